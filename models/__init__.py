@@ -1,6 +1,6 @@
 """Depth networks: each is an ``nn.Module`` that takes an image and returns a ``DepthPrediction`` in metres.
 
-The names below load their module when they are first used, not when this package is imported.
+Each name below imports its module at its first use, not when this package is imported.
 """
 
 from __future__ import annotations

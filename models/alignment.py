@@ -1,12 +1,12 @@
 """Scale and shift that make relative depth metric, fitted to sparse measurements.
 
 Relative networks (MiDaS, Depth Anything without "Metric") predict inverse depth up to a scale and a shift,
-1/d = scale x + shift; others predict depth itself so, d = scale x + shift (scale alone: shift = 0). Either
-is metric only together with these two numbers, which are fitted to measured depth here.
+1/d = scale x + shift; others predict depth up to both, d = scale x + shift, or up to scale (shift = 0). This module
+fits the two numbers to measured depth.
 
-UfM* compares views, so one alignment has to hold for all of them: fit it on the first frames
-(``pooled=True``) and keep it. An alignment per frame moves every frame's points by its own error, which
-counts as disagreement, and removes the frame-to-frame error of scale that is the network's own.
+UfM* compares views, so all views need the same alignment: fit it once, on the first frames (``pooled=True``). With an
+alignment per frame, its errors would count as disagreement, and the network's frame-to-frame error of scale would be
+removed.
 """
 
 from __future__ import annotations
@@ -24,18 +24,19 @@ from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction, infer
 
 KINDS = ("inverse", "affine")
-# Reweighted fits: with a third of outliers on one side each leaves .85 of the error, so 25 leave less than .02.
+# Reweighted fits: with a third of outliers on one side, each fit reduces the error to .85, and 25 to less than .02.
 _REWEIGHTED = 25
-# Fits to the inliers alone; the set is the same after a few of them.
+# Most fits to the inliers; their set converges after a few.
 _TRIMMED = 15
 # Huber's constant in standard deviations (95 % efficiency under normal errors), and the usual cut of an inlier.
 _HUBER, _CUT = 1.345, 3.0
 # Standard deviation of a normal residual per median of its magnitude.
 _MAD_TO_STD = 1.4826
-# [1] Share of the median value: exact data leave residuals of float64 rounding, which are no outliers.
+# [1] Smallest standard deviation of the residuals, over the median value: the float64 rounding of exact data gives no
+# outliers.
 _ROUNDING = 1e-9
-# Smallest variance of x per mean square: a relative spread of 1e-5, where what float32 predictions resolve (1e-7)
-# still determines a slope to 1 %.
+# Smallest variance of x over its mean square: a relative spread of 1e-5, at which the resolution of float32 predictions
+# (1e-7) still determines a slope to 1 %.
 _RANK = 1e-10
 
 
@@ -45,10 +46,10 @@ class Alignment(Checked):
 
     Attributes:
         kind: "inverse" (1/d, units 1/m) or "affine" (d, units m).
-        scale: [] for all images, or [B] for each of a batch; > 0. Numbers are taken too.
+        scale: [] for all images, or [B] for each image of a batch; > 0. May be a number.
         shift: as ``scale``.
-        max_depth: [m] farther pixels are invalid; None = no limit. Where inverse depth is nearly 0 (sky), the
-            smallest error of the shift moves a pixel by kilometres.
+        max_depth: [m] farther pixels are invalid; None = no limit. Where the inverse depth is nearly 0 (sky), a small
+            error of the shift moves a pixel by kilometres.
 
     Raises:
         ValueError: another kind, values that are not finite, a scale that is not positive, different shapes.
@@ -73,20 +74,20 @@ class Alignment(Checked):
             raise ValueError(f"Alignment.scale must be positive, got {self.scale.tolist()}")
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, exactly."""
+        """Plain values, without rounding."""
         return {**super().to_dict(), "scale": self.scale.tolist(), "shift": self.shift.tolist()}
 
     def depth(self, prediction: Tensor) -> Tensor:
-        """Depth [B, H, W] [m]; 0, which UfM* takes as no prediction, where it is not :meth:`valid`.
+        """Depth [B, H, W] [m]; 0 (no prediction, for UfM*) where it is not :meth:`valid`.
 
         Args:
-            prediction: [B, H, W] floating-point, as the network returns it.
+            prediction: [B, H, W] floating-point, the network's output.
 
         Raises:
-            ValueError: another shape, or as many images as there are alignments were expected.
+            ValueError: another shape, or another number of images than alignments.
         """
         require_maps("prediction", prediction)
-        scale, shift = self.scale, self.shift  # tensors without dimensions are numbers, on every device
+        scale, shift = self.scale, self.shift  # tensors [] work with every device
         if scale.dim():
             if len(scale) != len(prediction):
                 raise ValueError(f"prediction must have the alignment's {len(scale)} images, got {len(prediction)}")
@@ -99,20 +100,20 @@ class Alignment(Checked):
         return torch.where(possible, depth, 0)
 
     def valid(self, prediction: Tensor) -> Tensor:
-        """[B, H, W] where the aligned depth is finite, positive and at most ``max_depth``; errors as :meth:`depth`.
+        """[B, H, W] True where the aligned depth is finite, positive and at most ``max_depth``. Errors: :meth:`depth`.
 
-        ``(~alignment.valid(x)).sum((1, 2))`` counts what an image loses: many mean that the shift is wrong.
+        ``(~alignment.valid(x)).sum((1, 2))`` counts the lost pixels of an image; many indicate a wrong shift.
         """
         return self.depth(prediction) > 0
 
 
 @dataclass(frozen=True, eq=False)
 class AlignmentFit:
-    """An alignment and its statistics; [] instead of [B] where the images were pooled."""
+    """An alignment and its statistics; [] instead of [B] for pooled images."""
 
     alignment: Alignment  # the result
     points: Tensor  # [B] usable measurements
-    inliers: Tensor  # [B] those that the final fit used
+    inliers: Tensor  # [B] measurements in the final fit
     residual: Tensor  # [B] root mean square over the inliers of the difference in inverse depth [1/m] or depth [m]
 
 
@@ -121,8 +122,8 @@ class AlignedNetwork(DepthNetwork):
 
     Args:
         network: image [B, 3, H, W] -> relative depth [B, H, W] or [B, 1, H, W].
-        alignment: the same for every frame, fitted once; the module states why.
-        preprocess: what the network's input needs; None: images in [0, 1] at their own size.
+        alignment: the same for every frame (see the module).
+        preprocess: the network's preprocessing; None: images in [0, 1], not resized.
     """
 
     def __init__(self, network: nn.Module, alignment: Alignment, preprocess: Preprocess | None = None) -> None:
@@ -138,17 +139,17 @@ class AlignedNetwork(DepthNetwork):
 
     @property
     def max_depth(self) -> float | None:
-        """[m] The alignment's: farther pixels have no prediction."""
+        """[m] The alignment's largest depth; farther pixels have no prediction."""
         return self.alignment.max_depth
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
         """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] with ``intrinsics`` [B, 3, 3] [px]; 0 (no prediction) where the
-        alignment is not possible. Raises ValueError: the network returns another shape."""
+        aligned depth is not valid. Raises ValueError: the network returns another shape."""
         relative = as_map(infer(self.network, image, intrinsics), "the network's relative depth")
         if relative.shape[-2:] != image.shape[-2:]:
             raise ValueError(f"network must return {tuple(image.shape[-2:])} px, got {tuple(relative.shape)}")
         if relative.dtype in (torch.float16, torch.bfloat16):
-            relative = relative.float()  # a scale of 1e-3 and less is no number in half precision
+            relative = relative.float()  # half precision does not resolve scales of 1e-3 and less
         return DepthPrediction(self.alignment.depth(relative))
 
 
@@ -166,18 +167,19 @@ def fit_inverse_depth(
         prediction: [B, H, W] inverse depth up to scale and shift.
         depth: [B, H, W] measured depth [m] at the same pixels (LiDAR, SLAM points, a depth sensor); pixels without a
             finite positive value are not used.
-        valid: [B, H, W] bool, True = use; None = all measured.
-        shift: [1/m] if it is known (0: the prediction is inverse depth up to scale); None = fitted.
-        options: weights [B, H, W], inverse variances of 1/depth (or depth) up to a factor, 0 = do not use; equal ones
-            (default) fit stereo and structured light in inverse depth; for a constant error of depth: depth**4.
+        valid: [B, H, W] bool, True = use; None = all measurements.
+        shift: [1/m] fixed value (0: the prediction is inverse depth up to scale); None = fitted.
+        options: weights [B, H, W], inverse variances of 1/depth (or depth) up to a factor, 0 = do not use; equal
+            weights (default) suit stereo and structured light in inverse depth; for a constant error in depth, use
+            depth**4.
             pooled: one alignment for all images, as UfM* needs it, instead of one for each (default).
-            robust: leave out outliers, up to about a third of the points (default); False: plain least squares.
-            min_points: fewer usable measurements (of an image, or in all if pooled) are an error; default 10.
+            robust: reject outliers, up to about a third of the points (default); False: plain least squares.
+            min_points: least usable measurements (per image, or in total if pooled); default 10.
             max_depth: [m] of the resulting alignment; default: no limit.
 
     Raises:
-        ValueError: wrong shapes or types, too few measurements, predictions that hardly differ, or a scale that
-            comes out negative, as for a network that predicts depth; the image is named.
+        ValueError: wrong shapes or types, too few measurements, nearly constant predictions, or a negative fitted
+            scale, as for a network that predicts depth; the message names the image.
     """
     return _fit("inverse", prediction, depth, valid, shift, **options)
 
@@ -192,8 +194,8 @@ def fit_affine_depth(
 ) -> AlignmentFit:
     """Scale (and shift) with depth = scale prediction + shift [m], by least squares in depth.
 
-    As :func:`fit_inverse_depth`, for networks whose output grows with distance. ``shift`` is in metres and 0
-    by default (None = fitted): most such networks miss the scale alone.
+    As :func:`fit_inverse_depth`, for networks whose output grows with distance. ``shift`` is in metres and 0 by default
+    (None = fitted), since most such networks lack only the scale.
     """
     return _fit("affine", prediction, depth, valid, shift, **options)
 
@@ -231,10 +233,10 @@ def _fit(
 
 
 def _inliers(x: Tensor, y: Tensor, use: Tensor, weight: Tensor, shift: float | None) -> Tensor:
-    """[B, P] the points that agree with a robust line: within three standard deviations of it.
+    """[B, P] True for points within three standard deviations of a robust line.
 
-    Least squares with Huber's weight min(1, 1.345 s / |r|) of the residuals r [B, P], whose standard deviation s is
-    estimated from their median; then least squares over the inliers, which gives the line that exact data lie on.
+    Iterates least squares with Huber's weight min(1, 1.345 s / |r|) of the residuals r [B, P], whose standard deviation
+    s is estimated from their median; then least squares over the inliers, which is exact for exact data.
     """
     root, inlier, weights = weight.sqrt(), use, weight * use
     floor = _ROUNDING * _median(y.abs() * root, use)
@@ -245,7 +247,7 @@ def _inliers(x: Tensor, y: Tensor, use: Tensor, weight: Tensor, shift: float | N
         if step < _REWEIGHTED:
             weights = weight * use * (_HUBER * deviation / residual.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1)
             continue
-        # All points stay where no line is determined; the final fit names the image.
+        # All points stay inliers if no line is determined; the final fit raises for the image.
         previous, inlier = inlier, use & ((residual <= _CUT * deviation) | ~determined[:, None])
         weights = weight * inlier
         if torch.equal(inlier, previous):
@@ -255,7 +257,7 @@ def _inliers(x: Tensor, y: Tensor, use: Tensor, weight: Tensor, shift: float | N
 
 def _line(x: Tensor, y: Tensor, weight: Tensor, shift: float | None) -> tuple[Tensor, Tensor, Tensor]:
     """Scale and shift [B] of the weighted least-squares line through points [B, P], and whether they are determined
-    (elsewhere the line through the origin of x)."""
+    (if not, the scale is 0)."""
     w, wx, wy = weight.sum(1), (weight * x).sum(1), (weight * y).sum(1)
     wxx, wxy = (weight * x * x).sum(1), (weight * x * y).sum(1)
     if shift is None:
@@ -277,7 +279,7 @@ def _median(value: Tensor, use: Tensor) -> Tensor:
 def _points(
     prediction: Tensor, depth: Tensor, valid: Tensor | None, weights: Tensor | None, pooled: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """x, depth, use and weight, float64 [B, P] ([1, P] if pooled), harmless where not used."""
+    """x, depth, use and weight, float64 [B, P] ([1, P] if pooled); x and depth are 1 where not used."""
     require_maps("prediction", prediction)
     require_maps("depth", depth)
     if valid is not None and valid.dtype != torch.bool:
@@ -298,14 +300,14 @@ def _points(
 
 
 def require_maps(name: str, value: Tensor) -> None:
-    """Raises ValueError unless ``value`` is floating-point [B, H, W]."""
+    """Raise a ValueError unless ``value`` is floating-point [B, H, W]."""
     if value.dim() != 3 or not value.is_floating_point() or not value.numel():
         raise ValueError(f"{name} must be floating-point [B, H, W], got {value.dtype} {tuple(value.shape)}")
 
 
 def require_each(fine: Tensor, value: Tensor, sentence: str) -> None:
-    """Raises ValueError for the first image b that is not ``fine`` ([B], or [] of pooled images): "image b SENTENCE
-    value[b]"."""
+    """Raise a ValueError "image b SENTENCE value[b]" for the first image b that is not ``fine`` ([B], or [] for pooled
+    images)."""
     if not fine.all():
         image = int((~fine).reshape(-1).nonzero()[0])
         raise ValueError(f"image {image} {sentence} {value.reshape(-1)[image].item():.6g}")

@@ -1,4 +1,4 @@
-"""Any network as one that returns a ``DepthPrediction``: an ``nn.Module``, a function, a saved program."""
+"""Wrappers of any network (an ``nn.Module``, a function, a saved program) that return a ``DepthPrediction``."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from ufmstar_torch.prediction import DepthPrediction, infer
 from ufmstar_torch.prediction import takes_intrinsics as declares_intrinsics
 from ufmstar_torch.stream_warnings import LOGGER
 
-# Files of a torch.export archive: those of a word or a number, and tensors as raw bytes.
+# Files of a torch.export archive: short texts, and tensors as raw bytes.
 _TEXTS = ("archive_format", "archive_version", "byteorder", "version", "serialization_id")
 _RAW = re.compile(r"[^/]+/data/(weights/weight|constants/tensor)_\d+")
 
 
 class WrappedNetwork(DeclaredNetwork):
-    """A network whose outputs are declared by an :class:`OutputSpec`; made by :func:`wrap_network`."""
+    """A network with an :class:`OutputSpec`, which declares its outputs; made by :func:`wrap_network`."""
 
     def __init__(
         self,
@@ -57,38 +57,36 @@ class WrappedNetwork(DeclaredNetwork):
         return self._passes_intrinsics or super().takes_intrinsics
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
-        """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] as ``preprocess`` returns it, with ``intrinsics`` [B, 3, 3]
-        [px] for a network that takes them. Raises ValueError: the network's output is not what was declared, a program
-        does not take the image, or the intrinsics are missing."""
+        """Depth [B, H, W] [m] of the output ``image`` [B, 3, H, W] of ``preprocess``, with ``intrinsics`` [B, 3, 3]
+        [px] if the network takes them. Raises ValueError: the network's output contradicts the declaration, a program
+        does not accept the image, or the intrinsics are missing."""
         if not isinstance(image, Tensor):
             expected = "image must be a tensor [B, 3, H, W] as network.preprocess(image, intrinsics) returns it"
             raise TypeError(f"{expected}, got {type(image).__name__}; UncertainDepth takes pictures as they are")
         try:
             result = infer(self.network, image, intrinsics, takes=self._passes_intrinsics)
-        except (AssertionError, RuntimeError, TypeError, ValueError) as error:  # how programs refuse an input
+        except (AssertionError, RuntimeError, TypeError, ValueError) as error:  # a program may raise any of these
             if not self.path or isinstance(error, torch.OutOfMemoryError):
                 raise
-            shown = f"{image.dtype} {tuple(image.shape)}{' and K' if self._passes_intrinsics else ''}"
+            inputs = f"{image.dtype} {tuple(image.shape)}{' and K' if self._passes_intrinsics else ''}"
             raise ValueError(
-                f"{self.path} fails on {shown}: {error}; if it is made for another input, declare its size in the "
-                "spec's preprocess and a second input, of intrinsics, as takes_intrinsics, or export it for this one"
+                f"{self.path} fails on {inputs}: {error}; if it needs another input, declare its size in the spec's "
+                "preprocess, and intrinsics as a second input by takes_intrinsics, or export it for this input"
             ) from error
         return result if isinstance(result, DepthPrediction) else self.declared(result, image, intrinsics)
 
 
 def refuse_relative(network: object) -> None:
-    """Raises ValueError: a network of a package whose networks all predict relative depth (MiDaS, from ``torch.hub``);
-    what it returns looks like metric depth."""
+    """Raise a ValueError for MiDaS (from ``torch.hub``), whose relative depth has the same form as metric depth."""
     if type(network).__module__.partition(".")[0] == "midas":
         raise ValueError(
             f"network is MiDaS ({type(network).__name__}), which predicts inverse depth up to scale and shift, not "
-            "metres: give a metric network, or align it to measured depth (ufmstar_torch.models.AlignedNetwork)"
+            "metres: use a metric network, or align it to measured depth (ufmstar_torch.models.AlignedNetwork)"
         )
 
 
 def _warn_of_training(network: Callable[..., Any]) -> None:
-    """Warn of a function that uses a module in training mode: UncertainDepth sets modules to eval mode, which it cannot
-    do with those that a function refers to."""
+    """Warn if a function uses a module in training mode, which UncertainDepth cannot set to eval mode."""
     if isinstance(network, nn.Module):
         return
     function = network.func if isinstance(network, functools.partial) else network
@@ -121,27 +119,27 @@ def wrap_network(
     takes_intrinsics: bool = False,
     preprocess: Preprocess | Any = None,
 ) -> DepthNetwork:
-    """A network of one's own for UfM*.
+    """Wrap a custom network for UfM*.
 
     Args:
-        network: takes an image [B, 3, H, W]; returns metric depth [B, 1, H, W] or [B, H, W], a mapping or
-            an object with named tensors, a tuple of tensors, or a ``DepthPrediction``; NumPy arrays are as good. Or a
-            depth model or pipeline of ``transformers``, as ``from_hugging_face`` takes it, which becomes metric.
-        output: which of several outputs is depth: a name, or a position in a tuple.
+        network: maps an image [B, 3, H, W] to metric depth [B, 1, H, W] or [B, H, W], a mapping or an object with named
+            tensors, a tuple of tensors, or a ``DepthPrediction``; NumPy arrays are accepted, too. Or a metric depth
+            model or pipeline of ``transformers`` (``from_hugging_face``).
+        output: the depth among several outputs: a name, or a position in a tuple.
         scale: [m] length of one unit of depth.
-        inverse: declares inverse or relative depth, which is refused.
+        inverse: declares inverse or relative depth, which raises.
         aleatoric, aleatoric_kind, epistemic, epistemic_kind, confidence, resize, focal, max_depth: as in
             :class:`OutputSpec`.
-        takes_intrinsics: whether it is called as ``network(x, K)``, K [B, 3, 3] [px] of ``x``; an attribute
-            ``takes_intrinsics = True`` of ``network`` does the same.
-        preprocess: what its input needs; None: images in [0, 1] at their own size. Of a model of ``transformers``, also
-            its image processor; None: the pipeline's.
+        takes_intrinsics: call the network as ``network(x, K)``, K [B, 3, 3] [px] of ``x``; an attribute
+            ``takes_intrinsics = True`` of ``network`` has the same effect.
+        preprocess: preprocessing of its input; None: images in [0, 1], not resized. For a model of ``transformers``,
+            also its image processor; None: the pipeline's.
 
-    A function that uses a module in training mode is warned of (logger ``ufmstar_torch``).
+    Logs a warning (logger ``ufmstar_torch``) if a function uses a module in training mode.
 
     Raises:
         ValueError: ``inverse``, a value out of range, MiDaS, or a relative model of ``transformers``.
-        TypeError: ``network`` cannot be called, or does not estimate depth; ``preprocess`` is something else.
+        TypeError: ``network`` cannot be called, or does not estimate depth; ``preprocess`` has another type.
     """
     if isinstance(network, type) or not callable(network):
         raise TypeError(f"network must be an nn.Module or a function, got {_described(network)}")
@@ -153,7 +151,7 @@ def wrap_network(
             or resize
             or any(v is not None for v in (output, aleatoric, epistemic, confidence, focal, max_depth))
         ):
-            raise ValueError("of a model of transformers only scale, takes_intrinsics and preprocess can be declared")
+            raise ValueError("for a model of transformers, only scale, takes_intrinsics and preprocess can be declared")
         declares_preprocess = preprocess is None or isinstance(preprocess, Preprocess)
         declared: dict[str, Any] = {
             "preprocess" if declares_preprocess else "processor": preprocess,
@@ -170,7 +168,7 @@ def wrap_network(
 def _described(value: object) -> str:
     """Describe an argument that is no network or preprocessing, and the remedy, for an error message."""
     if isinstance(value, type):
-        return f"the class {value.__name__}: give an instance, {value.__name__}(...)"
+        return f"the class {value.__name__}: pass an instance, {value.__name__}(...)"
     if isinstance(value, str | Path):
         return f"{type(value).__name__} {str(value)!r}: load it, as load_network(name, weights) or from_hugging_face do"
     if isinstance(value, Mapping):
@@ -180,9 +178,9 @@ def _described(value: object) -> str:
 
 
 def load_torchscript(path: str | Path, spec: ProgramSpec | PlainSpec | None = None) -> WrappedNetwork:
-    """A TorchScript file (``torch.jit.save``) as a network, on the CPU; ``spec``: a :class:`ProgramSpec`, its plain
-    values or a JSON file. Such a file is a program: load only what you trust. Raises FileNotFoundError: there is no
-    such file; ValueError: it is not a TorchScript file, or the spec is missing or impossible."""
+    """Load a TorchScript file (``torch.jit.save``) as a network, on the CPU; ``spec``: a :class:`ProgramSpec`, its
+    plain values or a JSON file. The file is a program: load only files that you trust. Raises FileNotFoundError: there
+    is no such file; ValueError: it is not a TorchScript file, or the spec is missing or invalid."""
     declared = ProgramSpec.required(spec)
     try:
         program = torch.jit.load(_existing(path), map_location="cpu")
@@ -192,16 +190,16 @@ def load_torchscript(path: str | Path, spec: ProgramSpec | PlainSpec | None = No
 
 
 def load_exported(path: str | Path, spec: ProgramSpec | PlainSpec | None = None) -> WrappedNetwork:
-    """A ``torch.export`` file (``torch.export.save``, .pt2) as a network; arguments, trust and errors as
-    :func:`load_torchscript`. ``torch.export.load`` would unpickle any object in the archive, so one that holds more
-    than tensors beside its graph is refused."""
+    """Load a ``torch.export`` file (``torch.export.save``, .pt2) as a network; arguments, trust and errors as
+    :func:`load_torchscript`. ``torch.export.load`` would unpickle any object in the archive, so an archive with other
+    content than tensors and the graph raises."""
     declared = ProgramSpec.required(spec)
     try:
         program = torch.export.load(_checked_copy(_existing(path))).module()
     except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, BadZipFile) as error:
         raise ValueError(
-            f"{path} is not a readable torch.export file: {error}; expected what torch.export.save of a compatible "
-            f"torch writes (this one is {torch.__version__}): export the network again"
+            f"{path} is not a readable torch.export file: {error}; expected a file of torch.export.save from a "
+            f"compatible torch (this one is {torch.__version__}): export the network again"
         ) from error
     return _wrapped(_Exported(program), declared, path)
 
@@ -211,18 +209,18 @@ def _wrapped(program: nn.Module, spec: ProgramSpec, path: str | Path) -> Wrapped
 
 
 def _checked_copy(path: str) -> io.BytesIO:
-    """An archive in memory of the members that were checked: JSON, short texts, tensors and plain values. A file can
-    have two directories, of which Python's reader sees one and torch's the other. Raises ValueError (CheckpointError):
-    the file holds anything else."""
+    """Copy an archive into memory after checking its members: JSON, short texts, tensors and plain values. The copy is
+    necessary because a file can have two directories, one seen by Python's reader and one by torch's. Raises ValueError
+    (CheckpointError): other content."""
     copied = io.BytesIO()
     with ZipFile(path) as archive, ZipFile(copied, "w") as copy:
         names = archive.namelist()
         if any(entry.compress_type != ZIP_STORED for entry in archive.infolist()):
             raise ValueError(
-                "it has compressed files, which may expand without limit; torch.export.save compresses none"
+                "it has compressed files, which may expand without limit; torch.export.save does not compress"
             )
         if len({name.casefold() for name in names}) != len(names):
-            raise ValueError("it has two files of one name")
+            raise ValueError("it has two files with the same name")
         configs = [name for name in names if name.endswith("_config.json")]
         payloads = [p for name in configs for p in json.loads(archive.read(name))["config"].values()]
         pickled = {payload["path_name"] for payload in payloads if payload["use_pickle"]}
@@ -237,7 +235,7 @@ def _checked_copy(path: str) -> io.BytesIO:
 
 
 def _is_json(content: bytes) -> bool:
-    """True if the content is empty or JSON, neither of which can be unpickled."""
+    """True if the content is empty or JSON, which cannot be a pickle."""
     try:
         json.loads(content or b"0")
     except (ValueError, RecursionError):
@@ -246,7 +244,7 @@ def _is_json(content: bytes) -> bool:
 
 
 class _Exported(nn.Module):
-    """An exported program, which keeps the mode it was exported in; torch's own refuses even ``eval()``."""
+    """An exported program, whose mode is fixed; ignores ``train()`` and ``eval()``, on which torch's class raises."""
 
     def __init__(self, program: nn.Module) -> None:
         super().__init__()

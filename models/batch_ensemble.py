@@ -1,11 +1,11 @@
-"""BatchEnsemble (Wen, Tran and Ba, ICLR 2020): an ensemble in one network, whose members share their
-weights but for two vectors per layer.
+"""BatchEnsemble (Wen, Tran and Ba, ICLR 2020): an ensemble in one network, whose members share their weights except for
+two vectors per layer.
 
-Batch norms are shared by all members, statistics and all: a member then costs three vectors per layer, and
-the statistics stay those of a whole batch where it is split among the members.
+The members also share the batch norms with their statistics. A member then has three vectors per layer (with its bias),
+and the statistics are those of the whole batch even if it is split among the members.
 
-Why not torch-uncertainty (0.13): its ``batch_ensemble(convert_layers=True)`` crashes on nested modules,
-and its layers divide every batch among all members, so that one image cannot be given to one member.
+Why not torch-uncertainty (0.13): its ``batch_ensemble(convert_layers=True)`` crashes on nested modules, and its layers
+split every batch among all members, so that a single member cannot process an image.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.networks_in_turn import combine
 from ufmstar_torch.prediction import DepthPrediction
 
-# [1] Spread of the factors around 1, as in the published implementations. Less of it keeps
-# the members nearer to pretrained weights and to each other; random signs undo trained weights altogether.
+# [1] Standard deviation of the factors around 1, as in the published implementations. A smaller one keeps the members
+# nearer to pretrained weights and to each other; random signs would destroy trained weights.
 INIT_STD = 0.5
 _PLAIN = (nn.Conv2d, nn.Linear)
 
@@ -36,20 +36,19 @@ Network = TypeVar("Network", bound=nn.Module)
 def convert(network: Network, members: int, *, std: float = INIT_STD) -> Network:
     """A copy of a network in which every ``Conv2d`` and ``Linear`` is a :class:`BatchLayer`.
 
-    Weights are copied and every member starts with the layer's bias. Layers are found wherever the network
-    keeps them, also twice, or in plain lists and dicts beside its registered modules.
+    Weights are copied, and every member starts with the layer's bias. All references to a layer are replaced, also
+    repeated ones and those in plain lists and dicts.
 
     Args:
         network: not changed.
         members: N.
-        std: [1] of the factors, which begin at 1 +- ``std``, drawn from torch's generator; 0 starts all members equal.
+        std: [1] standard deviation of the initial factors around 1, drawn from torch's generator; 0 = equal members.
 
     Raises:
-        ValueError: nothing to convert, an option out of range, a network that is converted already, or a
-            layer that is kept in a plain list only (its weights would be neither trained nor saved).
-        TypeError: a layer of a derived class or with weights of another kind (weight norm), whose
-            computation is not known here.
-        RuntimeError: not all of the layers were converted.
+        ValueError: nothing to convert, an option out of range, a converted network, or a layer that is only in a plain
+            list (its weights would be neither trained nor saved).
+        TypeError: a layer of a derived class or with other parameters (weight norm), whose computation is unknown.
+        RuntimeError: not all layers were converted.
     """
     if members < 2 or not std >= 0:
         raise ValueError(f"need members >= 2 and std >= 0, got {members} and {std}")
@@ -58,15 +57,15 @@ def convert(network: Network, members: int, *, std: float = INIT_STD) -> Network
     plain = [(name, module) for name, module in network.named_modules() if isinstance(module, _PLAIN)]
     if not plain:
         raise ValueError(f"{type(network).__name__} has no Conv2d and no Linear: nothing to convert")
-    # What deepcopy puts in place of an object, by its id: it replaces a layer wherever the network refers to it.
+    # deepcopy's memo, by id: it replaces a layer at all references.
     copies: dict[int, Any] = {}
     selection = Selection()
     for name, module in plain:
         _require_plain(name, module)
         copies[id(module)] = BatchLayer(copy.deepcopy(module, copies), members, selection)
     result = copy.deepcopy(network, copies)
-    if left := [type(copied).__name__ for copied in copies.values() if isinstance(copied, _PLAIN)]:
-        raise ValueError(f"{type(network).__name__} keeps a {left[0]} that is not registered: use nn.ModuleList")
+    if unconverted := [type(copied).__name__ for copied in copies.values() if isinstance(copied, _PLAIN)]:
+        raise ValueError(f"{type(network).__name__} keeps a {unconverted[0]} that is not registered: use nn.ModuleList")
     layers = converted_layers(result)
     if len(layers) != len(plain):
         raise RuntimeError(f"{len(layers)} of {len(plain)} layers were converted")
@@ -77,18 +76,18 @@ def convert(network: Network, members: int, *, std: float = INIT_STD) -> Network
 
 
 def converted_layers(network: nn.Module) -> list[BatchLayer]:
-    """The layers that :func:`convert` made, each once."""
+    """The layers that :func:`convert` created, without repetitions."""
     return [module for module in network.modules() if isinstance(module, BatchLayer)]
 
 
 class BatchEnsemble(DepthNetwork):
     """An ensemble whose members share their weights ("BatchEnsemble").
 
-    Called as a network it is the multi-inference baseline: all members in one batched pass, combined.
-    :meth:`all_members` are the single-inference form, which ``UncertainDepth`` alternates.
+    A call runs the multi-inference baseline: all members in one batched pass, combined. :meth:`all_members` returns the
+    single-inference form, for ``UncertainDepth``.
 
     Args:
-        network: converted into a copy; see :func:`convert` for it and the other arguments, and for errors.
+        network: to convert, into a copy. Arguments and errors as in :func:`convert`.
     """
 
     def __init__(self, network: UncertaintyNetwork, members: int, *, std: float = INIT_STD) -> None:
@@ -98,10 +97,10 @@ class BatchEnsemble(DepthNetwork):
         self.members = members
 
     def distribution(self, image: Tensor, member: int | None = None, *, repeat: bool = True) -> DepthDistribution:
-        """The distributions of ``image`` [B, 3, H, W] for the losses: of a ``member`` alone, [B, H, W], or of all. With
-        ``repeat`` all members see every image, [N B, H, W] with member 0's B maps first; without, the batch is split
-        among them, [B, H, W] with image b by member floor(b N / B). Raises IndexError: no such member; ValueError: a
-        batch that is too small to be split."""
+        """The distributions of ``image`` [B, 3, H, W] for the losses: of one ``member``, [B, H, W], or of all. With
+        ``repeat``, all members process every image: [N B, H, W], the B maps of member 0 first. Without it, the batch is
+        split: [B, H, W], image b by member floor(b N / B). Raises IndexError: no such member; ValueError: a batch too
+        small to be split."""
         count = len(image)
         if member is not None:
             members = torch.full((count,), self._checked(member), device=image.device)
@@ -119,27 +118,27 @@ class BatchEnsemble(DepthNetwork):
         """The members' mixture of ``image`` [B, 3, H, W]: mean depth [B, H, W] [m], mean A and the variance
         between the members as E [m^2], from one pass with a batch of N B."""
         distribution = self.distribution(image)
-        # In training mode a network with heads at several scales has as many blocks of members; the first predicts.
+        # In training mode, a network with heads at several scales returns that many blocks; use the first, the finest.
         parts = [slice(n * len(image), (n + 1) * len(image)) for n in range(self.members)]
         return combine([images_of(distribution, part).prediction() for part in parts])
 
     def member(self, n: int) -> BatchEnsembleMember:
-        """Member n as a network, with the weights of this one: nothing is copied. Raises IndexError: no such member."""
+        """Member n as a network that shares this one's weights. Raises IndexError: no such member."""
         return BatchEnsembleMember(self, self._checked(n))
 
     def all_members(self) -> list[BatchEnsembleMember]:
-        """:meth:`member` of each."""
+        """All members (:meth:`member`)."""
         return [self.member(n) for n in range(self.members)]
 
     def folded(self, n: int) -> UncertaintyNetwork:
-        """Member n as a plain network with its own weights W_n: the same function up to rounding, as fast as the
-        network that was converted, and independent of this one. Raises IndexError: no such member."""
+        """Member n as a plain network with the weights W_n: the same function up to rounding, as fast as the original
+        network, and independent of this one. Raises IndexError: no such member."""
         self._checked(n)
         return copy.deepcopy(self.network, {id(layer): layer.plain(n) for layer in converted_layers(self.network)})
 
     def factors(self) -> list[nn.Parameter]:
-        """r and s of every layer. Weight decay would pull them to 0, where a member ends, instead of to the
-        shared weights: leave them out of it."""
+        """r and s of every layer. Exclude them from weight decay, which would pull them to 0 instead of to 1, the
+        shared weights."""
         return [factor for layer in converted_layers(self.network) for factor in (layer.r, layer.s)]
 
     def _checked(self, member: int) -> int:
@@ -149,7 +148,7 @@ class BatchEnsemble(DepthNetwork):
 
     @contextmanager
     def _selected(self, members: Tensor) -> Iterator[None]:
-        """Select the member [B] of every image for all layers, in this thread, for the length of a call."""
+        """Select the member [B] of every image for all layers, in this thread, during a call."""
         selection = converted_layers(self.network)[0].selection
         selection.members = members
         try:
@@ -161,9 +160,9 @@ class BatchEnsemble(DepthNetwork):
 class BatchEnsembleMember(DepthNetwork):
     """One member of a :class:`BatchEnsemble`, made by its ``member``.
 
-    It registers the whole ensemble as a part, so that all members stay one through ``.to()``,
-    ``deepcopy`` (of a list of them) and ``load_state_dict``. A state_dict repeats the shared tensors' names
-    for every member, but not the tensors.
+    The whole ensemble is a submodule, so that all members still share their weights after ``.to()``, ``deepcopy`` (of a
+    list of them) and ``load_state_dict``. A state_dict of several members repeats the names of the shared tensors, but
+    not the tensors.
     """
 
     def __init__(self, ensemble: BatchEnsemble, n: int) -> None:
@@ -174,7 +173,7 @@ class BatchEnsembleMember(DepthNetwork):
         self.training = ensemble.training
 
     def distribution(self, image: Tensor) -> DepthDistribution:
-        """[B, H, W] each, of ``image`` [B, 3, H, W]."""
+        """The distribution [B, H, W] of ``image`` [B, 3, H, W]."""
         return self.ensemble.distribution(image, self.n)
 
     def forward(self, image: Tensor) -> DepthPrediction:
@@ -183,13 +182,13 @@ class BatchEnsembleMember(DepthNetwork):
 
 
 def _require_plain(name: str, module: nn.Module) -> None:
-    """Raises TypeError where a layer computes something else than its plain class does."""
+    """Raise a TypeError unless a layer computes the same as its plain class."""
     if type(module) not in _PLAIN or set(module._parameters) != {"weight", "bias"}:
         held = ", ".join(module._parameters)
         raise TypeError(f"{name or 'the network'} cannot be converted: it is a {type(module).__name__} of {held}")
 
 
 def _draw(factor: nn.Parameter, std: float) -> None:
-    """Random values into a parameter; drawn on the CPU in float32, so that they depend on the seed alone."""
+    """Fill a parameter with random values, drawn on the CPU in float32, so that they depend only on the seed."""
     with torch.no_grad():
         factor.copy_(1 + std * torch.randn(factor.shape))

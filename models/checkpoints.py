@@ -1,7 +1,7 @@
-"""Weights to and from files: tensors only, checked key by key, written atomically.
+"""Reading and writing of weights: tensors only, checked key by key, written atomically.
 
-A file is read with ``weights_only=True`` (or as safetensors), so that it cannot run code; one that holds a
-pickled module, as older repositories publish them, is refused with an explanation.
+Files are read with ``weights_only=True`` (or as safetensors), so that they cannot run code. A pickled module, as in
+older repositories, raises with an explanation.
 """
 
 from __future__ import annotations
@@ -26,47 +26,45 @@ _TORCH_SUFFIXES = (".pth", ".pt", ".ckpt", ".bin", ".tar")
 _UNKNOWN_SUFFIX = f"{{}} must end in .safetensors or one of {', '.join(_TORCH_SUFFIXES)}"
 # Files of torch.save begin with these bytes: a zip archive, or (before torch 1.6) a pickled magic number.
 _BEGINNINGS = (b"PK\x03\x04", b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.")
-# Exceptions that the restricted unpickler raises on damaged bytes; it does not document them.
+# Exceptions, not documented, of the restricted unpickler on damaged bytes.
 DAMAGE = (EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, AttributeError, AssertionError)
-_SHOWN = 8  # keys named in an error message
+_SHOWN = 8  # most keys in an error message
 
 
 class CheckpointError(ValueError):
-    """A file of weights is broken, holds something else, or does not fit the network; names the file."""
+    """A file of weights is damaged, has other content, or does not fit the network; the message names the file."""
 
 
 def load_state_dict_file(path: str | Path, ignore: Collection[str] = ()) -> dict[str, Tensor]:
     """The weights in a file, on the CPU, by key.
 
-    Containers ("state_dict", "model", ...) are opened and prefixes that every key shares ("module.",
-    "model.", ...) are removed.
+    Containers ("state_dict", "model", ...) are opened, and prefixes of all keys ("module.", "model.", ...) are removed.
 
     Args:
-        path: .pth, .pt, .ckpt, .bin, .tar (all as ``torch.save`` writes them) or .safetensors.
-        ignore: keys of plain values that the file may hold beside the weights.
+        path: .pth, .pt, .ckpt, .bin, .tar (all of ``torch.save``) or .safetensors.
+        ignore: keys of plain values that the file may hold in addition to weights.
 
     Raises:
         FileNotFoundError: there is no such file.
-        CheckpointError: the file is cut off or damaged, holds pickled objects or no weights, or has
-            another suffix.
+        CheckpointError: the file is truncated or damaged, holds pickled objects or no weights, or has another suffix.
         ModuleNotFoundError: a .safetensors file without the package safetensors.
     """
     return _without_prefixes(_read(Path(path), ignore))
 
 
 def load_weights(module: nn.Module, path: str | Path) -> None:
-    """Fill a module from a file, in place; all keys and shapes have to match.
+    """Fill a module from a file, in place; all keys and shapes must match.
 
-    Types follow the module's (half-precision weights fill a float32 network). Raises FileNotFoundError,
-    CheckpointError, ModuleNotFoundError: as :func:`load_state_dict_file`; also where keys are missing or unexpected,
-    shapes differ, or values are not finite. The module is unchanged then.
+    Weights are converted to the module's dtypes (half-precision weights fill a float32 network). Raises
+    FileNotFoundError, CheckpointError, ModuleNotFoundError: as :func:`load_state_dict_file`; also if keys are missing
+    or unexpected, shapes differ, or values are not finite. The module is then unchanged.
     """
-    # A network may itself have a part called "model".
+    # The network may have a submodule called "model".
     fill(module, _without_prefixes(_read(Path(path)), keep=set(module.state_dict())), str(path))
 
 
 def channels_of(state: Mapping[str, Tensor], keys: Sequence[str], network: str, source: object) -> tuple[int, ...]:
-    """The output channels of some weights, from which a network's shape is read. Raises CheckpointError: one is
+    """The output channels of the weights ``keys``, which determine a network's shape. Raises CheckpointError: a key is
     missing; the message names ``source``."""
     if missing := [key for key in keys if key not in state]:
         fault = f"not the weights of a {network}: no {missing[0]!r} ({len(missing)} such keys missing)"
@@ -75,8 +73,8 @@ def channels_of(state: Mapping[str, Tensor], keys: Sequence[str], network: str, 
 
 
 def fill(module: nn.Module, state: Mapping[str, Tensor], source: str) -> None:
-    """Fill a module from tensors, in place; all keys and shapes have to match. Raises CheckpointError as
-    :func:`load_weights`; the message names ``source``, where they come from."""
+    """Fill a module from tensors, in place; all keys and shapes must match. Raises CheckpointError as
+    :func:`load_weights`; the message names their ``source``."""
     expected = module.state_dict()
     shapes = {key: (tuple(state[key].shape), tuple(expected[key].shape)) for key in expected if key in state}
     faults = {
@@ -94,16 +92,16 @@ def fill(module: nn.Module, state: Mapping[str, Tensor], source: str) -> None:
 
 
 def read_safetensors(path: str | Path, prefix: str | None = "") -> tuple[dict[str, Tensor], Any]:
-    """The tensors of a .safetensors file whose keys begin with ``prefix`` (None: none), by their keys without it, and
-    the metadata of :func:`save_checkpoint` (None: none); the rest is not read. Raises FileNotFoundError: there is no
-    such file; CheckpointError: it is no safetensors file, or cut off or damaged; ModuleNotFoundError: safetensors is
-    not installed."""
+    """Read the tensors of a .safetensors file whose keys begin with ``prefix`` (None: no tensors), by key without the
+    prefix, and the metadata of :func:`save_checkpoint` (None if absent). Raises FileNotFoundError: there is no such
+    file; CheckpointError: it is no safetensors file, truncated or damaged; ModuleNotFoundError: safetensors is not
+    installed."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"no file of weights {path}")
     safetensors = _safetensors("safetensors")
     try:
         with safetensors.safe_open(path, framework="pt") as file:
-            names = file.keys()  # no mapping: it cannot be iterated over itself
+            names = file.keys()  # the file itself cannot be iterated over
             keys = [] if prefix is None else [name for name in names if name.startswith(prefix)]
             tensors = {key[len(prefix or "") :]: file.get_tensor(key) for key in keys}
             return tensors, json.loads((file.metadata() or {}).get("metadata", "null"))
@@ -114,12 +112,12 @@ def read_safetensors(path: str | Path, prefix: str | None = "") -> tuple[dict[st
 def save_checkpoint(
     path: str | Path, weights: nn.Module | Mapping[str, Tensor], metadata: Mapping[str, Any] | None = None
 ) -> None:
-    """Write weights so that the file is either the old one or the whole new one, whatever happens.
+    """Write weights atomically.
 
     Args:
-        path: .safetensors, or a suffix of ``torch.save``, which gets {"state_dict", "metadata"}.
+        path: .safetensors, or a suffix of ``torch.save``, which writes {"state_dict", "metadata"}.
         weights: a module, or its state_dict.
-        metadata: plain values (JSON) stored beside them, such as widths and the command that trained them.
+        metadata: plain values (JSON) to store, such as widths and the training command.
 
     Raises:
         CheckpointError: another suffix.
@@ -134,7 +132,7 @@ def save_checkpoint(
 
 def _write(file: Any, path: Path, state: dict[str, Tensor], metadata: str) -> None:
     if path.suffix == ".safetensors":
-        # Tensors that share memory are not allowed there; a copy each costs little.
+        # safetensors does not allow tensors that share memory.
         separate = {key: value.clone() for key, value in state.items()}
         file.write(_safetensors("safetensors.torch").save(separate, metadata={"metadata": metadata}))
     elif path.suffix in _TORCH_SUFFIXES:
@@ -144,7 +142,7 @@ def _write(file: Any, path: Path, state: dict[str, Tensor], metadata: str) -> No
 
 
 def _read(path: Path, ignore: Collection[str] = ()) -> dict[str, Tensor]:
-    """The tensors of a file with its keys as they are, containers opened."""
+    """The tensors of a file by its original keys, containers opened."""
     if not path.is_file():
         raise FileNotFoundError(f"no file of weights {path}")
     if path.suffix == ".safetensors":
@@ -156,8 +154,8 @@ def _read(path: Path, ignore: Collection[str] = ()) -> dict[str, Tensor]:
 
 
 def read_tensors(file: BinaryIO, name: str | Path) -> Any:
-    """The content of an open file of ``torch.save``; no code from it is run. Raises CheckpointError: it is damaged,
-    or holds more than tensors and plain values; the message has ``name``."""
+    """The content of an open file of ``torch.save``, without running code from it. Raises CheckpointError: it is
+    damaged, or holds more than tensors and plain values; the message contains ``name``."""
     beginning = file.read(max(map(len, _BEGINNINGS)))
     if not beginning.startswith(_BEGINNINGS):
         raise CheckpointError(f"{name} is damaged or not a file of torch.save: it begins with {beginning[:8]!r}")
@@ -179,7 +177,7 @@ def _weights_in(content: Any, path: Path, ignore: Collection[str]) -> dict[str, 
             content = content[name]
             break
     if not isinstance(content, Mapping) or not content:
-        raise CheckpointError(f"{path} holds no weights but {type(content).__name__}")
+        raise CheckpointError(f"{path} holds no weights, but {type(content).__name__}")
     content = {key: value for key, value in content.items() if key not in ignore}
     if others := [k for k, value in content.items() if not isinstance(value, Tensor) or not isinstance(k, str)]:
         raise CheckpointError(f"{path} holds more than named tensors: {some(others)}")
@@ -187,7 +185,7 @@ def _weights_in(content: Any, path: Path, ignore: Collection[str]) -> dict[str, 
 
 
 def _without_prefixes(state: dict[str, Tensor], keep: set[str] | None = None) -> dict[str, Tensor]:
-    """Keys without the known prefixes that all of them share; stops where the keys are those in ``keep``."""
+    """Remove ``_PREFIXES`` that all keys share, until the keys equal ``keep``."""
     while state and set(state) != keep:
         prefix = next((p for p in _PREFIXES if all(key.startswith(p) for key in state)), None)
         if prefix is None:
@@ -197,7 +195,7 @@ def _without_prefixes(state: dict[str, Tensor], keep: set[str] | None = None) ->
 
 
 def some(keys: list[Any]) -> str:
-    """The first keys of a list as text, and how many more there are."""
+    """The first keys of a list as text, and the number of further keys."""
     more = f", ... ({len(keys) - _SHOWN} more)" if len(keys) > _SHOWN else ""
     return ", ".join(str(key) for key in keys[:_SHOWN]) + more
 

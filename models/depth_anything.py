@@ -1,9 +1,9 @@
 """Depth Anything V2 (Yang et al., NeurIPS 2024): a DINOv2 encoder with a DPT decoder, by ``transformers``.
 
 The checkpoints are depth-anything/Depth-Anything-V2-[Metric-Indoor-|Metric-Outdoor-]{Small,Base,Large}-hf on the hub.
-The metric ones (indoor up to 20 m, outdoor up to 80 m) are depth networks at once. The relative ones
-predict inverse depth up to scale and shift and need an alignment. Small is Apache-2.0, Base and Large are
-CC BY-NC 4.0: not for commercial use.
+The metric checkpoints (indoor up to 20 m, outdoor up to 80 m) can be used directly. The relative ones predict inverse
+depth up to scale and shift and need an alignment. Small is Apache-2.0, Base and Large are CC BY-NC 4.0: not for
+commercial use.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ SIZE = (518, 518)  # [px] of the input
 class DepthAnything(HuggingFaceDepth):
     """Depth Anything V2 for UfM*; made by :meth:`from_pretrained`.
 
-    A metric checkpoint is a depth network as it is. A relative one refuses to be one: ``network.raw(image)`` is
-    its inverse depth up to scale and shift, and ``network.aligned(alignment)`` a depth network.
+    A metric checkpoint is a depth network. Calling a relative one raises: ``network.raw(image)`` is its inverse depth
+    up to scale and shift, and ``network.aligned(alignment)`` a depth network.
     """
 
     def __init__(self, checkpoint: Checkpoint, spec: HuggingFaceSpec, dtype: torch.dtype = torch.float32) -> None:
-        """From a checkpoint that was read; arguments and errors as :meth:`from_pretrained`."""
+        """From a checkpoint's configuration; arguments and errors as :meth:`from_pretrained`."""
         if checkpoint.model_type != "depth_anything":
             raise CheckpointError(
                 f"{checkpoint.name} is a {checkpoint.config.get('model_type')!r} model, expected 'depth_anything'; "
@@ -65,7 +65,7 @@ class DepthAnything(HuggingFaceDepth):
 
         Args:
             size: (height, width) [px] of the input, multiples of the patch (14).
-            keep_aspect: keep the image's aspect as the checkpoint's own processor does: 480 x 640 becomes 518 x 686.
+            keep_aspect: keep the image's aspect like the checkpoint's image processor: 480 x 640 becomes 518 x 686.
 
         Raises:
             ValueError: ``size`` is no multiple of the patch.

@@ -1,6 +1,6 @@
-"""Parameters of the distribution that an uncertainty head predicts per pixel.
+"""Parameters of the distributions that uncertainty heads predict per pixel.
 
-The losses need the parameters of the distribution, UfM* its moments (``DepthPrediction``).
+The losses need the parameters, UfM* the moments (``DepthPrediction``).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from ufmstar_torch.prediction import DepthPrediction
 
 @dataclass(frozen=True)
 class PointDepth:
-    """Depth alone."""
+    """Depth without a variance."""
 
     depth: Tensor  # [B, H, W] [m]
 
@@ -28,8 +28,7 @@ class GaussianDepth:
     """N(depth, exp(log_variance)) (Kendall and Gal 2017)."""
 
     depth: Tensor  # [B, H, W] mean [m]
-    # [B, H, W] natural logarithm of the variance [m^2]; the logarithm, because the loss is stable in it and any
-    # real number is a valid one
+    # [B, H, W] natural logarithm of the variance [m^2]: the loss is stable in it, and every real number is valid
     log_variance: Tensor
 
     def prediction(self) -> DepthPrediction:
@@ -41,7 +40,7 @@ class GaussianDepth:
 class EvidentialDepth:
     """Normal-Inverse-Gamma evidence (Amini et al. 2020, Eq. 4 and 5).
 
-    The depth's mean and variance are themselves unknown: variance ~ Inverse-Gamma(alpha, beta) and
+    Mean and variance of the depth are random: variance ~ Inverse-Gamma(alpha, beta) and
     mean | variance ~ N(depth, variance / nu).
     """
 

@@ -1,7 +1,7 @@
 """MC-Dropout in the decoder (Gal and Ghahramani 2016; only the decoder, as in Poggi et al. 2020).
 
-While training, dropout acts as always. At test time it samples as well, while everything else, batch norm
-above all, stays in eval mode: every pass is then one draw from the network's approximate posterior.
+Dropout samples at test time, too, while all other layers, in particular batch norm, stay in eval mode: every pass is a
+draw from the network's approximate posterior.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ SAMPLES = 10  # passes of the paper's multi-inference baseline
 
 class DecoderDropout(nn.Module):
     """Zeroes whole channels with probability p in [0, 1) and scales the others by 1 / (1 - p), in training mode or
-    while ``sampling``. Without parameters, so that weights load with and without it.
+    while ``sampling``. It has no parameters, so that weights load with and without it.
 
-    Each channel of each image has one draw, as in the decoder of Poggi et al. Draws for single values would speckle a
-    sample: neighbouring pixels differ by decimetres, which segmentation cannot join to a surface. Raises ValueError: p
-    is out of range.
+    Each channel of each image has one draw, as in the decoder of Poggi et al. With one draw per value, neighbouring
+    pixels would differ by decimetres, which segmentation cannot join to a surface. Raises ValueError: p is out of
+    range.
     """
 
     def __init__(self, p: float) -> None:
@@ -36,18 +36,18 @@ class DecoderDropout(nn.Module):
         self.generator: torch.Generator | None = None
 
     def forward(self, x: Tensor) -> Tensor:
-        """x [B, C, ...] of any floating-point type; the same shape."""
+        """x [B, C, ...] of any floating-point dtype, to the same shape."""
         if not self.p or not (self.training or self.sampling):
             return x
-        # torch's dropout takes no generator.
+        # torch's dropout has no generator argument.
         draw = torch.rand(*x.shape[:2], *(1,) * (x.dim() - 2), generator=self.generator, device=x.device)
         return x * (draw >= self.p).to(x.dtype) / (1 - self.p)
 
 
 def set_sampling(module: nn.Module, on: bool, generator: torch.Generator | None = None) -> int:
-    """Switch sampling in eval mode of every :class:`DecoderDropout` in ``module`` (with p > 0), in place; their number.
-    ``generator``: of the random numbers, on the network's device; None: torch's global one. Raises ValueError: there is
-    no such layer, so that nothing would be sampled."""
+    """Switch sampling in eval mode on or off for every :class:`DecoderDropout` in ``module`` with p > 0, in place.
+    Returns their number. ``generator``: of the random numbers, on the network's device; None: torch's global one.
+    Raises ValueError: there is no such layer."""
     layers = [m for m in module.modules() if isinstance(m, DecoderDropout) and m.p > 0]
     if not layers:
         raise ValueError(
@@ -61,13 +61,13 @@ def set_sampling(module: nn.Module, on: bool, generator: torch.Generator | None 
 class MonteCarloDropout(DepthNetwork):
     """A network with decoder dropout that samples in eval mode ("MC-Dropout").
 
-    With one sample a pass is one draw, which ``UncertainDepth`` alternates: the single-inference form. With
-    more, every call runs that many passes, the multi-inference baseline: predictive mean, mean aleatoric
-    variance, and the variance between the passes as epistemic variance.
+    With one sample, a call is one draw: the single-inference form for ``UncertainDepth``. With more, every call runs
+    that many passes, the multi-inference baseline: predictive mean, mean aleatoric variance, and the variance between
+    the passes as epistemic variance.
 
     Args:
-        network: used as it is, not copied; from now on its dropout samples also in eval mode, which
-            ``set_sampling(network, False)`` takes back. Its weights are trained as without this wrapper.
+        network: not copied; its dropout samples in eval mode, too, until ``set_sampling(network, False)``. Training is
+            the same as without this wrapper.
         samples: passes per call.
         generator: source of the random numbers, on the network's device; None: torch's global one.
 
@@ -91,9 +91,11 @@ class MonteCarloDropout(DepthNetwork):
         self.samples = samples
 
     def distribution(self, image: Tensor) -> DepthDistribution:
-        """One pass, for the losses. Raises TypeError: the network predicts depth without declaring a distribution."""
+        """One pass, for the losses. Raises TypeError: the network has no uncertainty head."""
         if not isinstance(self.network, UncertaintyNetwork):
-            raise TypeError(f"{type(self.network).__name__} is no UncertaintyNetwork; put a head on it for training")
+            raise TypeError(
+                f"{type(self.network).__name__} is no UncertaintyNetwork; add a head for training (with_head)"
+            )
         return self.network.distribution(image)
 
     @property
@@ -102,8 +104,7 @@ class MonteCarloDropout(DepthNetwork):
         return (self.network,)
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
-        """Depth [B, H, W] [m] and variances [m^2] of ``image`` [B, 3, H, W] with ``intrinsics`` [B, 3, 3] [px]; with
-        one sample only what the network itself predicts, otherwise E = the variance between the passes (+ their own
-        mean E)."""
+        """Depth [B, H, W] [m] and variances [m^2] of ``image`` [B, 3, H, W] with ``intrinsics`` [B, 3, 3] [px]. With
+        one sample, only the network's variances; otherwise E = the variance between the passes (+ mean E)."""
         passes = [infer(self.network, image, intrinsics) for _ in range(self.samples)]
         return passes[0] if self.samples == 1 else combine(passes)

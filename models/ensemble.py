@@ -1,5 +1,5 @@
-"""Ensembles (Lakshminarayanan et al. 2017): all members at once as the multi-inference baseline, and
-members that are loaded at their first call and need not stay on the device."""
+"""Ensembles (Lakshminarayanan et al. 2017): the multi-inference baseline, which runs all members, and members that are
+loaded at their first call and can be offloaded from the device."""
 
 from __future__ import annotations
 
@@ -46,23 +46,22 @@ class Ensemble(DepthNetwork):
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
         """Mean depth [B, H, W] [m], mean A, and the variance between the members (+ mean E) as E [m^2] of
-        ``image`` [B, 3, H, W] with ``intrinsics`` [B, 3, 3] [px]; one inference after the other."""
+        ``image`` [B, 3, H, W] with ``intrinsics`` [B, 3, 3] [px]; runs the members sequentially."""
         return combine([infer(member, image, intrinsics) for member in self.members])
 
 
 class LazyMember(DepthNetwork):
-    """A network that is loaded when it is first called. For inference.
+    """A network that is loaded at its first call. For inference.
 
-    ``.to()`` decides where and in which type it will run, before and after loading. Its weights are in its file and no
-    part of its state_dict, whether loaded or not. A copy loads them anew.
+    ``.to()`` sets its device and dtype, before and after loading. Its weights are never part of its state_dict. A copy
+    loads them again.
 
     Args:
-        load: returns the network, on the CPU; called once, again after it raised.
-        preprocess: the network's, which is needed before it is loaded.
+        load: returns the network, on the CPU; called once, and again after an error.
+        preprocess: of the network, needed before it is loaded.
         name: for error messages.
-        offload: keep the weights in host memory and copy them to the device for the length of a call only.
-            On the CPU there is nothing to copy. Members that share weights (of a BatchEnsemble) must not be
-            called from several threads at once then.
+        offload: store the weights in host memory and copy them to the device during a call only. No effect on the CPU.
+            Members that share weights (of a BatchEnsemble) must then not be called from several threads at once.
     """
 
     _where: Tensor
@@ -75,7 +74,7 @@ class LazyMember(DepthNetwork):
         self.name = name
         self.offload = offload
         self._load = load
-        # In a dict, so that nn.Module does not count it among its parts.
+        # In a dict, so that nn.Module does not register it.
         self._held: dict[str, DepthNetwork] = {}
         self._loading, self._calling = threading.Lock(), threading.Lock()
         self.register_buffer("_where", torch.zeros(0), persistent=False)
@@ -87,9 +86,9 @@ class LazyMember(DepthNetwork):
         return bool(self._held)
 
     def network(self) -> DepthNetwork:
-        """The network itself, loaded now if it has not been: on the device, or with ``offload`` on the CPU. Raises
-        CheckpointError: it cannot be loaded; the message has its name and the reason."""
-        with self._loading:  # a second thread waits instead of loading it twice
+        """The network, loaded at the first call: on the device, or with ``offload`` on the CPU. Raises CheckpointError:
+        it cannot be loaded; the message has its name and the reason."""
+        with self._loading:  # a second thread waits instead of loading again
             if not self._held:
                 self._held["network"] = self._placed(self._loaded())
             return self._held["network"]
@@ -104,8 +103,8 @@ class LazyMember(DepthNetwork):
         if not isinstance(network, DepthNetwork):
             raise CheckpointError(f"{self.name} must be a DepthNetwork, got {type(network).__name__}")
         if network.preprocess != self.preprocess:
-            declared = f"declared was {self.preprocess}"
-            raise CheckpointError(f"{self.name} has the preprocessing {network.preprocess}, {declared}")
+            expected = f"expected {self.preprocess}"
+            raise CheckpointError(f"{self.name} has the preprocessing {network.preprocess}, {expected}")
         return network.train(self.training)
 
     @property
@@ -114,20 +113,20 @@ class LazyMember(DepthNetwork):
         return takes_intrinsics(self.network())
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
-        """The network's prediction; ``intrinsics`` [B, 3, 3] [px] of ``image`` for a network that takes them. Raises
+        """The network's prediction; ``intrinsics`` [B, 3, 3] [px] of ``image`` if the network takes them. Raises
         CheckpointError: it cannot be loaded."""
         network, device = self.network(), self._where.device
         if not self.offload or device.type == "cpu":
             prediction: DepthPrediction = infer(network, image, intrinsics)
             return prediction
         tensors = {**dict(network.named_parameters()), **dict(network.named_buffers())}
-        # Copies for this call: nothing has to be copied back, and none is left behind by an error.
+        # Temporary copies: nothing is copied back, and an error leaves none behind.
         copies = {name: tensor.to(device, non_blocking=True) for name, tensor in tensors.items()}
-        with self._calling:  # the call puts them into the network while it lasts
+        with self._calling:  # functional_call swaps the copies into the network during the call
             return functional_call(network, copies, (image, intrinsics) if takes_intrinsics(network) else (image,))
 
     def train(self, mode: bool = True) -> LazyMember:
-        """Also for a network that is loaded later."""
+        """Set the mode of the network, also if it is loaded later."""
         super().train(mode)
         for network in self._held.values():
             network.train(mode)
@@ -144,7 +143,7 @@ class LazyMember(DepthNetwork):
         return self
 
     def __getstate__(self) -> dict[str, Any]:
-        """For copies and pickles: without locks, and not loaded."""
+        """The state of copies and pickles: without locks and without the loaded network."""
         return {**self.__dict__, "_held": {}, "_loading": None, "_calling": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

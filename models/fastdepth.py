@@ -1,10 +1,10 @@
 """FastDepth (Wofk et al., ICRA 2019): MobileNet encoder, depthwise NNConv5 decoder, additive skips.
 
-The encoder is MobileNet (v1): a strided convolution and 13 pairs of a 3x3 depthwise and a 1x1 pointwise
-convolution, down to 1/32 of the resolution. Each of the decoder's five layers is a 5x5 depthwise and a
-1x1 pointwise convolution, followed by doubling the resolution (every pixel repeated); the encoder's
-features at 1/8, 1/4 and 1/2 are added on the way up. A last 1x1 convolution gives depth in metres.
-The channel widths are data, because the published network is pruned to irregular ones.
+The encoder is MobileNet (v1): a strided convolution and 13 pairs of a 3x3 depthwise and a 1x1 pointwise convolution,
+down to 1/32 of the resolution. Each of the decoder's five layers is a 5x5 depthwise and a 1x1 pointwise convolution,
+followed by nearest-neighbour upsampling by 2; the encoder's features at 1/8, 1/4 and 1/2 are added to the results. A
+last 1x1 convolution gives depth in metres. The channel widths are arguments, because the published network is pruned
+to irregular ones.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ MULTIPLE = 32  # [px] five halvings
 _STRIDES = (2, 1, 2, 1, 2, 1, 2, 1, 1, 1, 1, 1, 2, 1)
 # Decoder layer -> the encoder block (at 1/8, 1/4, 1/2 of the resolution) added to its doubled output.
 _SKIPS = {1: 5, 2: 3, 3: 1}
-# [m] Depth that an untrained network predicts: typical of rooms, and where a ReLU has a gradient.
+# [m] Depth that an untrained network predicts: typical of rooms, and positive, so that a ReLU has a gradient.
 INITIAL_DEPTH = 2.5
-# [1] Largest relative difference between ONNX Runtime's depth and ours that is rounding.
+# [1] Largest difference between ONNX Runtime's depth and the network's, over the largest depth, that is rounding.
 _AGREEMENT = 1e-3
 # The last activation, and its input for INITIAL_DEPTH.
 _POSITIVE: dict[str, tuple[type[nn.Module], float]] = {
@@ -52,7 +52,7 @@ _POSITIVE: dict[str, tuple[type[nn.Module], float]] = {
 @dataclass(frozen=True)
 class FastDepthWidths:
     """Channels after the encoder's stem and 13 blocks, and after the decoder's 5 layers. Raises ValueError: not 14 and
-    5 positive numbers, or the widths that a skip adds differ."""
+    5 positive numbers, or different widths at the two ends of a skip connection."""
 
     encoder: tuple[int, ...]
     decoder: tuple[int, ...]
@@ -71,18 +71,18 @@ class FastDepthWidths:
 
     @classmethod
     def full(cls) -> FastDepthWidths:
-        """MobileNet's own widths."""
+        """MobileNet's widths."""
         return cls((32, 64, 128, 128, 256, 256, *[512] * 6, 1024, 1024), (512, 256, 128, 64, 32))
 
     @classmethod
     def pruned(cls) -> FastDepthWidths:
-        """The widths that NetAdapt left of the network trained on NYU Depth V2."""
+        """The widths of the network trained on NYU Depth V2 and pruned by NetAdapt."""
         encoder = (16, 56, 88, 120, 144, 256, 408, 376, 272, 288, 296, 328, 480, 512)
         return cls(encoder, (200, 256, 120, 56, 16))
 
     @classmethod
     def scaled(cls, multiplier: float) -> FastDepthWidths:
-        """:meth:`full` times MobileNet's width multiplier: multiples of 8, never less than .9 of the exact width.
+        """:meth:`full` times MobileNet's width multiplier: multiples of 8, at least .9 of the exact width.
         Raises ValueError: the multiplier is not positive."""
         if not 0 < multiplier < float("inf"):
             raise ValueError(f"the width multiplier must be positive, got {multiplier}")
@@ -97,7 +97,7 @@ class FastDepthWidths:
 
     @classmethod
     def of_state_dict(cls, state: Mapping[str, Tensor], source: object) -> FastDepthWidths:
-        """The widths of a :class:`FastDepth`'s own state_dict; errors as ``channels_of``."""
+        """The widths of a :class:`FastDepth` from its state_dict; errors as ``channels_of``."""
         count = len(_STRIDES)
         units = [*(f"encoder.{i}.pointwise" for i in range(1, count)), *(f"decoder.{i}.pointwise" for i in range(5))]
         widths = channels_of(state, [f"{unit}.conv.weight" for unit in ("encoder.0", *units)], "FastDepth", source)
@@ -105,7 +105,7 @@ class FastDepthWidths:
 
 
 class ConvUnit(nn.Module):
-    """Convolution with "same" padding, batch norm (or a bias instead, where it is folded), activation."""
+    """Convolution with "same" padding, batch norm (or a bias, if it is folded), activation."""
 
     def __init__(
         self, inputs: int, outputs: int, kernel: int, *, stride: int = 1, groups: int = 1, relu6: bool, norm: bool
@@ -137,18 +137,18 @@ class SeparableUnit(nn.Module):
 class FastDepth(Backbone):
     """Monocular metric depth at 224 x 224 for small computers.
 
-    ``preprocess`` makes its input: the centre crop of NYU's validation, RGB in [0, 1]. The weights are
-    those of a start from scratch; :meth:`from_onnx` and ``checkpoints.load_weights`` fill in trained ones.
+    ``preprocess`` gives the centre crop of NYU's validation, RGB in [0, 1]. The weights are initialised for training
+    from scratch; :meth:`from_onnx` and ``checkpoints.load_weights`` load trained ones.
 
     Args:
         widths: channels of every layer.
-        norm: batch norm after every convolution; False for weights that have it folded in, which can be
-            trained on, but as plain convolutions with a bias.
+        norm: batch norm after every convolution; False for weights with folded batch norms, which can be trained
+            further as plain convolutions with a bias.
         dropout: probability of decoder dropout, after the convolutions of every decoder layer.
         dropout_both: dropout after both convolutions of a decoder layer instead of the second only.
-        positive: what keeps depth positive, "relu" as published or "softplus". A ReLU can leave a pixel at 0
-            without a gradient, so softplus suits a start from scratch; weights mean one or the other.
-        size: (height, width) [px], multiples of 32, that ``preprocess`` makes.
+        positive: last activation, "relu" as published or "softplus". A ReLU can leave a pixel at 0 without a gradient,
+            so softplus suits training from scratch; trained weights require the activation of their training.
+        size: (height, width) [px] of the input, multiples of 32.
 
     Raises:
         ValueError: an argument is out of range.
@@ -196,7 +196,7 @@ class FastDepth(Backbone):
         return self.widths.decoder[::-1]
 
     def features(self, image: Tensor) -> Tensor:
-        """The decoder's output [B, widths.decoder[-1], H, W], from which the head reads depth; as :meth:`pyramid`."""
+        """The decoder's output [B, widths.decoder[-1], H, W], the head's input; arguments as :meth:`pyramid`."""
         return self.pyramid(image)[0]
 
     def pyramid(self, image: Tensor) -> list[Tensor]:
@@ -217,17 +217,17 @@ class FastDepth(Backbone):
         return maps[::-1]
 
     def depth(self, features: Tensor) -> Tensor:
-        """Depth [B, H, W] [m] from :meth:`features`, at least 0 (where a last ReLU cuts off, a pixel has none)."""
+        """Depth [B, H, W] [m] from :meth:`features`, at least 0 (where the last ReLU is 0, there is no prediction)."""
         return self.head(features)[:, 0]
 
     @classmethod
     def from_onnx(cls, path: str | Path, *, dropout: float = 0.0, size: tuple[int, int] = (224, 224)) -> FastDepth:
         """The network with the weights of an ONNX export, in eval mode.
 
-        The widths are read from the file, every weight in it must be used and every parameter filled, and on one
-        random image the network must agree with ONNX Runtime; without that package, a warning states that this was not
-        tested. Batch norms stay batch norms, so fine-tuning goes on as if from a checkpoint after
-        ``.train()``; a file that has them folded gives a network without norm layers (``norm=False``).
+        The file determines the widths. Every weight in it must be used and every parameter filled, and on one random
+        image the network must agree with ONNX Runtime; without that package, a warning states that this was not tested.
+        Batch norms stay separate, so that fine-tuning is possible after ``.train()``; a file with folded batch norms
+        gives a network without norm layers (``norm=False``).
 
         Args:
             path: the ONNX file.
@@ -238,7 +238,7 @@ class FastDepth(Backbone):
             FileNotFoundError: there is no such file.
             ValueError: the file is broken or holds another network.
         """
-        layers, expected = read_convolutions(path), 2 * (len(_STRIDES) + 5)  # pairs, but for the first and the last one
+        layers, expected = read_convolutions(path), 2 * (len(_STRIDES) + 5)  # pairs, except for the first and the last
         if len(layers) != expected:
             raise ValueError(f"{path} is not a FastDepth: expected {expected} convolutions, got {len(layers)}")
         folded = {not layer.norm for layer in layers}
@@ -257,8 +257,8 @@ class FastDepth(Backbone):
         return network
 
     def folded(self) -> FastDepth:
-        """A copy for inference with every batch norm folded into its convolution, in eval mode: the same
-        function up to rounding in about three quarters of the time on a CPU."""
+        """A copy for inference with every batch norm folded into its convolution, in eval mode: the same function up to
+        rounding, in about three quarters of the time on a CPU."""
         options = {name: getattr(self, name) for name in ("dropout", "dropout_both", "positive", "size")}
         network = FastDepth(self.widths, norm=False, **options)
         network.preprocess = self.preprocess
@@ -286,15 +286,16 @@ def load_fastdepth(
     threads: int | None = None,
     device: torch.device | str = "cpu",
 ) -> DepthNetwork:
-    """The network in an ONNX export, a .tflite file or a state_dict file, with the widths of the file.
+    """Load the network from an ONNX export, a .tflite file or a state_dict file, which determines its widths.
 
     Args:
         weights: the file.
         size, dropout, positive: as in :class:`FastDepth`.
-        runtime: "auto": an ONNX export without dropout runs in ONNX Runtime, where that is installed and has a provider
-            for the device; "onnx": it has to, where it can; "torch": as a :class:`FastDepth`, which can be trained.
-        threads: of ONNX Runtime or LiteRT; None: as many as torch uses.
-        device: where it will run.
+        runtime: "auto": an ONNX export without dropout runs in ONNX Runtime if that is installed and has a provider for
+            the device; "onnx": it runs there if possible, also without such a provider; "torch": a :class:`FastDepth`,
+            which can be trained.
+        threads: of ONNX Runtime or LiteRT; None: torch's number.
+        device: device of the inference.
 
     Raises:
         ValueError: the file does not fit, ``runtime`` is unknown, or ``positive`` contradicts an ONNX export, which
@@ -321,7 +322,7 @@ def load_fastdepth(
 
 
 def _graph(network: FastDepth, weights: Path, runtime: str, threads: int, device: torch.device) -> OnnxNetwork | None:
-    """The file in ONNX Runtime, where that can replace the network that was read from it."""
+    """The file in ONNX Runtime if it can replace the network, else None."""
     if network.dropout or runtime == "torch" or (runtime == "auto" and find_spec("onnxruntime") is None):
         return None
     providers = providers_for(device)
@@ -335,8 +336,8 @@ def _graph(network: FastDepth, weights: Path, runtime: str, threads: int, device
 
 
 def load_graph(weights: Path, spec: OnnxSpec | PlainSpec | None = None, **options: Any) -> OnnxNetwork:
-    """As :class:`OnnxNetwork`; a FastDepth whose spec has no ``preprocess`` gets FastDepth's own crop, instead of an
-    image that is stretched."""
+    """As :class:`OnnxNetwork`; without ``preprocess`` in the spec, a FastDepth gets NYU's crop instead of a stretched
+    image."""
     network = OnnxNetwork(weights, spec, **options)
     if network.spec.preprocess is None and find_spec("onnx") is not None:
         with suppress(ValueError):  # another network
@@ -346,8 +347,8 @@ def load_graph(weights: Path, spec: OnnxSpec | PlainSpec | None = None, **option
 
 
 def _require_same_function(network: FastDepth, path: str | Path) -> None:
-    """Raises ValueError where ONNX Runtime returns another depth than the network, on an image of large noise, which
-    reaches both ends of the activations."""
+    """Raise a ValueError if ONNX Runtime returns another depth than the network, on an image of large noise, which
+    reaches both limits of the activations."""
     if find_spec("onnxruntime") is None:
         warnings.warn(
             f"without onnxruntime, {path} runs in torch, more slowly, and is not compared with its graph: "

@@ -1,8 +1,8 @@
-"""Uncertainty heads: one more convolution on a network's features.
+"""Uncertainty heads: an additional convolution on a network's features.
 
 Aleatoric: Gaussian depth and log-variance (Kendall and Gal 2017). Evidential: the four parameters of a
-Normal-Inverse-Gamma distribution (Amini et al. 2020). Depth stays the backbone's own, so that pretrained
-weights keep their meaning when a head is added.
+Normal-Inverse-Gamma distribution (Amini et al. 2020). The backbone predicts depth with and without a head, so that
+pretrained weights can be used.
 """
 
 from __future__ import annotations
@@ -18,22 +18,21 @@ from ufmstar_torch.models.distribution import DepthDistribution, EvidentialDepth
 from ufmstar_torch.models.network import Backbone, DepthNetwork
 from ufmstar_torch.prediction import DepthPrediction
 
-# [log m^2] Standard deviations from 1 mm to 1 km: none that a depth network could mean lies outside, and
-# within them neither exp(s) nor exp(-s) times a squared depth leaves single precision.
+# [log m^2] Standard deviations from 1 mm to 1 km, which covers all plausible ones. Within them, exp(s) and exp(-s)
+# times a squared depth stay in the range of float32.
 LOG_VARIANCE_RANGE = (math.log(1e-6), math.log(1e6))
-# [1] Smallest nu and alpha - 1, so that both evidential variances stay finite: softplus reaches 0 in
-# single precision from about -104 on.
+# [1] Smallest nu and alpha - 1, so that both evidential variances are finite: in float32, softplus is 0 below -104.
 EVIDENCE_FLOOR = 1e-4
 # [m^2] Smallest beta: (1 mm)^2, as for the Gaussian head.
 BETA_FLOOR = 1e-6
-# [1] Share of PyTorch's initial weights. With all of them, the log-variance of a trained FastDepth in training mode (on
-# frames unlike NYU's) starts as low as -8 at some pixels: 2 cm, where it errs by a metre and more. The mean loss of
-# such a batch was up to 136 nat instead of 2, and Adam remembers a gradient for a thousand steps.
+# [1] Factor of PyTorch's initial weights. Without it, the log-variance of a trained FastDepth in training mode (on
+# frames unlike NYU's) starts as low as -8 at some pixels: 2 cm, where the error is a metre and more. The mean loss of
+# such a batch was up to 136 nat instead of 2, and Adam averages a gradient over a thousand steps.
 HEAD_SCALE = 0.1
 
 
 class UncertaintyHead(nn.Module, ABC):
-    """A 3x3 convolution on a feature map of any network, for a model of one's own; ``train.loss_of`` is its loss.
+    """A 3x3 convolution on a feature map of any network, for custom models; ``train.loss_of`` is its loss.
 
     Args:
         channels: C of the feature map.
@@ -47,8 +46,8 @@ class UncertaintyHead(nn.Module, ABC):
         self.convolution = _convolution(channels, self.outputs)
 
     def forward(self, features: Tensor, depth: Tensor) -> DepthDistribution:
-        """The distribution [B, H, W] of ``depth`` [B, H, W] [m], at least in single precision, from ``features``
-        [B, C, h, w] of any resolution."""
+        """The distribution [B, H, W] of ``depth`` [B, H, W] [m], at least in float32, from ``features`` [B, C, h, w] of
+        any resolution."""
         raw = _single(self.convolution(features))
         return self.distribution(_single(depth), resized(raw, (depth.shape[-2], depth.shape[-1])))
 
@@ -70,7 +69,7 @@ class AleatoricHead(UncertaintyHead):
 
 
 class EvidentialHead(UncertaintyHead):
-    """Learned data and model variance from one inference (Amini et al. 2020)."""
+    """A learned data and model variance from one inference (Amini et al. 2020)."""
 
     method, outputs = "evidential", 3
 
@@ -92,10 +91,10 @@ class UncertaintyNetwork(DepthNetwork):
     """A backbone with a head; made by :func:`with_head`.
 
     Args:
-        backbone: whose features and depth are used; its ``preprocess`` is this network's.
+        backbone: provides features, depth and ``preprocess``.
         kind: of the head; None: depth without a variance.
-        scales: heads, at full resolution, 1/2, 1/4, ...: as many as 4 in Poggi et al. (2020). Only the first predicts;
-            the coarser ones are there in training mode, where they teach the decoder's inner layers.
+        scales: number of heads, at full resolution, 1/2, 1/4, ...: 4 in Poggi et al. (2020). Only the first is used for
+            inference; in training mode, the coarser heads train the decoder's inner layers.
 
     Raises:
         ValueError: more scales than the backbone has.
@@ -109,7 +108,7 @@ class UncertaintyNetwork(DepthNetwork):
         self.backbone, self.kind = backbone, kind
         self.preprocess = backbone.preprocess
         if kind is not None:
-            # The convolutions alone, under the names that stored weights have.
+            # Only the convolutions, under the keys of stored weights.
             self.head = _convolution(channels[0], kind.outputs)
             if scales > 1:
                 coarse = (_convolution(channels[s], kind.outputs) for s in range(1, scales))
@@ -121,8 +120,8 @@ class UncertaintyNetwork(DepthNetwork):
         return (self.backbone,)
 
     def distribution(self, image: Tensor) -> DepthDistribution:
-        """The parameters that the losses need, each [B, H, W], of ``image`` [B, 3, H, W]; in training mode with S
-        scales [S B, H, W], full resolution first, each with the same depth."""
+        """The parameters for the losses, each [B, H, W], of ``image`` [B, 3, H, W]; in training mode with S scales
+        [S B, H, W], full resolution first, all with the same depth."""
         if self.kind is None:
             return PointDepth(_single(self.backbone.depth(self.backbone.features(image))))
         coarse = self.coarse if self.training and hasattr(self, "coarse") else ()
@@ -133,7 +132,7 @@ class UncertaintyNetwork(DepthNetwork):
         return self.kind.distribution(depth, torch.cat([resized(raw, size) for raw in raws]))
 
     def forward(self, image: Tensor) -> DepthPrediction:
-        """Depth [B, H, W] [m] and the head's variances [m^2] of ``image`` as ``preprocess`` returns it."""
+        """Depth [B, H, W] [m] and the head's variances [m^2] of the output ``image`` of ``preprocess``."""
         distribution = self.distribution(image)
         return (images_of(distribution, slice(len(image))) if self.training else distribution).prediction()
 
@@ -147,22 +146,22 @@ def with_head(backbone: Backbone, method: str, scales: int = 1) -> UncertaintyNe
 
 
 def soft_range(x: Tensor, low: float, high: float) -> Tensor:
-    """x, bent smoothly into [low, high]: equal to x well inside, never decreasing.
+    """A smooth, increasing clamp of x to [low, high], equal to x well inside.
 
-    low + softplus(x - low) from below, and the same mirrored from above. Unlike a clamp it keeps a gradient
-    outside, which falls as exp(-distance): in single precision it is 0 only some 100 beyond an end.
+    low + softplus(x - low) at the lower end, mirrored at the upper. Unlike a clamp, it has a gradient outside, which
+    decays as exp(-distance): in float32 it is 0 only from a distance of about 100 on.
     """
     x = low + F.softplus(x - low)
     return high - F.softplus(high - x)
 
 
 def resized(x: Tensor, size: tuple[int, int]) -> Tensor:
-    """x [B, C, h, w] at another size, linearly between the centres of pixels."""
+    """x [B, C, h, w] resized bilinearly, with aligned borders (``align_corners=False``)."""
     return x if x.shape[-2:] == size else F.interpolate(x, size, mode="bilinear", align_corners=False)
 
 
 def _convolution(inputs: int, outputs: int) -> nn.Conv2d:
-    """A 3x3 convolution that starts near 0, whatever features a trained backbone has; members still differ."""
+    """A 3x3 convolution with outputs initially near 0 for any features; members of an ensemble still differ."""
     head = nn.Conv2d(inputs, outputs, 3, padding=1)
     assert head.bias is not None
     with torch.no_grad():
@@ -172,6 +171,6 @@ def _convolution(inputs: int, outputs: int) -> nn.Conv2d:
 
 
 def _single(x: Tensor) -> Tensor:
-    """At least single precision: in half precision 1 + EVIDENCE_FLOOR is 1 and exp(LOG_VARIANCE_RANGE[1])
-    infinite, and a depth in bfloat16 has steps of more than a centimetre from 2 m on."""
+    """x in at least float32: in float16 1 + EVIDENCE_FLOOR is 1 and exp(LOG_VARIANCE_RANGE[1]) infinite, and bfloat16
+    resolves depths from 2 m on to more than a centimetre."""
     return x.float() if x.dtype in (torch.float16, torch.bfloat16) else x

@@ -1,8 +1,7 @@
 """Depth models of Hugging Face's ``transformers``, from a hub name or a local directory.
 
-Few configurations state what the model's numbers mean ("depth_estimation_type"). The others need a declaration, as
-every network here; where both exist, they have to agree. ``transformers`` fills weights that a file lacks with random
-numbers and goes on; here that is an error.
+Few configurations state the kind of depth ("depth_estimation_type"). The others need a declaration; if both exist, they
+must agree. ``transformers`` initialises missing weights randomly; this module raises.
 """
 
 from __future__ import annotations
@@ -27,12 +26,12 @@ from ufmstar_torch.optional import optional
 from ufmstar_torch.prediction import DepthPrediction
 
 _LINEAR, _CUBIC = 2, 3  # Pillow's numbers, which the configurations use
-# The covered architectures, and whether they always predict metric depth. Others, such as models that need a second
-# input, are refused by name.
+# The supported architectures, and whether they always predict metric depth. Others, such as models with a second input,
+# raise.
 _ALWAYS_METRIC = {"depth_anything": False, "depth_pro": True, "dpt": False, "glpn": False, "zoedepth": True}
 # "depth_estimation_type" in the terms of this package; "relative" is inverse depth in all of them.
 _DECLARED = {"metric": METRIC, "relative": "inverse"}
-# Image processors that all published checkpoints share, where preprocessor_config.json is missing.
+# Image processors of all published checkpoints, used if preprocessor_config.json is missing.
 _PUBLISHED: dict[str, dict[str, Any]] = {
     "depth_anything": {
         "size": {"height": 518, "width": 518},
@@ -42,7 +41,7 @@ _PUBLISHED: dict[str, dict[str, Any]] = {
         "resample": _CUBIC,
     }
 }
-# [1/m] Depth Pro's inverse depth is kept between these: 0.1 mm and 10 km.
+# [1/m] Range to which Depth Pro's inverse depth is clamped: 0.1 mm to 10 km.
 _INVERSE_RANGE = (1e-4, 1e4)
 _PADDING = 3.0  # [sqrt(px)] ZoeDepth pads each border by this times the square root of half the side
 
@@ -52,16 +51,16 @@ class HuggingFaceSpec(Checked):
     """The user's declarations about a checkpoint.
 
     Attributes:
-        kind: what it predicts: "metric" (GLPN, DPT trained on NYU or KITTI; Depth Pro and ZoeDepth always), "inverse"
-            (DPT and MiDaS otherwise) or "affine" (depth up to scale and shift). None = as the configuration or the
-            architecture states, if it does.
+        kind: the predicted quantity: "metric" (GLPN, DPT trained on NYU or KITTI; Depth Pro and ZoeDepth always),
+            "inverse" (DPT and MiDaS otherwise) or "affine" (depth up to scale and shift). None = from the configuration
+            or the architecture, if they determine it.
         scale: [m] length of one unit of metric depth.
         size: (height, width) [px] of the input; None = that of preprocessor_config.json.
-        keep_aspect: whether ``size`` is only approximate and the aspect kept; None = as the configuration states.
-        preprocess: instead of the checkpoint's own; excludes ``size`` and ``keep_aspect``.
-        takes_intrinsics: Depth Pro: its inverse depth becomes metric by the camera's K instead of by the field of view
-            that it estimates.
-        allow_missing: beginnings of weights that the checkpoint may lack (and that stay random), as the unused
+        keep_aspect: keep the aspect, so that ``size`` is only approximate; None = from the configuration.
+        preprocess: replaces the checkpoint's preprocessing; excludes ``size`` and ``keep_aspect``.
+        takes_intrinsics: for Depth Pro: use the camera's K to make its inverse depth metric, instead of the estimated
+            field of view.
+        allow_missing: prefixes of weights that the checkpoint may lack (they stay random), for example the unused
             "neck.fusion_stage.layers.0.residual_layer1" of Intel/dpt-large.
         alignment: of a relative network; for :func:`load_hugging_face`.
     """
@@ -78,7 +77,7 @@ class HuggingFaceSpec(Checked):
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint whose configuration has been read."""
+    """A checkpoint's configuration."""
 
     name: str  # directory or hub name
     config: dict[str, Any]  # config.json
@@ -87,29 +86,28 @@ class Checkpoint:
 
     @property
     def model_type(self) -> str:
-        """As "depth_anything", "dpt"."""
+        """For example "depth_anything" or "dpt"."""
         return str(self.config.get("model_type"))
 
     @property
     def patch(self) -> int:
-        """[px] what an input's sides have to be multiples of: the patch of a vision transformer, otherwise 1."""
+        """[px] required divisor of the input's sides: the patch of a vision transformer, otherwise 1."""
         value: Any = self.config.get("patch_size", 14 if self.model_type == "depth_anything" else 1)
         return int(max(value)) if isinstance(value, (list, tuple)) else int(value or 1)
 
 
 class RawDepth(nn.Module):
-    """A model of ``transformers`` as an image-to-map network: its own units, the input's resolution.
+    """A model of ``transformers`` as an image-to-map network, in the model's units and the input's resolution.
 
-    What a model's ``predicted_depth`` is, ``transformers`` states in the image processor's
-    ``post_process_depth_estimation``; the same is computed here. Depth Pro (Bochkovskii et al. 2025) predicts inverse
-    depth for a focal length of one image width, which its field of view makes metric; ZoeDepth (Bhat et al. 2023) sees
-    the image with reflected borders, which are cut off its depth.
+    Computes the same as the image processor's ``post_process_depth_estimation``. Depth Pro (Bochkovskii et al. 2025)
+    predicts inverse depth for a focal length of one image width; its field of view makes it metric. ZoeDepth (Bhat et
+    al. 2023) needs an image with reflected borders, which are cropped from its depth.
 
     Args:
-        model: has ``predicted_depth`` [B, h, w] in what it returns for ``pixel_values``.
-        multiple: [px] what the input's sides have to be multiples of.
-        canonical: whether the output is Depth Pro's.
-        padded: whether the model expects ZoeDepth's borders.
+        model: returns ``predicted_depth`` [B, h, w] for ``pixel_values``.
+        multiple: [px] required divisor of the input's sides.
+        canonical: the output is Depth Pro's.
+        padded: the model expects ZoeDepth's borders.
     """
 
     def __init__(self, model: nn.Module, multiple: int = 1, *, canonical: bool = False, padded: bool = False) -> None:
@@ -117,9 +115,9 @@ class RawDepth(nn.Module):
         self.model, self.multiple, self.canonical, self.padded = model, multiple, canonical, padded
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> Tensor:
-        """[B, H, W], at least in single precision, of ``image`` [B, 3, H, W]; a smaller output is enlarged.
-        ``intrinsics`` [B, 3, 3] [px] replace Depth Pro's estimate of the field of view. Raises ValueError: the image
-        has another shape, or sides that are no multiples of ``multiple``."""
+        """[B, H, W], at least in float32, of ``image`` [B, 3, H, W]; a smaller output is enlarged. ``intrinsics``
+        [B, 3, 3] [px] replace Depth Pro's estimate of the field of view. Raises ValueError: the image has another
+        shape, or sides that are no multiples of ``multiple``."""
         height, width = require_image(image, self.multiple)
         down, right = (int(math.sqrt(side / 2) * _PADDING) if self.padded else 0 for side in (height, width))
         if self.padded:
@@ -145,11 +143,11 @@ class HuggingFaceDepth(DepthNetwork):
     """A depth model of ``transformers``; made by :func:`from_hugging_face`.
 
     Attributes:
-        raw: the :class:`RawDepth`; ``raw(image)`` is what alignments are fitted to.
+        raw: the :class:`RawDepth`; fit alignments to ``raw(image)``.
         kind: "metric", "inverse" or "affine".
-        scale: [m] length of one unit, where metric.
-        max_depth: [m] the ``max_depth`` of a metric checkpoint, of which its output is a share.
-        takes_intrinsics: whether it is called as ``network(x, K)``: Depth Pro, if so declared.
+        scale: [m] length of one unit, if metric.
+        max_depth: [m] the ``max_depth`` of a metric checkpoint, whose raw output is a share of it.
+        takes_intrinsics: call it as ``network(x, K)``: for Depth Pro, if so declared.
     """
 
     max_depth: float | None = None
@@ -162,12 +160,11 @@ class HuggingFaceDepth(DepthNetwork):
         dtype: torch.dtype = torch.float32,
         model: nn.Module | None = None,
     ) -> None:
-        """From a checkpoint that was read, or the ``model`` that is in memory already, in eval mode; errors as
-        :func:`from_hugging_face`."""
+        """From a checkpoint, or with a ``model`` in memory, in eval mode; errors as :func:`from_hugging_face`."""
         super().__init__()
         self.kind, self.scale, self.source = _kind(checkpoint, spec), spec.scale, checkpoint.name
         if spec.preprocess is not None and (spec.size is not None or spec.keep_aspect is not None):
-            raise ValueError("preprocess excludes size and keep_aspect, which it contains")
+            raise ValueError("preprocess excludes size and keep_aspect: set them in preprocess")
         self.preprocess = spec.preprocess or _preprocess(checkpoint, spec.size, spec.keep_aspect)
         model = _load_model(checkpoint, dtype, spec.allow_missing) if model is None else model
         padded = checkpoint.model_type == "zoedepth" and checkpoint.processor.get("do_pad", True)
@@ -183,9 +180,9 @@ class HuggingFaceDepth(DepthNetwork):
         return self.kind == METRIC
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
-        """Depth [B, H, W] [m], at least in single precision, of ``image`` [B, 3, H, W] as ``preprocess`` returns it,
-        with ``intrinsics`` [B, 3, 3] [px] where it takes them. Raises ValueError: the network is relative, the image
-        does not fit, or the intrinsics are missing."""
+        """Depth [B, H, W] [m], at least in float32, of the output ``image`` [B, 3, H, W] of ``preprocess``, with
+        ``intrinsics`` [B, 3, 3] [px] if it takes them. Raises ValueError: the network is relative, the image does not
+        fit, or the intrinsics are missing."""
         if self.takes_intrinsics and intrinsics is None:
             raise ValueError(
                 "the network was declared to take intrinsics: call network(x, K), K [B, 3, 3] of its input x"
@@ -194,7 +191,7 @@ class HuggingFaceDepth(DepthNetwork):
         return DepthPrediction(self.aligned(None).raw(image, K) * self.scale)
 
     def aligned(self, alignment: Alignment | None) -> Any:
-        """The metric network that a relative one becomes by a fixed alignment; the weights are shared. None: this
+        """The network with a fixed alignment, which makes a relative one metric; shares the weights. None: this
         network, if it is metric. Raises ValueError: a relative network without an alignment, or an alignment for
         another kind of output."""
         if alignment is not None:
@@ -206,7 +203,7 @@ class HuggingFaceDepth(DepthNetwork):
             example = f'{{"alignment": {{"kind": "{self.kind}", "scale": ..., "shift": ...}}}}'
             raise ValueError(
                 f"{self.source or 'this network'} predicts relative depth ({what} up to scale and shift), not metres: "
-                "give it an Alignment, fitted to measured depth (fit_inverse_depth, fit_affine_depth), by "
+                "add an Alignment, fitted to measured depth (fit_inverse_depth, fit_affine_depth), by "
                 f"network.aligned(alignment), or in a spec: {example}; or use a metric checkpoint"
             )
         return self
@@ -225,11 +222,11 @@ def from_hugging_face(
     """A depth model of ``AutoModelForDepthEstimation`` in eval mode: DPT, GLPN, Depth Anything, Depth Pro, ZoeDepth.
 
     Args:
-        name_or_dir: "owner/name" on the hub, or a directory with config.json and weights; or the model or
-            depth-estimation pipeline in memory, whose dtype and device then stay.
+        name_or_dir: "owner/name" on the hub, or a directory with config.json and weights; or a model or
+            depth-estimation pipeline in memory, whose dtype and device are preserved.
         processor: image processor of a model in memory, if ``preprocess`` is not declared.
-        dtype: of the weights; what comes out is float32 in any case (float64 for float64).
-        device: where they go; None = the CPU.
+        dtype: of the weights; the output is float32 (float64 for float64).
+        device: of the weights; None = the CPU.
         revision: branch, tag or commit on the hub.
         local_files_only: do not access the hub.
         declared: kind, scale, size, keep_aspect, preprocess, takes_intrinsics and allow_missing: see
@@ -237,9 +234,10 @@ def from_hugging_face(
 
     Raises:
         TypeError: a model or pipeline in memory that does not estimate depth.
-        ValueError: the kind is declared nowhere or contradicts the configuration, a Depth Pro without the part that
-            estimates the field of view, or a value is out of range.
-        CheckpointError: a directory or checkpoint is damaged, incomplete or of another kind of model; named.
+        ValueError: the kind is not declared or contradicts the configuration, a Depth Pro without its estimator of the
+            field of view, or a value is out of range.
+        CheckpointError: a directory or checkpoint is damaged, incomplete or of another kind of model; the message names
+            it.
         FileNotFoundError, OSError: there is no such directory, or the hub cannot be reached.
         ModuleNotFoundError: transformers is missing.
     """
@@ -248,18 +246,18 @@ def from_hugging_face(
         model, checkpoint = _in_memory(name_or_dir, processor)
         return HuggingFaceDepth(checkpoint, spec, model=model).to(device)
     if processor is not None:
-        raise ValueError("processor goes with a model in memory: a checkpoint has its own")
+        raise ValueError("processor goes with a model in memory: a checkpoint contains its processor")
     return HuggingFaceDepth(read_checkpoint(name_or_dir, revision, local_files_only), spec, dtype).to(device)
 
 
 def of_transformers(network: object) -> bool:
-    """True for a model or a pipeline of ``transformers``, which is not imported for the test."""
+    """True for a model or a pipeline of ``transformers``; does not import it."""
     bases = {cls.__name__ for cls in type(network).__mro__ if cls.__module__.startswith("transformers.")}
     return bool(bases & {"PreTrainedModel", "Pipeline"})
 
 
 def _in_memory(network: Any, processor: Any) -> tuple[nn.Module, Checkpoint]:
-    """A model or pipeline, and what its checkpoint would say. Raises TypeError: it does not estimate depth."""
+    """A model or pipeline in memory, and its configuration. Raises TypeError: it does not estimate depth."""
     model, name = network, type(network).__name__
     if not isinstance(network, nn.Module):
         if network.task != "depth-estimation":
@@ -276,7 +274,7 @@ def load_hugging_face(
     spec: HuggingFaceSpec | PlainSpec | None = None,
     kind: type[HuggingFaceDepth] = HuggingFaceDepth,
 ) -> DepthNetwork:
-    """The metric network in a directory, or of a hub name; ``spec``: :class:`HuggingFaceSpec`, its plain values or a
+    """Load the metric network of a directory or hub name; ``spec``: :class:`HuggingFaceSpec`, its plain values or a
     JSON file. Raises ValueError: an unknown option, or a relative network without an alignment; others as
     :func:`from_hugging_face`."""
     declared = HuggingFaceSpec.read(spec or {})
@@ -285,15 +283,15 @@ def load_hugging_face(
 
 
 def read_checkpoint(name_or_dir: str | Path, revision: str | None = None, local_files_only: bool = False) -> Checkpoint:
-    """The configuration of a checkpoint; arguments as :func:`from_hugging_face`. Raises FileNotFoundError: a directory
-    is missing, or lacks config.json; CheckpointError: config.json or preprocessor_config.json cannot be read; OSError:
-    the hub cannot be reached, or has nothing of that name; ModuleNotFoundError: transformers is missing."""
+    """Read the configuration of a checkpoint; arguments as :func:`from_hugging_face`. Raises FileNotFoundError: a
+    directory is missing, or lacks config.json; CheckpointError: config.json or preprocessor_config.json cannot be read;
+    OSError: the hub cannot be reached, or has no such name; ModuleNotFoundError: transformers is missing."""
     optional("transformers", "a checkpoint of transformers needs the package transformers", "'ufmstar-torch[models]'")
     from transformers import PreTrainedConfig
     from transformers.image_processing_base import ImageProcessingMixin
 
     path = Path(name_or_dir).expanduser()
-    # A directory is meant where one exists, and by what no "owner/name" looks like.
+    # The name is a directory if that exists, or if it does not have the form "owner/name".
     local = path.is_dir() or path.is_absolute() or str(name_or_dir).startswith(".") or len(path.parts) != 2
     if local and not (path / "config.json").is_file():
         what = f"{path} has no config.json" if path.is_dir() else f"no such directory: {path}"
@@ -312,7 +310,7 @@ def read_checkpoint(name_or_dir: str | Path, revision: str | None = None, local_
         except (OSError, ValueError, TypeError, AttributeError) as error:
             if not local and file == "config.json":
                 raise OSError(
-                    f"{name} is no directory and cannot be had from the Hugging Face hub: {error}; with a connection, "
+                    f"{name} is no directory and cannot be read from the Hugging Face hub: {error}; with a connection, "
                     "`hf download NAME --local-dir DIR` fetches it; a directory needs no connection"
                 ) from error
             raise CheckpointError(f"{name}: {file} cannot be read: {error}") from error
@@ -320,8 +318,9 @@ def read_checkpoint(name_or_dir: str | Path, revision: str | None = None, local_
 
 
 def _load_model(checkpoint: Checkpoint, dtype: torch.dtype, allow_missing: tuple[str, ...]) -> nn.Module:
-    """The model with every weight from the checkpoint, on the CPU, or random ones. Raises CheckpointError: not a depth
-    model, damaged, or with missing, misshapen or non-finite weights; the message names the directory."""
+    """Load the model with all weights of the checkpoint, on the CPU, or with random ones (empty ``options``). Raises
+    CheckpointError: not a depth model, damaged, or with missing, misshapen or non-finite weights; the message names the
+    directory."""
     from huggingface_hub.errors import StrictDataclassError
     from safetensors import SafetensorError
     from transformers import CONFIG_MAPPING, AutoModelForDepthEstimation
@@ -352,8 +351,8 @@ def _load_model(checkpoint: Checkpoint, dtype: torch.dtype, allow_missing: tuple
 
 
 def _preprocess(checkpoint: Checkpoint, size: tuple[int, int] | None, keep_aspect: bool | None) -> Preprocess:
-    """The preprocessing that a checkpoint's image processor describes. Raises ValueError: the description lacks what is
-    needed, or contains what ``Preprocess`` cannot do."""
+    """The preprocessing of a checkpoint's image processor. Raises ValueError: its description is incomplete, or
+    contains a step that ``Preprocess`` does not support."""
     processor, name = checkpoint.processor or _PUBLISHED.get(checkpoint.model_type, {}), checkpoint.name
     declare = (
         'in a spec: {"preprocess": {"size": [518, 518], "mean": [...], "std": [...]}}, or preprocess=Preprocess(...)'
@@ -361,7 +360,7 @@ def _preprocess(checkpoint: Checkpoint, size: tuple[int, int] | None, keep_aspec
     if not processor:
         raise ValueError(
             f"{name} has no preprocessor_config.json, which states how images are resized and normalised: copy it "
-            f"there from where the weights are from, or declare it {declare}"
+            f"there from the source of the weights, or declare it {declare}"
         )
     unknown = [option for option in ("do_center_crop", "do_flip_channel_order") if processor.get(option)]
     resample = processor.get("resample", _CUBIC)
@@ -418,7 +417,7 @@ def _kind(checkpoint: Checkpoint, spec: HuggingFaceSpec) -> str:
     stated_kind = METRIC if _ALWAYS_METRIC[model_type] else _DECLARED.get(str(stated))
     if stated_kind is None and kind is None:
         raise ValueError(
-            f"{name} ({model_type}) does not say whether its depth is metric: declare kind='metric', 'inverse' "
+            f"{name} ({model_type}) does not state whether its depth is metric: declare kind='metric', 'inverse' "
             "(inverse depth up to scale and shift) or 'affine' (depth up to scale and shift)"
         )
     if stated_kind is not None and kind not in (None, stated_kind):
@@ -426,5 +425,5 @@ def _kind(checkpoint: Checkpoint, spec: HuggingFaceSpec) -> str:
         source = f"depth_estimation_type {stated!r}" if stated else f"the architecture {model_type}"
         raise ValueError(f"kind={kind!r}, but {name} states {source}, which is {stated_kind!r}{aligned}")
     if (stated_kind or kind) != METRIC and spec.scale != 1:
-        raise ValueError(f"scale goes with kind {METRIC!r} only; a relative network gets an Alignment")
+        raise ValueError(f"scale goes with kind {METRIC!r} only; use an Alignment for a relative network")
     return stated_kind or str(kind)

@@ -1,9 +1,8 @@
-"""Loaded networks as they run fastest where nothing is trained: ONNX Runtime, or torch's better form of them.
+"""The fastest form of loaded networks for inference.
 
-Weights that come as an ONNX file run in ONNX Runtime on the processor, and on a GPU where it has its
-provider; a .tflite file in LiteRT. Everything else runs in torch: ``Backbone`` networks with channels last, FastDepth
-with its batch norms folded (docs/results/speed.md has the times). The results equal those of the loaded network up to
-rounding.
+ONNX weights run in ONNX Runtime, on the CPU or on a GPU with its provider, and a .tflite file in LiteRT. All others run
+in torch: ``Backbone`` networks in channels-last format, FastDepth with folded batch norms (docs/results/speed.md has
+the times). The results equal those of the loaded network up to rounding.
 """
 
 from __future__ import annotations
@@ -31,16 +30,16 @@ BF16 = "bf16"
 
 @dataclass(frozen=True)
 class Inference(Checked):
-    """Settings with which networks are run.
+    """Settings of inference.
 
     Attributes:
         runtime: "auto" (ONNX Runtime for ONNX weights, torch for the rest), "torch" or "onnx".
         precision: "float32", or "bf16": torch's autocast to bfloat16, whose depths have 8 bits (.4 %).
-        threads: CPU threads of one inference in ONNX Runtime; None = as many as torch uses. Its threads do not spin
-            between two inferences, since the cores belong to the multiview step then.
+        threads: CPU threads of one inference in ONNX Runtime; None = torch's number. Its threads do not spin between
+            two inferences, since the multiview step then needs the cores.
 
     Raises:
-        ValueError: a value is impossible, or ONNX Runtime is asked for bf16.
+        ValueError: an invalid value, or bf16 with ONNX Runtime.
     """
 
     runtime: str = choice("auto", TORCH, ONNX)
@@ -50,10 +49,10 @@ class Inference(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.runtime == ONNX and self.precision == BF16:
-            raise ValueError("precision bf16 is torch's: ONNX Runtime computes in the file's own, use runtime torch")
+            raise ValueError("precision bf16 needs runtime torch: ONNX Runtime computes in the file's precision")
 
     def options(self, model: str, device: torch.device) -> dict[str, Any]:
-        """Further arguments of ``load_network`` for a model of that name."""
+        """Additional arguments of ``load_network`` for a model of that name."""
         threads = {"threads": self.threads or torch.get_num_threads()}
         if model == "onnx":
             return {**threads, "providers": providers_for(device)}
@@ -62,25 +61,25 @@ class Inference(Checked):
         return threads if model == "litert" else {}
 
     def ready(self, network: DepthNetwork, weights: Path, device: torch.device) -> DepthNetwork:
-        """The network in the form in which it runs on ``device``; the one given stays as it is.
+        """The fastest form of the network on ``device``; the argument is not changed.
 
         Args:
             network: loaded from ``weights``, in eval mode.
             weights: its file or directory.
-            device: where it will run.
+            device: device of the inference.
 
         Raises:
-            ValueError: the runtime or the precision is not one for these weights.
+            ValueError: the runtime or the precision does not support these weights.
         """
         if isinstance(network, OnnxNetwork | LiteRTNetwork):
             name = "ONNX Runtime" if isinstance(network, OnnxNetwork) else "LiteRT"
             if self._torch_only or (self.runtime == ONNX and name == "LiteRT"):
-                asked = f"runtime {self.runtime} in {self.precision}"
-                raise ValueError(f"{weights} is a graph that only {name} runs, not {asked}")
+                requested = f"runtime {self.runtime} in {self.precision}"
+                raise ValueError(f"{weights} is a graph that only {name} runs, not {requested}")
             return network
         if self.runtime == ONNX:
             raise ValueError(
-                "runtime onnx needs weights in an ONNX file, of the input's size and without dropout that samples, "
+                "runtime onnx needs weights in an ONNX file, of the input's size and without sampling dropout, "
                 f"got {weights}"
             )
         return _fast_in_torch(network)
@@ -102,7 +101,7 @@ def runtime_of(network: nn.Module, precision: str) -> dict[str, Any]:
 
 
 def _fast_in_torch(network: DepthNetwork) -> DepthNetwork:
-    """A copy with channels last and folded batch norms of a network for which it was measured; others as they are."""
+    """A copy with channels last and folded batch norms, for networks that are faster so; other networks unchanged."""
     modules = list(network.modules())
     if isinstance(network, BatchEnsembleMember) or not any(isinstance(module, Backbone) for module in modules):
         return network

@@ -1,4 +1,4 @@
-"""A depth network in a TensorFlow Lite file, run by LiteRT: integers in, integers out, as small computers like it."""
+"""A depth network in a TensorFlow Lite file, possibly quantised, run by LiteRT."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ class LiteRTNetwork(DeclaredNetwork):
 
     Args:
         path: the .tflite file, with one image [1, H, W, 3] or [1, 3, H, W] as input.
-        spec: declares what the file does not state: a :class:`ProgramSpec`, its plain values or a JSON file. Without
-            ``preprocess``, the image in [0, 1] is stretched to H x W.
-        threads: of the CPU; 0 leaves it to LiteRT.
+        spec: declarations that the file does not contain: a :class:`ProgramSpec`, its plain values or a JSON file.
+            Without ``preprocess``, the image in [0, 1] is stretched to H x W.
+        threads: of the CPU; 0 = LiteRT's default.
 
     Raises:
         ModuleNotFoundError: ``ai-edge-litert`` is not installed (extra ``litert``).
         FileNotFoundError: there is no such file.
-        ValueError: the file is broken, or spec and file do not fit.
+        ValueError: the file is damaged, or spec and file do not match.
     """
 
     def __init__(self, path: str | Path, spec: ProgramSpec | PlainSpec | None = None, *, threads: int = 0) -> None:
@@ -42,7 +42,7 @@ class LiteRTNetwork(DeclaredNetwork):
         self.preprocess = self.sized(declared.preprocess, self.size)
 
     def _open(self) -> None:
-        """Start an interpreter, and find the input and the declared outputs."""
+        """Create an interpreter, and look up the input and the declared outputs."""
         runtime = optional(
             "ai_edge_litert.interpreter", "a .tflite file needs the package ai-edge-litert", "'ufmstar-torch[litert]'"
         )
@@ -68,8 +68,8 @@ class LiteRTNetwork(DeclaredNetwork):
             raise ValueError(f"{self.path}: the outputs are {list(self.details)}; it has no {absent}")
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
-        """Depth [B, H, W] [m], on the image's device, of ``image`` [B, 3, H, W] as ``preprocess`` returns it. Raises
-        ValueError: another size, or an output is not as declared."""
+        """Depth [B, H, W] [m], on the image's device, of the output ``image`` [B, 3, H, W] of ``preprocess``. Raises
+        ValueError: another size, or an output contradicts the declaration."""
         if require_image(image) != self.size:
             raise ValueError(f"{self.path}: the input has {self.size} px, got {tuple(image.shape[-2:])}")
         array = image.detach().cpu().float()
@@ -94,7 +94,7 @@ class LiteRTNetwork(DeclaredNetwork):
         return outputs
 
     def __getstate__(self) -> dict[str, Any]:
-        # An interpreter cannot be copied or pickled; the copy opens its own from the same file.
+        # An interpreter cannot be copied or pickled; the copy creates one from the same file.
         unsaved = ("interpreter", "input", "details")
         return {key: value for key, value in self.__dict__.items() if key not in unsaved}
 

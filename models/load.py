@@ -1,4 +1,4 @@
-"""A network by name: what the command line and configuration files use."""
+"""Loading of networks by name, for the command line and configuration files."""
 
 from __future__ import annotations
 
@@ -30,30 +30,30 @@ def network_names() -> tuple[str, ...]:
 
 
 def load_network(name: str, weights: str | Path | None = None, **options: Any) -> DepthNetwork:
-    """A depth network in eval mode, on the CPU.
+    """Load a depth network in eval mode, on the CPU.
 
     Args:
         name: one of :func:`network_names`.
-        weights: the file it is loaded from.
-        options: what the network of that name takes:
+        weights: its file.
+        options: depend on the name:
             fastdepth: ``size``, ``dropout``, ``positive`` with a state_dict, ``runtime``, ``threads`` and ``device``.
                 ``weights``: an ONNX export, which runs in ONNX Runtime (``runtime="torch"``: in torch), a .tflite file,
                 or a state_dict (.pth, .pt, .safetensors).
             monodepth2: ``strides`` ("v1.5" or "v1"), ``size``, ``dropout``. ``weights``: a state_dict. Or a folder with
                 Monodepth2's published encoder.pth and depth.pth, and ``spec`` (see ``PublishedSpec``).
-            trained: ``backbone``, of a head on a module of one's own. ``weights``: a file of ``save_trained``; where
-                it has several members, all of them as one network (``Ensemble``). ``load_trained`` gives them one by
-                one, and takes several files.
+            trained: ``backbone``, the module below the head if it is a custom one. ``weights``: a file of
+                ``save_trained``; several members become one network (``Ensemble``). ``load_trained`` returns them
+                separately, and accepts several files.
             onnx: ``spec`` (an ``OnnxSpec``, a dict or a JSON file), ``threads``, ``providers``.
             litert: ``spec`` (a ``ProgramSpec``, a dict or a JSON file), ``threads``. ``weights``: a .tflite file.
             depth_anything: ``spec`` with "size", "keep_aspect" and, for a relative checkpoint, "alignment" (a dict or
                 a JSON file). ``weights``: a directory or hub name of ``transformers``.
-            huggingface: ``spec`` with "kind" and what else ``from_hugging_face`` takes. ``weights`` as above.
+            huggingface: ``spec`` with "kind" and other fields of ``HuggingFaceSpec``. ``weights`` as above.
             torchscript, exported: ``spec`` with "outputs" and, if needed, "preprocess" (a dict or a JSON file).
 
     Raises:
-        ValueError: no such network, no weights, or a file or declaration that does not fit.
-        TypeError: an option that this network does not have.
+        ValueError: an unknown name, no weights, or a file or declaration that does not match.
+        TypeError: an unknown option of this network.
         FileNotFoundError, ModuleNotFoundError: a file or an optional package is missing.
     """
     if name not in _LOADERS:

@@ -1,7 +1,7 @@
 """Any network below an uncertainty head: an ``nn.Module`` that returns depth or features, or a depth model of
 ``transformers``.
 
-The head reads two things: the features that go into the network's last convolution, and the depth.
+The inputs of the head are the input of the network's last convolution, and the depth.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from ufmstar_torch.models.outputs import as_map
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction, takes_intrinsics
 
-_PROBE = (480, 640)  # [px] of the grey image on which a network is tried
+_PROBE = (480, 640)  # [px] of the grey image for a test inference
 
 
 @dataclass(frozen=True)
 class ModuleSpec(Checked):
-    """A network below a head, apart from its weights; made by :meth:`of`.
+    """A network below a head, without its weights; made by :meth:`of`.
 
     Attributes:
         source: its class, or the directory or hub name of its checkpoint.
-        preprocess: what its input needs.
-        part: dotted name of the part whose input the head reads; "" = the image; None = what the network returns, which
-            are features without a depth.
-        channels: of what the head reads.
-        checkpoint: config.json and preprocessor_config.json of ``transformers``; None: a module that only Python makes.
-        declared: about that checkpoint.
+        preprocess: preprocessing of its input.
+        part: dotted name of the submodule whose input is the head's input; "" = the image; None = the network's output,
+            features without a depth.
+        channels: of the head's input, without the depth.
+        checkpoint: config.json and preprocessor_config.json of ``transformers``; None: a module built in Python.
+        declared: declarations about that checkpoint.
     """
 
     source: str
@@ -50,17 +50,17 @@ class ModuleSpec(Checked):
 
     @classmethod
     def of(cls, network: nn.Module, preprocess: Preprocess, part: str | None = None, **about: Any) -> ModuleSpec:
-        """The specification of a network, found by one inference.
+        """The specification of a network, determined by one inference.
 
         Args:
             network: returns depth [B, 1, H, W] or [B, H, W] [m], of its input's size or smaller, a
                 ``DepthPrediction``, or features [B, C, h, w].
-            preprocess: what its input needs.
-            part: the part whose input the head reads; None = the last ``nn.Conv2d`` that runs.
+            preprocess: preprocessing of its input.
+            part: the submodule whose input is the head's input; None = the last ``nn.Conv2d`` that runs.
             about: other fields.
 
         Raises:
-            ValueError: it returns something else, needs intrinsics, or has no such part.
+            ValueError: another output, a network that needs intrinsics, or no such submodule.
         """
         if takes_intrinsics(network):
             raise ValueError("backbone: a network that takes intrinsics cannot have a head")
@@ -73,7 +73,7 @@ class ModuleSpec(Checked):
 
         def note(name: str, value: Any) -> None:
             if part in (None, name) and isinstance(value, Tensor) and value.dim() == 4:
-                read.pop(name, None)  # the order is that of the last calls
+                read.pop(name, None)  # to keep the order of the last calls
                 read[name] = value.shape[1]
 
         hooks = [
@@ -99,11 +99,11 @@ class ModuleSpec(Checked):
         return cls(source, preprocess, *(list(read.items())[-1] if read else ("", 3)), **about)
 
     def build(self, weights: bool = False) -> nn.Module:
-        """The network of a checkpoint, with its ``weights`` or random ones. Raises ValueError: Python has to make it;
-        others as ``from_hugging_face``."""
+        """Build the network of a checkpoint, with its ``weights`` or random ones. Raises ValueError: the network has no
+        checkpoint; others as ``from_hugging_face``."""
         if self.checkpoint is None:
             raise ValueError(
-                f"{self.source} is a network of your own, which only Python can make: "
+                f"{self.source} is a network of your own, which must be built in Python: "
                 "load_network('trained', FILE, backbone=NETWORK)"
             )
         declared = self.declared or HuggingFaceSpec()
@@ -113,12 +113,12 @@ class ModuleSpec(Checked):
 
 
 class ModuleBackbone(Backbone):
-    """A network below a head; ``features`` are what its part reads, at the image's resolution, and the depth.
+    """A network below a head; ``features`` are the input of its ``part``, at the image's resolution, and the depth.
 
     Args:
-        network: becomes a part of this one. While none of it is trained, it stays in eval mode.
-        spec: of it.
-        dropout: probability of dropout on what the part reads.
+        network: becomes a submodule. If none of its parameters is trained, it stays in eval mode.
+        spec: of the network.
+        dropout: probability of dropout on the input of ``part``.
     """
 
     def __init__(self, network: nn.Module, spec: ModuleSpec, dropout: float = 0.0) -> None:
@@ -137,15 +137,15 @@ class ModuleBackbone(Backbone):
         return (self.network,)
 
     def train(self, mode: bool = True) -> ModuleBackbone:
-        """See ``nn.Module``; a network that is not trained stays in eval mode."""
+        """See ``nn.Module``; a network without trained parameters stays in eval mode."""
         super().train(mode)
         if not any(p.requires_grad for p in self.network.parameters()):
             self.network.eval()
         return self
 
     def features(self, image: Tensor) -> Tensor:
-        """[B, channels + 1, H, W] of ``image`` [B, 3, H, W]. Raises ValueError: the network returns something else than
-        its specification says."""
+        """[B, channels + 1, H, W] of ``image`` [B, 3, H, W]. Raises ValueError: the network's output contradicts its
+        specification."""
         size, read = (image.shape[-2], image.shape[-1]), [image]
 
         def replace(_: nn.Module, inputs: tuple[Any, ...], by_name: dict[str, Any]) -> Any:
@@ -155,7 +155,7 @@ class ModuleBackbone(Backbone):
             named = dict(zip(by_name, values[len(inputs) :], strict=True))
             return tuple(values[: len(inputs)]), named
 
-        # For the length of a call: a copy of the network, or one of its layers, would take a lasting hook with it.
+        # The hook exists during a call only: copies of the network or its layers must not contain it.
         part = self.network.get_submodule(self.part) if self.part else None
         hooks = [] if part is None else [part.register_forward_pre_hook(replace, with_kwargs=True)]
         try:
@@ -165,7 +165,7 @@ class ModuleBackbone(Backbone):
                 hook.remove()
         if self.part is None:
             if not _is_features(output):
-                raise ValueError("the network must return features [B, C, h, w], as when it was described")
+                raise ValueError("the network must return features [B, C, h, w], as its specification states")
             read[0] = self.dropout(output)
             depth = F.softplus(resized(self.last(read[0]), size))
         else:
@@ -182,7 +182,7 @@ def _is_features(output: Any) -> bool:
 
 
 def _depth_of(output: Any) -> Tensor:
-    """[B, H, W] of what a network returns."""
+    """The depth [B, H, W] in a network's output."""
     if isinstance(output, DepthPrediction):
         return output.depth
     if isinstance(output, Tensor):

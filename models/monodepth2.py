@@ -1,10 +1,10 @@
 """ResNet50-Monodepth2: a ResNet encoder with Monodepth2's U-Net decoder (Godard et al., ICCV 2019), predicting
 metric depth.
 
-Written from the paper (section 3 and the supplementary's table of layers): five levels of 3x3 convolution,
-ELU, doubling by repeating pixels, concatenation with the encoder's features and another 3x3 convolution, with
-reflected borders. Where Monodepth2 ends in a sigmoid disparity at four scales, one convolution and a softplus
-give depth in metres at full resolution.
+Written from the paper (section 3 and the supplementary's table of layers): five levels of 3x3 convolution, ELU,
+nearest-neighbour upsampling by 2, concatenation with the encoder's features and another 3x3 convolution, with reflected
+borders. Instead of Monodepth2's sigmoid disparities at four scales, one convolution and a softplus give depth in metres
+at full resolution.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.optional import optional
 
 MULTIPLE = 32  # [px] five halvings
-SMALLEST = 64  # [px] borders cannot be reflected in a map of a single pixel
+SMALLEST = 64  # [px] reflection padding needs maps of more than one pixel
 LEVELS = 5
 LAYERS = (18, 34, 50)
 STRIDES = ("v1.5", "v1")
@@ -34,18 +34,18 @@ DECODER_WIDTHS = (16, 32, 64, 128, 256)
 # ImageNet's colour statistics, for RGB in [0, 1].
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-# [m] About the depth that an untrained network predicts: typical of rooms.
+# [m] Approximate depth that an untrained network predicts: typical of rooms.
 INITIAL_DEPTH = 2.5
 
 
 class ResNetEncoder(nn.Module):
-    """torchvision's ResNet without its classifier, under torchvision's own keys.
+    """torchvision's ResNet without its classifier, with torchvision's keys.
 
     Args:
         layers: 18, 34 or 50.
-        strides: where the bottlenecks that halve the resolution do so: "v1.5", in their 3x3 convolution, as in
-            torchvision, or "v1", in the 1x1 before it, as in the original paper. Weights were trained for one of
-            the two and do not state which. Without bottlenecks (18, 34) there is no such difference.
+        strides: the strided convolution of a bottleneck: "v1.5", the 3x3 convolution, as in torchvision, or "v1", the
+            1x1 before it, as in the original paper. Weights are trained for one of them and do not state it. There are
+            no bottlenecks in 18 and 34 layers.
 
     Raises:
         ValueError: other layers or strides.
@@ -78,8 +78,8 @@ class ResNetEncoder(nn.Module):
 
 
 class UpConvolution(nn.Module):
-    """One level of the decoder: convolve (and drop with probability ``between``), double, concatenate with the skip,
-    convolve, drop with probability ``dropout``."""
+    """One level of the decoder: convolution, dropout with probability ``between``, upsampling by 2, concatenation with
+    the skip, convolution, dropout with probability ``dropout``."""
 
     def __init__(self, inputs: int, skip: int, outputs: int, dropout: float, between: float) -> None:
         super().__init__()
@@ -97,9 +97,9 @@ class UpConvolution(nn.Module):
 class MonodepthResNet(Backbone):
     """Monocular metric depth with a ResNet encoder and Monodepth2's decoder.
 
-    ``preprocess`` makes its input: NYU's crop, 224 x 224, normalised by ImageNet's colour statistics. The
-    weights are those of a start from scratch (depth about :data:`INITIAL_DEPTH` everywhere);
-    :meth:`imagenet`, ``load_monodepth2`` and ``checkpoints.load_weights`` fill in trained ones.
+    ``preprocess`` gives NYU's crop, 224 x 224, normalised by ImageNet's colour statistics. The weights are initialised
+    for training from scratch (depth about :data:`INITIAL_DEPTH` everywhere); :meth:`imagenet`, ``load_monodepth2`` and
+    ``checkpoints.load_weights`` load trained ones.
 
     Args:
         layers: of the encoder, 18, 34 or 50.
@@ -107,9 +107,9 @@ class MonodepthResNet(Backbone):
         dropout: probability of decoder dropout, after each of the five levels.
         dropout_both: dropout after both convolutions of a level instead of the second only.
         decoder: channels of the five levels, full resolution first.
-        disparity: (least, largest) depth in units of ``scale`` [m], between whose inverses the last convolution's
-            sigmoid interpolates, as in Monodepth2; None = its softplus is depth.
-        size: (height, width) [px], multiples of 32 and at least 64, that ``preprocess`` makes.
+        disparity: (least, largest) depth in units of ``scale`` [m]: the last convolution's sigmoid interpolates between
+            their inverses, as in Monodepth2; None = its softplus is depth.
+        size: (height, width) [px] of the input, multiples of 32 and at least 64.
 
     Raises:
         ValueError: an argument is out of range.
@@ -142,7 +142,7 @@ class MonodepthResNet(Backbone):
         self.encoder = ResNetEncoder(layers, strides)
         skips = (0, *self.encoder.channels[:-1])  # of levels 0 to 4
         inputs = (*decoder[1:], self.encoder.channels[-1])
-        # levels[i] makes features at 1/2^i of the resolution; level 4 runs first.
+        # levels[i] returns features at 1/2^i of the resolution; level 4 runs first.
         self.levels = nn.ModuleList(
             UpConvolution(inputs[i], skips[i], decoder[i], dropout, dropout if dropout_both else 0.0)
             for i in range(LEVELS)
@@ -157,13 +157,13 @@ class MonodepthResNet(Backbone):
         return self._widths
 
     def features(self, image: Tensor) -> Tensor:
-        """The decoder's output [B, decoder[0], H, W], from which the head reads depth; as :meth:`pyramid`."""
+        """The decoder's output [B, decoder[0], H, W], the head's input; arguments as :meth:`pyramid`."""
         return self.pyramid(image)[0]
 
     def pyramid(self, image: Tensor) -> list[Tensor]:
         """The outputs of the decoder's five levels, [B, pyramid_channels[s], H / 2^s, W / 2^s], full resolution first,
-        of ``image`` [B, 3, H, W], normalised as ``preprocess`` does. Raises ValueError: another shape or type, or H or
-        W no multiple of 32 from 64 on."""
+        of ``image`` [B, 3, H, W], normalised as by ``preprocess``. Raises ValueError: another shape or type, or H or W
+        no multiple of 32 from 64 on."""
         require_image(image, MULTIPLE, SMALLEST)
         skips = self.encoder(image)
         x, maps = skips.pop(), []
@@ -173,8 +173,7 @@ class MonodepthResNet(Backbone):
         return maps[::-1]
 
     def depth(self, features: Tensor) -> Tensor:
-        """Depth [B, H, W] [m] from :meth:`features`: a 3x3 convolution and softplus, hence positive; or the inverse of
-        its disparity."""
+        """Depth [B, H, W] [m] from :meth:`features`: a 3x3 convolution and softplus, or the inverse of a disparity."""
         raw = self.head(features)[:, 0]
         if self.disparity is None:
             return F.softplus(raw)
@@ -190,15 +189,15 @@ class MonodepthResNet(Backbone):
     def imagenet(
         cls, weights: Any = None, layers: int = 50, *, strides: str = "v1.5", **options: Any
     ) -> MonodepthResNet:
-        """The network with an encoder trained on ImageNet, the decoder untrained.
+        """The network with an encoder trained on ImageNet and an untrained decoder.
 
         Args:
-            weights: a file (.pth, .safetensors, ...) of torchvision's keys, with or without classifier, of any
-                floating-point type (a batch norm's variance too large for half precision, stored as infinity,
-                is taken as half's largest number, 65504); or one of torchvision's weights enums, which it
-                downloads once; None: torchvision's default for these layers.
+            weights: a file (.pth, .safetensors, ...) with torchvision's keys, with or without classifier, of any
+                floating-point dtype (a batch norm's variance that overflowed to infinity in float16 is set to its
+                largest number, 65504); or one of torchvision's weights enums, which it downloads once; None:
+                torchvision's default for these layers.
             layers: 18, 34 or 50.
-            strides: what the weights were trained with; "v1.5" for all of torchvision's own.
+            strides: of the weights' training; "v1.5" for torchvision's weights.
             options: other arguments of the class.
 
         Raises:
@@ -220,28 +219,28 @@ class MonodepthResNet(Backbone):
 
 
 def shape_of_state_dict(state: Mapping[str, Tensor], source: object) -> tuple[int, tuple[int, ...]]:
-    """(layers, decoder) of the :class:`MonodepthResNet` that a state_dict belongs to; the strides do not show in it.
-    Errors as ``channels_of``."""
+    """(layers, decoder) of the :class:`MonodepthResNet` of a state_dict, which does not determine the strides. Errors
+    as ``channels_of``."""
     keys = ["encoder.layer1.0.conv2.weight", *(f"levels.{i}.before.weight" for i in range(LEVELS))]
     _, *decoder = channels_of(state, keys, "MonodepthResNet", source)
     return layers_of(state), tuple(decoder)
 
 
 def layers_of(state: Mapping[str, Any]) -> int:
-    """Layers of the ResNet behind "encoder.": two, or three, blocks of two convolutions in the first stage; or three of
-    three."""
+    """Layers of the ResNet under "encoder.": its first stage has two (18) or three (34) blocks of two convolutions, or
+    three blocks of three (50)."""
     deep = 34 if "encoder.layer1.2.conv1.weight" in state else 18
     return 50 if "encoder.layer1.0.conv3.weight" in state else deep
 
 
 def _fill_encoder(encoder: ResNetEncoder, state: Mapping[str, Tensor], source: str) -> None:
-    """Load every tensor of a classifier's weights but the classifier itself; errors as ``checkpoints.fill``."""
-    # Files older than PyTorch 0.4.1 do not count batches; nothing here reads the count.
+    """Load the weights of a ResNet without the classifier's; errors as ``checkpoints.fill``."""
+    # Files older than PyTorch 0.4.1 lack num_batches_tracked, which is not used.
     filled = {key: value for key, value in encoder.state_dict().items() if key.endswith("num_batches_tracked")}
     filled |= {key: value for key, value in state.items() if not key.startswith("fc.")}
     for key, value in filled.items():
         if value.dtype == torch.float16 and key.endswith("running_var"):
-            # An overflowed variance as the largest one: as infinity it would make its channel constant.
+            # A variance that overflowed to infinity would make its channel constant.
             filled[key] = value.clamp(max=torch.finfo(torch.float16).max)
     fill(encoder, filled, source)
 
@@ -251,5 +250,5 @@ def _convolution(inputs: int, outputs: int) -> nn.Conv2d:
 
 
 def _torchvision_models() -> Any:
-    """torchvision's, imported when first needed: it takes seconds."""
+    """torchvision.models, imported lazily, because that takes seconds."""
     return optional("torchvision.models", "a ResNet encoder needs torchvision", "torchvision")

@@ -1,8 +1,8 @@
-"""Weights from files in a :class:`MonodepthResNet`, the published ones of Monodepth2 among them.
+"""Loading of a :class:`MonodepthResNet` from files, including the published weights of Monodepth2.
 
-Its repository publishes two state_dicts. ``encoder.pth`` holds torchvision's keys behind "encoder." and the
-image size it was trained at. ``depth.pth`` numbers the decoder's convolutions in the order of execution: levels 4
-to 0 with two each, then one convolution per scale that ends in disparity.
+Its repository publishes two state_dicts. ``encoder.pth`` has torchvision's keys with the prefix "encoder.", and the
+image size of the training. ``depth.pth`` numbers the decoder's convolutions in the order of execution: two for each of
+the levels 4 to 0, then one disparity convolution per scale.
 """
 
 from __future__ import annotations
@@ -31,32 +31,31 @@ from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import PlainSpec
 from ufmstar_torch.models.preprocess import Preprocess
 
-# Keys of encoder.pth that are no weights.
+# Keys of encoder.pth other than weights.
 _NO_WEIGHTS = ("height", "width", "use_stereo")
-# [m] Length of a unit of depth of networks that were trained on KITTI's stereo pairs, whose cameras are .54 m apart and
-# in training .1 units.
+# [m] Length of a unit of depth of networks that were trained on KITTI's stereo pairs: the baseline of .54 m is .1 units
+# in training.
 STEREO_SCALE = 5.4
-# Monodepth2 normalises every colour of an image in [0, 1] by these.
+# Monodepth2's mean and standard deviation for all colours of an image in [0, 1].
 _MEAN, _STD = 0.45, 0.225
 _CONVOLUTION = re.compile(r"decoder\.(\d+)(?:\.conv)?\.conv\.(weight|bias)")
 
 
 @dataclass(frozen=True)
 class Imported:
-    """The tensors of two files that were loaded, and those that were not."""
+    """The loaded and the skipped tensors of two files."""
 
     loaded: tuple[str, ...]  # keys of the network that were filled
-    skipped: Mapping[str, str]  # keys of the files that were not used, with the reason
-    unchanged: tuple[str, ...]  # keys of the network that stayed as they were: of a metric network its head
+    skipped: Mapping[str, str]  # unused keys of the files, with the reason
+    unchanged: tuple[str, ...]  # keys of the network that were not filled: the head of a metric network
 
 
 def load_monodepth2(network: MonodepthResNet, encoder_path: str | Path, depth_path: str | Path) -> Imported:
     """Fill a network's encoder and decoder with published Monodepth2 weights, in place.
 
-    A network with ``disparity`` gets the finest disparity convolution too. Another one does not predict depth yet: its
-    head stays untrained. The first convolution is rescaled from
-    Monodepth2's normalisation of colours to ImageNet's, exactly but for the border, which is padded with
-    ImageNet's mean instead of its grey.
+    A network with ``disparity`` also gets the finest disparity convolution. Without it, the head stays untrained. The
+    first convolution is rescaled from Monodepth2's normalisation of colours to ImageNet's. This is exact except at the
+    border, which is padded with ImageNet's mean instead of Monodepth2's grey.
 
     Args:
         network: with ``strides="v1.5"`` and the layers and channels of the files.
@@ -65,7 +64,7 @@ def load_monodepth2(network: MonodepthResNet, encoder_path: str | Path, depth_pa
     Raises:
         ValueError: the network's strides are not "v1.5".
         FileNotFoundError: a file is missing.
-        CheckpointError: a file is damaged, or a tensor does not fit the network, which is unchanged then.
+        CheckpointError: a file is damaged, or a tensor does not fit the network, which is then unchanged.
     """
     if network.strides != "v1.5":
         raise ValueError(f"Monodepth2's encoders have strides 'v1.5', got a network with {network.strides!r}")
@@ -81,7 +80,7 @@ def load_monodepth2(network: MonodepthResNet, encoder_path: str | Path, depth_pa
         else:
             loaded[target] = value
     head = tuple(key for key in expected if key.startswith("head.") and not disparity)
-    uncounted = [key for key in expected if key.endswith("num_batches_tracked")]  # old files lack it, nothing reads it
+    uncounted = [key for key in expected if key.endswith("num_batches_tracked")]  # missing in old files, and unused
     remaining = {key: expected[key] for key in (*head, *uncounted)}
     fill(network, remaining | loaded, f"{encoder_path} with {depth_path}")
     _to_imagenet_colours(network)
@@ -93,9 +92,9 @@ class PublishedSpec(Checked):
     """The meaning of published Monodepth2 weights' disparity.
 
     Attributes:
-        scale: [m] length of a unit of depth; None = 5.4 where the weights were trained on stereo pairs.
-        alignment: instead of it: "affine" of the depth in units, or "inverse" of its inverse.
-        least, largest: depth between whose inverses the disparity lies [units].
+        scale: [m] length of a unit of depth; None = 5.4 for weights that were trained on stereo pairs.
+        alignment: replaces the scale: "affine" for the depth in units, or "inverse" for its inverse.
+        least, largest: depths [units] whose inverses bound the disparity.
         size: (height, width) [px] of the input; None = as in training.
     """
 
@@ -107,7 +106,7 @@ class PublishedSpec(Checked):
 
 
 class Units(nn.Module):
-    """A network's depth [B, H, W], or its inverse, as an alignment takes it."""
+    """A network's depth [B, H, W], or its inverse, the input of an alignment."""
 
     def __init__(self, network: DepthNetwork, inverse: bool) -> None:
         super().__init__()
@@ -120,9 +119,9 @@ class Units(nn.Module):
 
 
 def load_published(folder: Path, spec: PublishedSpec | PlainSpec | None = None) -> DepthNetwork:
-    """Metric depth by the weights in a folder with Monodepth2's encoder.pth and depth.pth; ``spec``: declarations,
-    plain values or a JSON file. Raises FileNotFoundError, CheckpointError: as :func:`load_monodepth2`; ValueError:
-    weights of single images without a scale, or an impossible value."""
+    """Load a metric network from a folder with Monodepth2's encoder.pth and depth.pth; ``spec``: declarations, plain
+    values or a JSON file. Raises FileNotFoundError, CheckpointError: as :func:`load_monodepth2`; ValueError: weights
+    trained on single images without a scale, or an invalid value."""
     s, files = PublishedSpec.read(spec or {}), (folder / "encoder.pth", folder / "depth.pth")
     if missing := [path for path in files if not path.is_file()]:
         raise FileNotFoundError(f"no {missing[0]}; expected a folder with Monodepth2's encoder.pth and depth.pth")
@@ -148,8 +147,8 @@ def load_published(folder: Path, spec: PublishedSpec | PlainSpec | None = None) 
 def load_monodepth_resnet(
     weights: Path, size: tuple[int, int] = (224, 224), dropout: float = 0.0, strides: str = "v1.5", spec: Any = None
 ) -> DepthNetwork:
-    """The network in a state_dict file, with the layers and widths of the file; errors as
-    ``checkpoints.load_weights``. Of a folder, :func:`load_published` with ``spec``."""
+    """Load a network from a state_dict file, which determines its layers and widths; errors as
+    ``checkpoints.load_weights``. For a folder, :func:`load_published` with ``spec``."""
     if weights.is_dir():
         return load_published(weights, spec)
     state = load_state_dict_file(weights)
@@ -160,8 +159,8 @@ def load_monodepth_resnet(
 
 
 def _network_key(key: str) -> str | None:
-    """The network's key for one of the files, "head." of the finest disparity; None of a coarser one; an unknown key as
-    it is."""
+    """The network's key for a key of the files; "head." for the finest disparity, None for coarser ones. Unknown keys
+    are returned unchanged."""
     match = _CONVOLUTION.fullmatch(key)
     if match is None:
         return key
@@ -175,8 +174,8 @@ def _network_key(key: str) -> str | None:
 def _to_imagenet_colours(network: MonodepthResNet) -> None:
     """Rescale the first convolution, in place.
 
-    With ImageNet's x = (c - m) / s for a colour c, Monodepth2's input is (x s + m - .45) / .225: a factor per
-    channel, and an offset, constant over the image, that batch norm subtracts again with its mean.
+    With ImageNet's x = (c - m) / s for a colour c, Monodepth2's input is (x s + m - .45) / .225: a factor per channel,
+    and a constant offset, which is subtracted from batch norm's mean.
     """
     weight, mean = network.encoder.conv1.weight, network.encoder.bn1.running_mean
     s, m = torch.tensor(IMAGENET_STD), torch.tensor(IMAGENET_MEAN)

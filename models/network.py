@@ -21,25 +21,25 @@ if TYPE_CHECKING:
 class DepthNetwork(nn.Module, ABC):
     """A monocular network that predicts metric depth.
 
-    ``x, K = network.preprocess(image, intrinsics)`` turns a camera image into the network's input ``x``
-    [B, 3, H, W] with its intrinsics K, and ``network(x)`` is a :class:`DepthPrediction` at that resolution.
+    ``x, K = network.preprocess(image, intrinsics)`` converts a camera image to the network's input ``x`` [B, 3, H, W]
+    with its intrinsics K, and ``network(x)`` returns a :class:`DepthPrediction` at that resolution.
     """
 
     preprocess: Preprocess
 
     @property
     def wrapped(self) -> Sequence[nn.Module]:
-        """The networks that this one calls; its declarations below are theirs."""
+        """The networks that this one calls. By default, the properties below are derived from theirs."""
         return ()
 
     @property
     def takes_intrinsics(self) -> bool:
-        """True if it is called as ``network(x, K)``, with K [B, 3, 3] of ``x`` [px]."""
+        """True if it must be called as ``network(x, K)``, with K [B, 3, 3] of ``x`` [px]."""
         return any(takes_intrinsics(network) for network in self.wrapped)
 
     @property
     def max_depth(self) -> float | None:
-        """[m] The largest depth that it can predict; None where it is not bounded, or not known."""
+        """[m] The largest depth that it can predict; None if unbounded or unknown."""
         return stated_range(self.wrapped)
 
     @property
@@ -54,15 +54,15 @@ class DepthNetwork(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, image: Tensor) -> DepthPrediction:
-        """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] as ``preprocess`` returns it; a second argument, the image's
-        intrinsics [B, 3, 3] [px], of a network that takes them (``infer`` passes what a network takes)."""
+        """Depth [B, H, W] [m] of the output ``image`` [B, 3, H, W] of ``preprocess``. A network that takes intrinsics
+        has a second argument [B, 3, 3] [px] (``infer`` passes the right arguments)."""
 
 
 class Backbone(DepthNetwork):
-    """An encoder and decoder that uncertainty heads can be put on.
+    """An encoder and decoder for uncertainty heads.
 
-    Depth is read from the decoder's last features, and so is everything that a head adds. The two steps are
-    separate so that a head shares the features without computing them twice.
+    Depth and the outputs of a head are functions of the decoder's last features. ``features`` and ``depth`` are
+    separate, so that a head can share the features.
     """
 
     feature_channels: int
@@ -85,21 +85,21 @@ class Backbone(DepthNetwork):
         """Depth [B, H, W] [m] from :meth:`features`."""
 
     def forward(self, image: Tensor) -> DepthPrediction:
-        """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] as ``preprocess`` returns it; no variances."""
+        """Depth [B, H, W] [m] of the output ``image`` [B, 3, H, W] of ``preprocess``, without variances."""
         return DepthPrediction(self.depth(self.features(image)))
 
 
 class DeclaredNetwork(DepthNetwork):
-    """A network whose raw outputs are declared.
+    """A network with declared raw outputs.
 
     Attributes:
         outputs: the declaration.
-        path: the file that the network is in, which error messages name; "" without one.
+        path: the network's file, for error messages; "" = none.
     """
 
     outputs: OutputSpec
     path: str = ""
-    _has_predicted: bool = False  # a depth at some pixel
+    _has_predicted: bool = False  # after the first output with a depth
 
     @property
     def takes_intrinsics(self) -> bool:
@@ -108,17 +108,17 @@ class DeclaredNetwork(DepthNetwork):
 
     @property
     def states_confidence(self) -> bool:
-        """True if a confidence is declared, or stated by a network that returns a ``DepthPrediction``."""
+        """True if a confidence is declared, or the wrapped network predicts one."""
         return self.outputs.confidence is not None or super().states_confidence
 
     @property
     def max_depth(self) -> float | None:
-        """[m] As declared, or stated by a network that returns a ``DepthPrediction``."""
+        """[m] The declared largest depth, or that of the wrapped network."""
         return self.outputs.max_depth or super().max_depth
 
     def sized(self, preprocess: Preprocess | None, size: tuple[int, int]) -> Preprocess:
-        """The declared preprocessing with the (height, width) [px] of the file's input. Raises ValueError: another size
-        is declared."""
+        """The declared preprocessing with the (height, width) [px] of the file's input. Raises ValueError: the
+        declaration has another size."""
         preprocess = preprocess or Preprocess()
         if preprocess.size not in (None, size):
             fixed = f"{self.path}: the input has a fixed size of {size[0]} x {size[1]} px"
@@ -126,8 +126,8 @@ class DeclaredNetwork(DepthNetwork):
         return replace(preprocess, size=size)
 
     def declared(self, result: Any, image: Tensor, intrinsics: Tensor | None) -> DepthPrediction:
-        """The prediction in what the network returned; arguments and errors as :meth:`OutputSpec.prediction`, with the
-        file's name. The first one must have a depth; a later one without any is a frame without a valid pixel."""
+        """Convert the network's result to a prediction; arguments and errors as :meth:`OutputSpec.prediction`, with the
+        file's name. The first result must have a depth; a later one may have no valid pixel."""
         try:
             prediction = self.outputs.prediction(result, image, intrinsics, require_depth=not self._has_predicted)
         except (TypeError, ValueError) as error:
@@ -140,7 +140,7 @@ class DeclaredNetwork(DepthNetwork):
 
 @contextmanager
 def in_eval_mode(network: nn.Module) -> Iterator[None]:
-    """Without gradients and in eval mode; then each part is in its own mode again."""
+    """Disable gradients and set eval mode; restore the mode of each submodule afterwards."""
     modes = {part: part.training for part in network.modules()}
     network.eval()
     try:
@@ -156,7 +156,7 @@ def require_image(image: Tensor, multiple: int = 1, smallest: int = 1) -> tuple[
     multiples of ``multiple`` and at least ``smallest``."""
     if image.dim() != 4 or image.shape[1] != 3 or not image.is_floating_point():
         shape = f"{image.dtype} {tuple(image.shape)}"
-        raise ValueError(f"image must be floating-point [B, 3, H, W] as the network's preprocess makes it, got {shape}")
+        raise ValueError(f"image must be floating-point [B, 3, H, W], as from the network's preprocess, got {shape}")
     height, width = image.shape[-2:]
     if not fits(height, width, multiple, smallest):
         expected = f"multiples of {multiple} px" + (f", at least {smallest}" if smallest > multiple else "")

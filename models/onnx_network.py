@@ -1,7 +1,7 @@
 """Any depth network that was exported to ONNX, run by ONNX Runtime.
 
 Names, sizes, types and a fixed batch are read from the graph. An :class:`OnnxSpec` declares the scale of the input and
-the unit of the output, which no graph states.
+the unit of the output, which a graph does not contain.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _NUMPY_TYPES = {
     "tensor(uint8)": np.uint8,
 }
 _FLOATS = [name for name, kind in _NUMPY_TYPES.items() if kind is not np.uint8]
-_ERRORS_ONLY = 3  # ONNX Runtime's severity; below it, it reports every unused weight of a file
+_ERRORS_ONLY = 3  # ONNX Runtime's severity; a lower one logs every unused weight of a file
 
 
 @dataclass(frozen=True)
@@ -40,13 +40,13 @@ class OnnxSpec(ProgramSpec):
     """Declarations that an ONNX file does not contain.
 
     Attributes:
-        outputs: as in :class:`ProgramSpec`; outputs are named.
-        preprocess: what the input needs; None: the image in [0, 1], stretched to the graph's size if that
-            is fixed. A fixed size of the graph is taken over where ``preprocess.size`` is None.
-        input: name of the image input; None where the graph has only one. A second input, with ``takes_intrinsics``,
-            is that of the intrinsics [B, 3, 3] [px].
+        outputs: as in :class:`ProgramSpec`, with outputs by name.
+        preprocess: preprocessing of the input; None: the image in [0, 1], stretched to the graph's size if that is
+            fixed. ``preprocess.size`` None = a fixed size of the graph.
+        input: name of the image input; None: the graph has only one. With ``takes_intrinsics``, the second input is
+            that of the intrinsics [B, 3, 3] [px].
         layout: "NCHW" or "NHWC", of the input.
-        channels: "rgb" or "bgr"; ``preprocess``'s mean and std are R, G, B in either case.
+        channels: "rgb" or "bgr"; mean and std of ``preprocess`` are R, G, B in either case.
 
     Raises:
         ValueError: a field is out of range.
@@ -63,18 +63,18 @@ class OnnxSpec(ProgramSpec):
 
 
 class OnnxNetwork(DeclaredNetwork):
-    """An ONNX depth network as a module; no gradients, and the computation runs where ONNX Runtime does.
+    """An ONNX depth network as a module, without gradients; ``providers`` determine the device of the computation.
 
     Args:
         path: the .onnx file.
-        spec: what the file does not state: an :class:`OnnxSpec`, its plain values or a JSON file.
-        threads: CPU threads of one run; 0 leaves it to ONNX Runtime. They do not spin between two runs.
+        spec: declarations that the file does not contain: an :class:`OnnxSpec`, its plain values or a JSON file.
+        threads: CPU threads of one run; 0 = ONNX Runtime's default. They do not spin between two runs.
         providers: ONNX Runtime's execution providers in order of preference.
 
     Raises:
         ModuleNotFoundError: ``onnxruntime`` is not installed (extra ``models``).
         FileNotFoundError: there is no such file.
-        ValueError: the file is broken, or spec and graph do not fit; the message names the tensor.
+        ValueError: the file is damaged, or spec and graph do not match; the message names the tensor.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class OnnxNetwork(DeclaredNetwork):
             self.preprocess = self.sized(self.spec.preprocess, (height, width))
 
     def _open(self) -> None:
-        """Start a session and check the spec's names against the graph."""
+        """Create a session, and check the spec's names against the graph."""
         self.session = open_session(self.path, self.threads, self.providers)
         inputs = {i.name: i for i in self.session.get_inputs()}
         name = self.spec.input
@@ -124,7 +124,8 @@ class OnnxNetwork(DeclaredNetwork):
         self.fetched = outputs if self.outputs.depth is None else declared
 
     def _intrinsics_input(self, name: str | None, inputs: Mapping[str, NodeArg]) -> tuple[str, Any] | None:
-        """Name and NumPy type of the graph's second input, the intrinsics [B, 3, 3]; None: it has only the image."""
+        """Name and NumPy type of the graph's second input, the intrinsics [B, 3, 3]; None: the image is its only
+        input."""
         rest = [i for other, i in inputs.items() if other != name]
         if name in inputs and not rest and not self.spec.takes_intrinsics:
             return None
@@ -152,9 +153,9 @@ class OnnxNetwork(DeclaredNetwork):
         return self.K_input is not None or super().takes_intrinsics
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
-        """Depth [B, H, W] [m], on the image's device, of ``image`` [B, 3, H, W] as ``preprocess`` returns it, with
-        ``intrinsics`` [B, 3, 3] [px] for a graph that takes them. Raises ValueError: the image does not fit the graph's
-        input, the intrinsics are missing, or an output is not as declared."""
+        """Depth [B, H, W] [m], on the image's device, of the output ``image`` [B, 3, H, W] of ``preprocess``, with
+        ``intrinsics`` [B, 3, 3] [px] if the graph takes them. Raises ValueError: the image does not fit the graph's
+        input, the intrinsics are missing, or an output contradicts the declaration."""
         self._require_fit(image)
         if self.takes_intrinsics and intrinsics is None:
             raise ValueError(f"{self.path} takes intrinsics: call network(x, K), K [B, 3, 3] of its input x")
@@ -194,15 +195,15 @@ class OnnxNetwork(DeclaredNetwork):
         except _runtime_errors() as error:
             shapes = {name: value.shape for name, value in feeds.items()}
             raise ValueError(
-                f"{self.path}: a node fails when ONNX Runtime runs the graph on {shapes}: {error}; if the graph is "
-                "made for another size of image, declare it as the spec's preprocess.size"
+                f"{self.path}: a node fails when ONNX Runtime runs the graph on {shapes}: {error}; if the graph needs "
+                "another size of image, declare it as the spec's preprocess.size"
             ) from error
         if wrong := [name for name, value in zip(self.fetched, results, strict=True) if not _numbers(value)]:
             raise ValueError(f"{self.path}: the outputs {wrong} are no tensors of numbers")
         return [torch.from_numpy(np.atleast_1d(value).astype(np.float32, copy=False)) for value in results]
 
     def __getstate__(self) -> dict[str, Any]:
-        # A session cannot be copied or pickled; the copy opens its own from the same file.
+        # A session cannot be copied or pickled; the copy creates one from the same file.
         return {key: value for key, value in self.__dict__.items() if key != "session"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -219,7 +220,7 @@ def open_session(path: str, threads: int, providers: tuple[str, ...]) -> Inferen
         raise ValueError(f"providers {absent} are not available; this ONNX Runtime has {ort.get_available_providers()}")
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
-    # Threads that wait by spinning would take the cores from what comes between two runs.
+    # Spinning threads would occupy the cores between two runs.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = _ERRORS_ONLY
     try:
@@ -229,10 +230,10 @@ def open_session(path: str, threads: int, providers: tuple[str, ...]) -> Inferen
 
 
 def providers_for(device: torch.device) -> tuple[str, ...]:
-    """ONNX Runtime's execution providers on a device, the preferred one first; the processor's where it has no other.
+    """ONNX Runtime's execution providers for a device, the preferred one first; only the CPU's if there is no other.
     Raises ModuleNotFoundError: ``onnxruntime`` is not installed (extra ``models``)."""
-    here, cpu, gpu = _onnxruntime().get_available_providers(), "CPUExecutionProvider", "CUDAExecutionProvider"
-    return (gpu, cpu) if device.type == "cuda" and gpu in here else (cpu,)
+    available, cpu, gpu = _onnxruntime().get_available_providers(), "CPUExecutionProvider", "CUDAExecutionProvider"
+    return (gpu, cpu) if device.type == "cuda" and gpu in available else (cpu,)
 
 
 def _onnxruntime() -> Any:
@@ -241,7 +242,7 @@ def _onnxruntime() -> Any:
 
 
 def _runtime_errors() -> tuple[type[Exception], ...]:
-    """Exceptions that ONNX Runtime raises for a graph that it cannot load or run. Its own have no common base class."""
+    """Exceptions of ONNX Runtime for a graph that it cannot load or run; they have no common base class."""
     from onnxruntime.capi import onnxruntime_pybind11_state as state
 
     names = ("InvalidProtobuf", "InvalidGraph", "InvalidArgument", "Fail", "NotImplemented", "RuntimeException")
@@ -253,5 +254,5 @@ def _numbers(value: object) -> bool:
 
 
 def _fixed(node: NodeArg) -> list[int | None]:
-    """The sides of an input's shape, None where the graph leaves one open."""
+    """The sides of an input's shape, None where the graph does not fix one."""
     return [side if isinstance(side, int) and side > 0 else None for side in node.shape]

@@ -1,7 +1,7 @@
 """Weights of a plain convolutional network in an ONNX file: every convolution with the batch norm that follows it.
 
-Only weights are read. Whether the graph computes what the network that they fill computes, the caller has to compare
-(``FastDepth.from_onnx`` does, on one image).
+This module reads only weights. The caller must check that graph and network compute the same (``FastDepth.from_onnx``
+does, on one image).
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ class ConvWeights:
     bias: Tensor | None  # [C_out], or None
     # the following batch norm's weight, bias, running_mean, running_var [C_out]; empty without batch norm
     norm: dict[str, Tensor] = field(default_factory=dict)
-    norm_eps: float = 0.0  # what batch norm adds to the variance
+    norm_eps: float = 0.0  # batch norm's epsilon
 
     def state(self) -> dict[str, Tensor]:
-        """The weights as a state_dict of parts ``conv`` and ``norm``, where a bias stands in one of the two only."""
+        """The weights as a state_dict of ``conv`` and ``norm``; only one of them has a bias."""
         state = {"conv.weight": self.weight}
         bias = torch.zeros(len(self.weight)) if self.bias is None else self.bias
         if not self.norm:
@@ -43,8 +43,8 @@ class ConvWeights:
 
 
 def load_onnx_graph(path: str | Path) -> ModelProto:
-    """The parsed file. Raises ModuleNotFoundError: ``onnx`` is not installed (extra ``models``); FileNotFoundError:
-    there is no such file; ValueError: the file is not ONNX, or cut off."""
+    """Parse a file. Raises ModuleNotFoundError: ``onnx`` is not installed (extra ``models``); FileNotFoundError: there
+    is no such file; ValueError: the file is not ONNX, or truncated."""
     onnx = optional("onnx", "reading weights from an ONNX file needs the package onnx", "'ufmstar-torch[models]'")
     from google.protobuf.message import DecodeError
 
@@ -53,16 +53,16 @@ def load_onnx_graph(path: str | Path) -> ModelProto:
     try:
         model: ModelProto = onnx.load(str(path))
     except DecodeError as error:
-        raise ValueError(f"{path} is not a readable ONNX file ({error}): cut off or of another kind?") from error
+        raise ValueError(f"{path} is not a readable ONNX file ({error}): truncated or of another kind?") from error
     if not model.graph.node:
-        raise ValueError(f"{path} is not a readable ONNX file (it has no nodes): cut off or of another kind?")
+        raise ValueError(f"{path} is not a readable ONNX file (it has no nodes): truncated or of another kind?")
     return model
 
 
 def read_convolutions(path: str | Path) -> list[ConvWeights]:
     """The convolutions of a graph in the order of execution, with their batch norms. Raises ModuleNotFoundError,
-    FileNotFoundError: as :func:`load_onnx_graph`; ValueError: the file is broken, a weight is not in it, or one in it
-    is used by no node."""
+    FileNotFoundError: as :func:`load_onnx_graph`; ValueError: the file is damaged, a weight is not in it, or no node
+    uses one."""
     graph = load_onnx_graph(path).graph
     from onnx import helper, numpy_helper
 
@@ -90,7 +90,7 @@ def read_convolutions(path: str | Path) -> list[ConvWeights]:
             layer.norm_eps = {a.name: helper.get_attribute_value(a) for a in node.attribute}.get("epsilon", 1e-5)
     used = {names.get(name, name) for node in graph.node for name in node.input}
     for name, value in tensors.items():
-        counter = value.dim() == 0 and value.dtype == torch.int64  # batch norm's number of batches, which nothing reads
+        counter = value.dim() == 0 and value.dtype == torch.int64  # batch norm's num_batches_tracked
         if name not in used and not counter:
             raise ValueError(f"{path}: initialiser {name!r} {tuple(value.shape)} is used by no layer")
     return layers

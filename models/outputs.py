@@ -1,7 +1,7 @@
 """The meaning of a network's raw outputs: which one is depth, in which unit, and which are variances.
 
-UfM* compares 3D points of different views, so depth has to be metric. Networks that predict inverse
-depth, disparity or depth up to scale (and shift) are refused here, where their output is declared.
+UfM* compares 3D points of different views, so depth must be metric. Declaring inverse depth, disparity or depth up to
+scale (and shift) raises.
 """
 
 from __future__ import annotations
@@ -33,24 +33,24 @@ class OutputSpec(Checked):
     """The meaning of a network's outputs.
 
     Attributes:
-        kind: what the depth output is. Only "metric" (along the optical axis) can be used; it has no default,
-            so that it is declared and not assumed.
-        depth: name of the depth output (or its position, for a network that returns a tuple); None where the
-            network has only one output.
+        kind: of the depth output. Only "metric" (along the optical axis) is allowed; it has no default, so that it must
+            be declared.
+        depth: name of the depth output (or its position, for a network that returns a tuple); None for a network with
+            only one output.
         scale: [m] length of one unit of the depth output, .001 for millimetres.
-        focal: [px] focal length for which the depth output holds; None where it holds for every camera. Depth and the
-            spreads in its units are then multiplied by f / ``focal``, with f = (fx + fy) / 2 of the network's input
-            (300 for Depth Anything 3's metric networks, 1000 for Metric3D), which needs the intrinsics.
+        focal: [px] focal length for which the depth output holds; None = every camera. Depth, and spreads in its units,
+            are multiplied by f / ``focal``, with f = (fx + fy) / 2 of the network's input (300 for Depth Anything 3's
+            metric networks, 1000 for Metric3D), which requires the intrinsics.
         aleatoric, epistemic: names of the outputs with the learned data and model variance, if any.
         aleatoric_kind, epistemic_kind: "variance", "std", "log_variance" or "log_std" (natural logarithms), in the
-            units of the depth output; or "relative_std", a standard deviation per depth (to first order that of the
-            logarithm of depth). A "confidence" has no such meaning and is refused: name it in ``confidence``.
-        confidence: name of an output that ranks the pixels in whatever unit, as a confidence or an uncertainty; anchors
-            teach what it means in metres (``ufmstar_torch.confidence``).
-        max_depth: [m] largest depth that the network can predict: ``UncertainDepth`` and the commands use no pixel
-            beyond it; None where it is not known.
-        resize: whether outputs of another resolution than the input are brought to it by repeating or
-            dropping pixels; otherwise such outputs are an error.
+            units of the depth output; or "relative_std", a standard deviation over the depth (to first order that of
+            the logarithm of depth). "confidence" is not allowed, since it is not a spread: use ``confidence``.
+        confidence: name of an output of any unit that ranks the pixels, a confidence or an uncertainty; its relation to
+            the variance is learnt from anchors (``ufmstar_torch.confidence``).
+        max_depth: [m] largest depth that the network can predict: ``UncertainDepth`` and the commands ignore pixels
+            beyond it; None = unknown.
+        resize: resize outputs of another resolution to that of the input, by nearest-neighbour sampling; otherwise such
+            outputs raise.
 
     Raises:
         ValueError: a field is out of range, or the depth is not metric.
@@ -85,7 +85,7 @@ class OutputSpec(Checked):
         super().__post_init__()
 
     def names(self) -> list[str | int]:
-        """The outputs that are declared by name."""
+        """The declared names."""
         return [name for name in (self.depth, self.aleatoric, self.epistemic, self.confidence) if name is not None]
 
     def prediction(
@@ -96,14 +96,14 @@ class OutputSpec(Checked):
         Args:
             result: of the network: a tensor or array [B, 1, H, W], [B, H, W, 1] or [B, H, W]; several in a mapping,
                 a tuple or an object.
-            image: [B, 3, H, W] the network's input, whose size and intrinsics the prediction has to share.
+            image: [B, 3, H, W] the network's input, whose size the prediction must have.
             intrinsics: [B, 3, 3] of that input [px], for ``focal``.
-            require_depth: refuse an output that is a depth at no pixel; on the CPU only, since the test would wait for
-                an accelerator.
+            require_depth: raise if no pixel has a depth; on the CPU only, since the test would synchronise with an
+                accelerator.
 
         Raises:
-            ValueError: a declared output is missing or has another shape, ``focal`` lacks the intrinsics, or as
-                ``require_depth`` says.
+            ValueError: a declared output is missing or has another shape, ``focal`` without intrinsics, or see
+                ``require_depth``.
         """
         outputs = _named(result)
         if self.depth is None and len(outputs) != 1:
@@ -122,7 +122,7 @@ class OutputSpec(Checked):
         return DepthPrediction(depth, aleatoric, epistemic, confidence)
 
     def _unit(self, intrinsics: Tensor | None, depth: Tensor) -> float | Tensor:
-        """[m] length of one unit of the depth output: a number, or [B, 1, 1] where the camera decides."""
+        """[m] length of one unit of the depth output: a number, or [B, 1, 1] if it depends on the camera."""
         if self.focal is None:
             return self.scale
         if intrinsics is None:
@@ -140,7 +140,7 @@ class OutputSpec(Checked):
         depth: Tensor,
         unit: float | Tensor,
     ) -> Tensor | None:
-        """[B, H, W] [m^2], or None where the network has none; ``depth`` [B, H, W] [m], ``unit`` as :meth:`_unit`."""
+        """[B, H, W] [m^2], or None if not declared; ``depth`` [B, H, W] [m], ``unit`` as :meth:`_unit`."""
         if name is None:
             return None
         spread = self._map(outputs, name, tuple(depth.shape))
@@ -160,14 +160,14 @@ class OutputSpec(Checked):
             return value
         if not self.resize:
             raise ValueError(
-                f"output {name!r} has {tuple(value.shape[1:])} px, expected the input's {size[1:]}, whose intrinsics "
-                "it is used with; set resize to bring it there"
+                f"output {name!r} has {tuple(value.shape[1:])} px, expected the input's {size[1:]}, since it is used "
+                "with the input's intrinsics; set resize=True to resize it"
             )
         return F.interpolate(value[:, None], size[1:], mode="nearest-exact")[:, 0]
 
 
 def _named(result: Any) -> dict[str | int, Tensor]:
-    """The tensors (or NumPy arrays) of whatever a network returned, by name or position."""
+    """The tensors (or NumPy arrays) in a network's result, by name or position."""
     if isinstance(result, Tensor | np.ndarray):
         return {"depth": as_tensor("the network's output", result)}
     if isinstance(result, (tuple, list)):
@@ -181,8 +181,8 @@ def _named(result: Any) -> dict[str | int, Tensor]:
 
 
 def as_map(value: Any, name: str) -> Tensor:
-    """[B, H, W] floating-point, of a tensor [B, 1, H, W], [B, H, W, 1] or [B, H, W] of numbers; half precision stays.
-    Raises ValueError: ``name`` is something else."""
+    """Convert a tensor [B, 1, H, W], [B, H, W, 1] or [B, H, W] of numbers to floating-point [B, H, W]; half precision
+    is preserved. Raises ValueError: another type or shape; the message contains ``name``."""
     if not isinstance(value, Tensor) or value.is_complex() or value.dtype == torch.bool:
         kind = value.dtype if isinstance(value, Tensor) else type(value).__name__
         raise ValueError(f"{name} must be a tensor of numbers, got {kind}")
@@ -202,9 +202,9 @@ class ProgramSpec(Checked):
          "outputs": {"kind": "metric", "scale": 1.0}}
 
     Attributes:
-        outputs: which output is depth, in which unit; and the variances, if any.
-        preprocess: what the input needs; None: the image in [0, 1] at its own size.
-        takes_intrinsics: whether the program has a second input for the intrinsics [B, 3, 3] [px] of the first.
+        outputs: depth output and its unit; and the variances, if any.
+        preprocess: preprocessing of the input; None: the image in [0, 1], not resized.
+        takes_intrinsics: the program has a second input, the intrinsics [B, 3, 3] [px] of the first.
 
     Raises:
         ValueError: a field is out of range.
@@ -216,10 +216,10 @@ class ProgramSpec(Checked):
 
     @classmethod
     def required(cls, spec: Self | PlainSpec | None) -> Self:
-        """As :meth:`read`, with an explanation where ``spec`` is None."""
+        """As :meth:`read`; raises an explanation if ``spec`` is None."""
         if spec is None:
             raise ValueError(
-                "this network needs a spec, which declares what its file does not state; for metric depth in metres "
+                "this network needs a spec, which declares the meaning of its output; for metric depth in metres "
                 '{"outputs": {"kind": "metric"}}'
             )
         return cls.read(spec)

@@ -1,14 +1,13 @@
-"""From a camera image to a network's input, with the intrinsics and the ground truth that belong to it.
+"""Conversion of a camera image to a network's input, with the corresponding intrinsics and ground truth.
 
-The geometry has up to three steps: resize with the aspect kept, crop the centre, resize to the final
-size (each axis by its own factor). Intrinsics follow by ``camera.resize_intrinsics`` and
-``crop_intrinsics``, that is by the rule that an image's borders lie half a pixel outside its outer pixel
-centres. UfM* works at the network's resolution, so predictions need no way back.
+The geometry has up to three steps: resize with a constant aspect, crop the centre, resize to the final size (each axis
+by its own factor). ``camera.resize_intrinsics`` and ``crop_intrinsics`` convert the intrinsics; an image's borders lie
+half a pixel outside its outer pixel centres. UfM* works at the network's resolution, so predictions are not resized
+back.
 
-Colour is resampled linearly with antialiasing, as Pillow does and therefore the field's loaders did
-(FastDepth was trained and validated on Pillow's bilinear filter), or cubically where a network was trained
-so (Depth Anything); depth takes the nearest pixel, since a
-mean over a depth edge is a place where nothing is.
+Colour is resampled linearly with antialiasing, like Pillow's bilinear filter, with which FastDepth was trained and
+validated, or cubically if a network was trained so (Depth Anything). Depth is sampled at the nearest pixel, since a
+mean over a depth edge lies on no surface.
 """
 
 from __future__ import annotations
@@ -25,13 +24,13 @@ from ufmstar_torch.arguments import CameraLike, ImageLike, as_image, as_intrinsi
 from ufmstar_torch.camera import crop_intrinsics, resize_intrinsics
 from ufmstar_torch.checked import Checked, number
 
-# [1] What a float image may exceed [0, 1] by: filters that overshoot, noise; but not a range of 0..255.
+# [1] Tolerance of the range [0, 1] of float images, for overshooting filters and noise; excludes a range of 0..255.
 _RANGE_SLACK = 0.5
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """Sizes (height, width) [px] of the three steps for one size of image; ``top`` and ``left`` are cut off."""
+    """Sizes (height, width) [px] of the three steps for one size of image; ``top`` and ``left`` are cropped."""
 
     image: tuple[int, int]
     resized: tuple[int, int]
@@ -43,20 +42,20 @@ class Geometry:
 
 @dataclass(frozen=True)
 class Preprocess(Checked):
-    """The input that a network needs; immutable, usable as a function.
+    """The preprocessing of a network's input; immutable and callable.
 
     Attributes:
-        resize_height: [px] height after the first step, None = no such step. Where the crop would not fit
-            into an image of that height, it is resized larger, to the smallest size that holds the crop.
-        crop: (height, width) [px] of the centre crop, None = everything.
-        size: (height, width) [px] of the network's input, None = as it is by then.
-        aspect_multiple: [px] keep the aspect: of the two factors that lead to ``size``, both sides take the
-            one that changes the image less, and the result is rounded to this multiple (a vision
-            transformer's patch). ``size`` is then approximate. None = exactly ``size``.
-        value_range: what white becomes: 1 for networks trained on [0, 1], 255 for those on bytes.
+        resize_height: [px] height after the first step, None = no such step. If the crop does not fit into an image of
+            that height, the image is resized to the smallest size that contains the crop.
+        crop: (height, width) [px] of the centre crop, None = no crop.
+        size: (height, width) [px] of the network's input, None = not resized.
+        aspect_multiple: [px] keep the aspect: both sides are resized by the factor to ``size``, of the two, that
+            changes the image less, and rounded to this multiple (a vision transformer's patch). ``size`` is then
+            approximate. None = exactly ``size``.
+        value_range: value of white: 1 for networks trained on [0, 1], 255 for networks trained on bytes.
         mean, std: per channel (R, G, B), in units of ``value_range``: input = (value - mean) / std.
-        antialias: whether shrinking averages over all pixels that fall into one.
-        cubic: resample with cubic instead of linear interpolation; where it overshoots, colours are clipped.
+        antialias: average over all source pixels when shrinking.
+        cubic: resample with cubic instead of linear interpolation; colours are clipped where it overshoots.
 
     Raises:
         ValueError: a field is out of range.
@@ -93,30 +92,30 @@ class Preprocess(Checked):
 
     @classmethod
     def nyu(cls, size: tuple[int, int] = (224, 224), **changes: Any) -> Preprocess:
-        """NYU Depth V2's validation as FastDepth uses it: height 250 (480 x 640 becomes 250 x 333), centre
-        228 x 304, then ``size``. Portrait images are resized to width 304 instead."""
+        """FastDepth's preprocessing for the validation on NYU Depth V2: height 250 (480 x 640 becomes 250 x 333),
+        centre crop of 228 x 304, then ``size``. Portrait images are resized to width 304 instead."""
         return replace(cls(resize_height=250, crop=(228, 304), size=size), **changes)
 
     def of_whole_frame(self) -> Preprocess:
-        """The same input from the whole frame, each axis resized by its own factor: nothing is cut off."""
+        """A copy that resizes the whole frame, each axis by its own factor, without cropping."""
         return replace(self, resize_height=None, crop=None, size=self.size or self.crop, aspect_multiple=None)
 
     def of_nyu_crop(self) -> Preprocess:
-        """The same input from the centre that NYU's validation takes (:meth:`nyu`)."""
+        """A copy with the centre crop of NYU's validation (:meth:`nyu`)."""
         nyu = Preprocess.nyu()
         size = self.size or self.crop or nyu.crop
         return replace(self, resize_height=nyu.resize_height, crop=nyu.crop, size=size, aspect_multiple=None)
 
     def geometry(self, height: int, width: int) -> Geometry:
-        """The sizes of every step for an image of height x width [px]. Raises ValueError: the crop is larger than an
-        image that is not resized."""
+        """The sizes of all steps for an image of height x width [px]. Raises ValueError: the crop is larger than the
+        image, without ``resize_height``."""
         if min(height, width) < 1:
             raise ValueError(f"an image must have at least one pixel, got {height} x {width}")
         ch, cw = self.crop or (0, 0)
         resized = (height, width)
         if self.resize_height is not None:
             scale = max(self.resize_height / height, ch / height, cw / width)
-            # Fractions are cut off as Pillow-based loaders do; the 1e-6 keeps 250/480*480 at 250.
+            # Rounded down, as in Pillow-based loaders; the 1e-6 keeps 250/480*480 at 250.
             resized = (max(ch, 1, int(scale * height + 1e-6)), max(cw, 1, int(scale * width + 1e-6)))
         if ch > resized[0] or cw > resized[1]:
             raise ValueError(
@@ -137,14 +136,14 @@ class Preprocess(Checked):
 
     def __call__(self, image: ImageLike, intrinsics: CameraLike) -> tuple[Tensor, Tensor]:
         """The network's input [B, 3, h, w], floating-point, of ``image`` [B, 3, H, W] RGB, uint8 or floating-point in
-        [0, 1] (or as NumPy and Pillow have it: ``arguments.as_image``); and its intrinsics, of the shape and type of
-        ``intrinsics`` [B, 3, 3] (or [3, 3]) of ``image`` [px]. Raises TypeError, ValueError: wrong kinds or shapes, an
-        integer type other than uint8, or floats outside [0, 1]."""
+        [0, 1] (or of NumPy or Pillow: ``arguments.as_image``); and its intrinsics, of the shape and dtype of
+        ``intrinsics`` [B, 3, 3] (or [3, 3]) of ``image`` [px]. Raises TypeError, ValueError: wrong types or shapes, an
+        integer dtype other than uint8, or floats outside [0, 1]."""
         image = as_image(image)
         return self.apply_image(image), self.apply_intrinsics(as_intrinsics(intrinsics), *image.shape[-2:])
 
     def apply_image(self, image: ImageLike) -> Tensor:
-        """The image alone; shapes, types and errors as in :meth:`__call__`."""
+        """The network's input without intrinsics; shapes, types and errors as in :meth:`__call__`."""
         x = self._resampled(as_image(image))
         if self.value_range != 1.0:
             x = x * self.value_range
@@ -161,16 +160,15 @@ class Preprocess(Checked):
         return resize_intrinsics(crop_intrinsics(resized, g.top, g.left), g.cropped, g.final)
 
     def apply_depth(self, depth: Tensor) -> Tensor:
-        """A map [..., H, W] that is registered to the image, ground truth depth, a mask or labels, as the network sees
-        it [..., h, w]: every pixel takes the value of the one source pixel that its centre falls into; values are
-        copied, never mixed, and of whatever type."""
+        """Resample a map [..., H, W] registered to the image (ground truth depth, a mask, labels) to the network's
+        input [..., h, w]: every pixel copies the source pixel that contains its centre. Any dtype."""
         g = self.geometry(*depth.shape[-2:])
         rows = _source_index(g.final[0], g.cropped[0], g.top, g.resized[0], g.image[0])
         columns = _source_index(g.final[1], g.cropped[1], g.left, g.resized[1], g.image[1])
         return depth[..., rows.to(depth.device)[:, None], columns.to(depth.device)]
 
     def _resampled(self, image: Tensor) -> Tensor:
-        """[B, 3, h, w] in [0, 1]; bytes on the processor by a kernel, linearly (``preprocess_cpu``)."""
+        """[B, 3, h, w] in [0, 1]; a kernel resamples bytes on the CPU linearly (``preprocess_cpu``)."""
         _check(image)
         g = self.geometry(*image.shape[-2:])
         single = torch.get_default_dtype() == torch.float32
@@ -184,9 +182,9 @@ class Preprocess(Checked):
         return self.resampled(image)
 
     def resampled(self, image: Tensor) -> Tensor:
-        """[B, 3, h, w] in [0, 1], resized, cropped and resized: the reference for every device, type and filter."""
+        """[B, 3, h, w] in [0, 1], resized, cropped and resized: the reference for all devices, dtypes and filters."""
         x = image.to(torch.get_default_dtype()) / 255 if image.dtype == torch.uint8 else image
-        if image.dtype in (torch.float16, torch.bfloat16):  # torch resamples none of these on the CPU
+        if image.dtype in (torch.float16, torch.bfloat16):  # not supported by torch on the CPU
             return self.resampled(image.float()).to(image.dtype)
         g = self.geometry(*x.shape[-2:])
         x = self._resize(x, g.resized)
@@ -202,7 +200,7 @@ class Preprocess(Checked):
 
 
 def _check(image: Tensor) -> None:
-    """Raise ValueError unless it is uint8 or floats in [0, 1]."""
+    """Raise a ValueError unless the image is uint8 or floats in [0, 1]."""
     if image.dtype == torch.uint8:
         return
     if not torch.is_floating_point(image):
@@ -217,7 +215,7 @@ def _check(image: Tensor) -> None:
 
 
 def _source_index(final: int, cropped: int, cut: int, resized: int, image: int) -> Tensor:
-    """[final] the source pixel that each final pixel's centre falls into, along one axis."""
+    """[final] the source pixel that contains each final pixel's centre, along one axis."""
     centre = torch.arange(final, dtype=torch.float64) + 0.5
     source = (centre * (cropped / final) + cut) * (image / resized)
     return source.floor().to(torch.int64).clamp_(0, image - 1)

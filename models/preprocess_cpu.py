@@ -1,7 +1,7 @@
-"""Resizing, cropping and resizing of 8-bit images, compiled, on one thread of the processor.
+"""Resizing, cropping and resizing of 8-bit images, compiled, on one CPU thread.
 
-The reference is ``Preprocess.resampled``: the weights are its own, and every pixel adds up its products in the same
-order, in single precision. They differ at most by the rounding of a fused multiplication.
+The reference is ``Preprocess.resampled``, with the same weights and the same order of summation in float32. The results
+differ at most by the rounding of a fused multiplication.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from ufmstar_torch.kernels.compile_cpu import cached
 
 Array = NDArray[Any]
 Taps = tuple[Array, Array]
-_PULSES = 256  # rows at a time: memory
+_PULSES = 256  # rows at a time, to bound the memory
 compiled = cached(fastmath={"contract"})
 
 
 def resample(
     image: Array, resized: tuple[int, int], top: int, left: int, cropped: tuple[int, int], final: tuple[int, int]
 ) -> Array:
-    """The image in [0, 1], resized, cropped and resized again, linearly with antialiasing.
+    """Convert an image to [0, 1], resize, crop and resize it, linearly with antialiasing.
 
     Args:
         image: [H, W, 3] uint8.
@@ -48,9 +48,9 @@ def resample(
 @lru_cache(maxsize=16)
 def taps(size: int, wanted: int) -> Taps:
     """The weights of ``interpolate`` along one axis: [wanted] the first source pixel, and [wanted, T] float32 weights
-    from there on, 0 behind the last one."""
+    from there on, padded with 0."""
     pulses = torch.arange(size).split(_PULSES)
-    weights = np.concatenate([_answers(F.one_hot(part, size), wanted) for part in pulses]).T
+    weights = np.concatenate([_responses(F.one_hot(part, size), wanted) for part in pulses]).T
     counts = weights != 0
     first = counts.argmax(1)
     last = size - counts[:, ::-1].argmax(1)
@@ -59,16 +59,16 @@ def taps(size: int, wanted: int) -> Taps:
     return first, np.ascontiguousarray(np.take_along_axis(weights, first[:, None] + np.arange(number), 1))
 
 
-def _answers(pulses: torch.Tensor, wanted: int) -> Array:
-    """[N, wanted] of rows [N, W]."""
-    into = (len(pulses), wanted)
+def _responses(pulses: torch.Tensor, wanted: int) -> Array:
+    """Rows [N, W] resized to [N, wanted]."""
+    size = (len(pulses), wanted)
     rows = pulses[None, None].float()
-    return F.interpolate(rows, into, mode="bilinear", align_corners=False, antialias=True)[0, 0].numpy()
+    return F.interpolate(rows, size, mode="bilinear", align_corners=False, antialias=True)[0, 0].numpy()
 
 
 @compiled
 def _resized_bytes(image: Any, row: Any, row_weight: Any, column: Any, column_weight: Any) -> Any:
-    """As :func:`_resized`, of [H, W, 3] bytes, 255 of which are 1."""
+    """As :func:`_resized`, for bytes [H, W, 3], divided by 255."""
     low, high = row[0], row[-1] + row_weight.shape[1]
     across = np.empty((high - low, 3, len(column)), np.float32)
     line = np.empty((3 * image.shape[1]), np.float32)
@@ -91,30 +91,30 @@ def _resized(image: Any, row: Any, row_weight: Any, column: Any, column_weight: 
 
 @compiled
 def _across(line: Any, step: int, channel: int, first: Any, weight: Any, result: Any) -> None:
-    """A row of three channels -> [3, w]; ``step`` lies between two pixels in ``line``, ``channel`` between two
+    """Resize a row of three channels to [3, w]; strides in ``line``: ``step`` between pixels, ``channel`` between
     channels."""
     for x in range(len(first)):
-        at, w = step * first[x], weight[x, 0]
-        red, green, blue = line[at] * w, line[at + channel] * w, line[at + 2 * channel] * w
+        i, w = step * first[x], weight[x, 0]
+        red, green, blue = line[i] * w, line[i + channel] * w, line[i + 2 * channel] * w
         for j in range(1, weight.shape[1]):
-            at, w = at + step, weight[x, j]
-            red += line[at] * w
-            green += line[at + channel] * w
-            blue += line[at + 2 * channel] * w
+            i, w = i + step, weight[x, j]
+            red += line[i] * w
+            green += line[i + channel] * w
+            blue += line[i + 2 * channel] * w
         result[0, x], result[1, x], result[2, x] = red, green, blue
 
 
 @compiled
 def _down(lines: Any, first: Any, weight: Any) -> Any:
-    """[H, 3, w] -> [3, h, w]."""
+    """Resize the rows of [H, 3, w] to [3, h, w]."""
     result = np.empty((3, len(first), lines.shape[2]), np.float32)
     for y in range(len(first)):
         for c in range(3):
-            into, line, w = result[c, y], lines[first[y], c], weight[y, 0]
-            for x in range(len(into)):
-                into[x] = line[x] * w
+            row, line, w = result[c, y], lines[first[y], c], weight[y, 0]
+            for x in range(len(row)):
+                row[x] = line[x] * w
             for j in range(1, weight.shape[1]):
                 line, w = lines[first[y] + j, c], weight[y, j]
-                for x in range(len(into)):
-                    into[x] += line[x] * w
+                for x in range(len(row)):
+                    row[x] += line[x] * w
     return result

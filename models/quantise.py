@@ -1,4 +1,4 @@
-"""Integers instead of floats: a network of this package as an int8 graph for ONNX Runtime."""
+"""Quantisation of a network to an int8 graph for ONNX Runtime."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def quantise(network: DepthNetwork, images: Iterable[Tensor], path: Path, *, thr
     """Write a network as a graph with int8 weights (a scale per channel) and uint8 activations, and open it.
 
     Args:
-        network: on the CPU, in eval mode; predicts depth, and an aleatoric variance if it has one. Batch norms of
-            FastDepth are folded first: a layer of their own would cost a sixth of the depth.
-        images: inputs [1, 3, h, w] as ``network.preprocess`` returns them, whose activations give the ranges.
-        path: the .onnx file to be written.
-        threads: as of :class:`OnnxNetwork`.
+        network: on the CPU, in eval mode; predicts depth and possibly an aleatoric variance. Batch norms of FastDepth
+            are folded first: quantised separately, they would change the depth by a sixth.
+        images: outputs [1, 3, h, w] of ``network.preprocess``, to calibrate the ranges of the activations.
+        path: the .onnx file to write.
+        threads: as in :class:`OnnxNetwork`.
 
     Raises:
         ModuleNotFoundError: ``onnx`` or ``onnxruntime`` is not installed (extra ``models``).
@@ -53,14 +53,14 @@ def quantise(network: DepthNetwork, images: Iterable[Tensor], path: Path, *, thr
 
 
 class _Samples:
-    """The network's inputs one by one, as onnxruntime reads them (its ``CalibrationDataReader``)."""
+    """onnxruntime's ``CalibrationDataReader`` over the network's inputs."""
 
     def __init__(self, inputs: Iterable[Tensor]) -> None:
-        self._left = iter(inputs)
+        self._inputs = iter(inputs)
 
     def get_next(self) -> dict[str, Any] | None:
         """The next input by its name; None at the end."""
-        x = next(self._left, None)
+        x = next(self._inputs, None)
         return None if x is None else {_IMAGE: x.numpy()}
 
 
@@ -81,7 +81,7 @@ def _maps(prediction: DepthPrediction) -> dict[str, Tensor]:
 
 
 def _export(network: DepthNetwork, image: Tensor, path: Path) -> list[str]:
-    """Write the graph in floats; the names of its outputs."""
+    """Write the float graph. Returns the names of its outputs."""
     with torch.no_grad():
         names = list(_maps(network(image)))
         torch.onnx.export(_Maps(network), (image,), path, dynamo=False, input_names=[_IMAGE], output_names=names)
@@ -90,7 +90,8 @@ def _export(network: DepthNetwork, image: Tensor, path: Path) -> list[str]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without the exporter's warnings on tracing and on its age, and the quantiser's advice to simplify the graph."""
+    """Suppress the exporter's warnings about tracing and deprecation, and the quantiser's advice to simplify the
+    graph."""
     root, level = logging.getLogger(), logging.getLogger().level
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -1,4 +1,4 @@
-"""A trainable network as plain values: what is written beside its weights, and what builds it again."""
+"""The specification of a trainable network as plain values, which is stored with its weights and rebuilds it."""
 
 from __future__ import annotations
 
@@ -16,38 +16,38 @@ from ufmstar_torch.models.preprocess import Preprocess
 
 _MULTIPLE = 32  # [px] both architectures halve the image five times
 _SMALLEST = {"fastdepth": 32, "monodepth2": 64}  # [px]
-# Fields of one architecture; with the other they keep their defaults, so that two specs of the same network are equal.
+# Fields of one architecture; the others require their defaults, so that specs of the same network are equal.
 _ONLY = {"widths": "fastdepth", "norm": "fastdepth", "positive": "fastdepth"}
 _ONLY |= {"layers": "monodepth2", "strides": "monodepth2", "module": "module"}
 
 
 @dataclass(frozen=True)
 class NetworkSpec(Checked):
-    """Everything that decides what :func:`build_network` builds, apart from the weights.
+    """The complete description of a network for :func:`build_network`, without the weights.
 
-    An ensemble is several "aleatoric" networks of one spec; its files state how many.
+    An ensemble consists of several "aleatoric" networks of one spec; its file contains their number.
 
     Attributes:
-        architecture: "fastdepth", "monodepth2", or "module": a network of one's own.
+        architecture: "fastdepth", "monodepth2", or "module": a custom network.
         method: "depth" (no variance), "aleatoric", "evidential", "mc_dropout" (aleatoric, sampled by its
             decoder's dropout) or "batch_ensemble" (aleatoric, ``members`` in one).
-        widths: of FastDepth: "full", "pruned", or a multiple of the full ones.
-        norm: whether FastDepth has its batch norms, or has them folded into its convolutions.
-        positive: how FastDepth's depth is kept from being negative: "relu" as published, or "softplus",
-            which leaves no pixel without depth and gradient.
+        widths: of FastDepth: "full", "pruned", or a factor of the full widths.
+        norm: FastDepth has batch norms; False: they are folded into its convolutions.
+        positive: FastDepth's last activation: "relu" as published, or "softplus", which gives every pixel a depth and a
+            gradient.
         layers: of monodepth2's ResNet.
         strides: of monodepth2's ResNet: "v1" (in a bottleneck's first convolution) or "v1.5" (in its second).
         dropout: [1] share of the decoder's features that are dropped in training (and where "mc_dropout" samples).
         dropout_both: dropout after both convolutions of a decoder's level instead of the second only.
-        head_scales: of the head of a variance: 1, or 4 in training as in Poggi et al. (2020).
+        head_scales: number of uncertainty heads: 1, or 4 in training as in Poggi et al. (2020).
         members: of "batch_ensemble"; 1 for every other method.
         size: (height, width) [px] of the input, multiples of 32.
-        preprocess: how a camera image comes to that size: "nyu" (the centre crop of NYU's validation)
-            or "resize" (the whole image, each axis by its own factor).
-        module: the network of "module", whose ``preprocess`` decides instead of ``size`` and ``preprocess``.
+        preprocess: conversion of a camera image to that size: "nyu" (the centre crop of NYU's validation) or "resize"
+            (the whole image, each axis by its own factor).
+        module: the network of "module", whose ``preprocess`` replaces ``size`` and ``preprocess``.
 
     Raises:
-        ValueError: a value that cannot be, or fields that contradict each other.
+        ValueError: an invalid value, or contradictory fields.
     """
 
     architecture: str = choice("fastdepth", "monodepth2", "module")
@@ -72,7 +72,7 @@ class NetworkSpec(Checked):
         if width not in ("full", "pruned") and not positive:
             raise ValueError(f"NetworkSpec.widths must be 'full', 'pruned' or a positive number, got {width!r}")
         if self.method == "mc_dropout" and not self.dropout:
-            raise ValueError("NetworkSpec.dropout must be positive for 'mc_dropout', which samples by it")
+            raise ValueError("NetworkSpec.dropout must be positive for 'mc_dropout', which samples with it")
         if (self.members > 1) != (self.method == "batch_ensemble"):
             expected = "1" if self.members > 1 else "at least 2"
             raise ValueError(f"NetworkSpec.members must be {expected} for {self.method!r}, got {self.members}")
@@ -92,7 +92,7 @@ class NetworkSpec(Checked):
         """The fields as plain values for JSON."""
         values = {**super().to_dict(), "size": list(self.size)}
         if self.module is None:
-            del values["module"]  # as files have it that are older than the field
+            del values["module"]  # equal to files that are older than the field
         return values
 
     def input(self) -> Preprocess:
@@ -109,7 +109,7 @@ class NetworkSpec(Checked):
 
 
 def build_backbone(spec: NetworkSpec, module: nn.Module | None = None) -> Backbone:
-    """The encoder and decoder of ``spec``, with random weights from torch's generator, or a ``module`` of one's own."""
+    """The encoder and decoder of ``spec``, with random weights from torch's generator, or with a custom ``module``."""
     if spec.module is not None:
         return ModuleBackbone(spec.module.build() if module is None else module, spec.module, spec.dropout)
     backbone: Backbone
@@ -131,14 +131,13 @@ def build_backbone(spec: NetworkSpec, module: nn.Module | None = None) -> Backbo
 def build_network(
     spec: NetworkSpec, backbone: Backbone | None = None, *, std: float = INIT_STD
 ) -> UncertaintyNetwork | BatchEnsemble:
-    """The network that ``spec`` describes, for training; "mc_dropout" does not sample by itself yet
-    (``MonteCarloDropout`` makes it do so).
+    """The network of ``spec``, for training; "mc_dropout" samples only when wrapped in ``MonteCarloDropout``.
 
     Args:
-        spec: what to build.
-        backbone: with pretrained weights, as :func:`build_backbone` makes it; it becomes part of the
-            network (a "batch_ensemble" takes a copy). None: random weights.
-        std: spread of the first factors of a "batch_ensemble"; see ``convert``.
+        spec: of the network.
+        backbone: from :func:`build_backbone`, with pretrained weights; becomes a submodule (a "batch_ensemble" copies
+            it). None: random weights.
+        std: standard deviation of the initial factors of a "batch_ensemble"; see ``convert``.
     """
     backbone = build_backbone(spec) if backbone is None else backbone
     network = with_head(backbone, spec.method if spec.method in HEADS else "aleatoric", spec.head_scales)

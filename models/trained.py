@@ -1,7 +1,7 @@
-"""Trained networks in one file: tensors in the safetensors format, and beside them, as JSON, what builds the
-networks again (``NetworkSpec``) and how they were trained.
+"""Trained networks in one safetensors file, with the specification that rebuilds them (``NetworkSpec``) and details of
+the training as JSON.
 
-Member n's tensors have the prefix "member.<n>."; a BatchEnsemble, whose members share theirs, is one network.
+Member n's tensors have the prefix "member.<n>."; a BatchEnsemble, whose members share their tensors, is one network.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class TrainedInfo:
     path: Path  # of the file
     spec: NetworkSpec  # of every network in it
     networks: int  # their number (a BatchEnsemble is one)
-    info: dict[str, Any]  # what was given to :func:`save_trained`: the training's command, data, figures
+    info: dict[str, Any]  # argument of :func:`save_trained`: the training's command, data, figures
 
     @property
     def members(self) -> int:
@@ -54,26 +54,26 @@ def save_trained(
     half: bool = False,
     info: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write trained networks, so that the file is either the old one or the whole new one.
+    """Write trained networks atomically.
 
     Args:
         path: .safetensors.
-        networks: as ``build_network(spec)`` made them, or within a ``MonteCarloDropout``; several are the
-            members of an ensemble.
-        spec: what builds them again.
-        half: weights in half precision. Tensors that it cannot hold (values beyond 65504; variances of a
-            batch norm below 6e-5, where its resolution ends) stay as they are.
+        networks: from ``build_network(spec)``, possibly in a ``MonteCarloDropout``; several networks are the members of
+            an ensemble.
+        spec: specification of the networks.
+        half: store weights in half precision. Tensors out of its range (values beyond 65504; variances of a batch norm
+            below 6e-5) are stored unchanged.
         info: plain values (JSON) on the origin of the weights.
 
     Raises:
-        ValueError: no network, one that does not fit ``spec``, another suffix, or weights that are not finite.
-        TypeError: ``info`` holds something that JSON cannot.
+        ValueError: no network, a network that does not fit ``spec``, another suffix, or weights that are not finite.
+        TypeError: ``info`` holds values that JSON does not support.
     """
     path = Path(path)
     members = [networks] if isinstance(networks, DepthNetwork) else list(networks)
     if path.suffix != ".safetensors" or not members:
         raise ValueError(f"need a file .safetensors and at least one network, got {path.name} and {len(members)}")
-    # A network of one's own is compared with the first member.
+    # The reference of custom networks is the first member.
     own_module = spec.module is not None and spec.module.checkpoint is None
     reference = _unwrapped(members[0]) if own_module else _new(spec)
     expected = {key: value.shape for key, value in reference.state_dict().items()}
@@ -81,7 +81,7 @@ def save_trained(
     for n, member in enumerate(members):
         weights = _unwrapped(member).state_dict()
         if {key: value.shape for key, value in weights.items()} != expected:
-            raise ValueError(f"network {n} ({type(member).__name__}) is not what its spec describes: {spec}")
+            raise ValueError(f"network {n} ({type(member).__name__}) does not match its spec: {spec}")
         state |= {f"member.{n}.{key}": value for key, value in weights.items()}
     if broken := [key for key, value in state.items() if not torch.isfinite(value).all()]:
         raise ValueError(f"{broken[0]} has NaN or infinity ({len(broken)} such tensors): training diverged")
@@ -92,7 +92,7 @@ def save_trained(
 
 
 def read_info(path: str | Path) -> TrainedInfo:
-    """The metadata of a file, whose weights are not read. Raises FileNotFoundError: there is no such file;
+    """Read the metadata of a file without its weights. Raises FileNotFoundError: there is no such file;
     CheckpointError: it is damaged, of another format or of a newer version; ModuleNotFoundError: safetensors is not
     installed."""
     return _TrainedFile(Path(path)).info
@@ -105,20 +105,20 @@ def load_trained(
     lazy: bool = False,
     offload: bool = False,
 ) -> list[DepthNetwork]:
-    """The networks in one or several files, in eval mode and on the CPU, as ``UncertainDepth`` alternates them.
+    """Load the networks of one or several files, in eval mode and on the CPU, for ``UncertainDepth``.
 
-    "mc_dropout" comes as :class:`MonteCarloDropout`, "batch_ensemble" as its members, which share their weights.
-    Weights are float32, however they were stored.
+    "mc_dropout" becomes a :class:`MonteCarloDropout`, "batch_ensemble" its members, which share their weights. Weights
+    are converted to float32.
 
     Args:
-        path: a file, or several, whose networks follow each other.
-        backbone: the network of one's own below the heads, as ``train_module`` got it; copied, with the file's weights.
-        lazy: read a network's weights when it is first called; their metadata are read now.
-        offload: as :class:`LazyMember` has it.
+        path: a file, or several, whose networks are concatenated.
+        backbone: the custom network below the heads, as passed to ``train_module``; copied, and filled from the file.
+        lazy: read a network's weights at its first call; their metadata are read immediately.
+        offload: see :class:`LazyMember`.
 
     Raises:
-        FileNotFoundError, CheckpointError, ModuleNotFoundError: as :func:`read_info`; and where weights are
-            missing, unexpected, of another shape or not finite. With ``lazy`` that comes with the first call.
+        FileNotFoundError, CheckpointError, ModuleNotFoundError: as :func:`read_info`; and if weights are missing,
+            unexpected, of another shape or not finite, with ``lazy`` at the first call.
     """
     paths = [path] if isinstance(path, str | Path) else list(path)
     members: list[DepthNetwork] = []
@@ -136,32 +136,32 @@ def load_trained(
 
 
 def load_ensemble(weights: Path, backbone: nn.Module | None = None) -> DepthNetwork:
-    """All networks in a file as one: the network itself, or an :class:`Ensemble` of several; arguments and errors as
+    """Load all networks of a file as one network, an :class:`Ensemble` if there are several; arguments and errors as
     :func:`load_trained`."""
     members = load_trained(weights, backbone=backbone)
     return members[0] if len(members) == 1 else Ensemble(members)
 
 
 def load_for_training(path: str | Path, backbone: nn.Module | None = None) -> list[UncertaintyNetwork | BatchEnsemble]:
-    """The networks in a file as ``build_network`` made them, in training mode, to go on from; arguments and errors as
+    """Load the networks of a file in the form of ``build_network``, in training mode; arguments and errors as
     :func:`load_trained`."""
     file = _TrainedFile(Path(path), backbone)
     return [file.read(index).train() for index in range(file.info.networks)]
 
 
 class _TrainedFile:
-    """One file, whose networks are read one by one. Shared weights are read once. Raises FileNotFoundError,
-    CheckpointError, ModuleNotFoundError: as :func:`read_info`."""
+    """A file whose networks are read individually, shared weights once. Raises FileNotFoundError, CheckpointError,
+    ModuleNotFoundError: as :func:`read_info`."""
 
     def __init__(self, path: Path, backbone: nn.Module | None = None) -> None:
         self.path, self.backbone = path, backbone
         self.info = _parse(path, read_safetensors(path, prefix=None)[1])
-        self._shared: dict[int, Any] = {}  # a BatchEnsemble's members are of one network
+        self._shared: dict[int, Any] = {}  # networks of BatchEnsembles, shared by their members
         self._lock = threading.Lock()
 
     def member(self, n: int) -> DepthNetwork:
         """Network n of :func:`load_trained`, in eval mode. Raises CheckpointError: its weights are damaged or do not
-        fit; names the file and the member."""
+        fit; the message names the file and the member."""
         index, member = divmod(n, self.info.spec.members)
         if self.info.spec.method != "batch_ensemble":
             network = self.read(index)
@@ -182,13 +182,13 @@ class _TrainedFile:
 
 
 def _parse(path: Path, metadata: Any) -> TrainedInfo:
-    """The metadata of a file, checked."""
+    """Check and convert the metadata of a file."""
     if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
         raise CheckpointError(f"{path} holds no trained networks of this package (it does not name the format)")
     version = metadata.get("version")
     if version != VERSION:
         newer = isinstance(version, int) and version > VERSION
-        advice = "written by a newer release of this package: update it" if newer else "which never was"
+        advice = "written by a newer release of this package: update it" if newer else "which does not exist"
         raise CheckpointError(f"{path} is of version {version!r}, {advice} (this one reads {VERSION})")
     count, info = metadata.get("networks"), metadata.get("info")
     if set(metadata) != _KEYS or type(count) is not int or count < 1 or not isinstance(info, dict):
@@ -201,7 +201,7 @@ def _parse(path: Path, metadata: Any) -> TrainedInfo:
 
 
 def _new(spec: NetworkSpec, backbone: nn.Module | None = None) -> UncertaintyNetwork | BatchEnsemble:
-    """A network to be filled or compared with, whose random weights do not use up the caller's seed."""
+    """A network with random weights that leaves the caller's random state unchanged."""
     with torch.random.fork_rng(devices=[]):
         return build_network(spec, build_backbone(spec, copy.deepcopy(backbone)))
 
@@ -211,7 +211,7 @@ def _unwrapped(network: DepthNetwork) -> nn.Module:
 
 
 def _fits_half(key: str, value: Tensor) -> bool:
-    """True if half precision holds a tensor: small weights may become 0, a variance that is divided by may not."""
+    """True if a tensor can be stored in half precision: small weights may become 0, but variances may not."""
     if value.dtype not in (torch.float32, torch.float64) or not value.numel():
         return False
     tiny = key.endswith("running_var") and value.min() < _HALF.tiny

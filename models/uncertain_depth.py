@@ -1,4 +1,4 @@
-"""``UncertainDepth`` of any network: the class that ``ufmstar_torch`` exports under this name."""
+"""``UncertainDepth`` for any network, which ``ufmstar_torch`` exports under this name."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class UncertainDepth(pipeline.UncertainDepth):
     def accepted(
         self, networks: object, preprocess: networks_in_turn.Preprocess | Literal["own"] | None
     ) -> tuple[list[nn.Module], networks_in_turn.Preprocess | None]:
-        """See the base class. Functions, and models and pipelines of ``transformers``, are wrapped; they take a
-        ``preprocess`` that is a ``Preprocess`` or an image processor."""
+        """See the base class. Wraps functions, and models and pipelines of ``transformers``, whose ``preprocess`` may
+        be a ``Preprocess`` or an image processor."""
         members: list[Any] = [networks]
         if isinstance(networks, Iterable) and not isinstance(networks, nn.Module | str | Mapping):
             members = list(networks)
@@ -36,7 +36,7 @@ class UncertainDepth(pipeline.UncertainDepth):
         return super().accepted(modules, "own" if any(foreign) and declared is not None else preprocess)
 
     def as_prediction(self, result: Any, x: Tensor) -> DepthPrediction:
-        """See the base class. Maps that a network returns are taken as metric depth."""
+        """See the base class. A map is assumed to be metric depth."""
         if isinstance(result, DepthPrediction):
             return result
         return OutputSpec(METRIC).prediction(result, x)

@@ -132,7 +132,7 @@ def test_a_linear_layer_is_the_formula(shape, bias):
 
 def test_a_layer_needs_its_ensemble():
     layer = convert(nn.Conv2d(3, 2, 3), N)
-    with pytest.raises(RuntimeError, match="which selects the members"):
+    with pytest.raises(RuntimeError, match="it selects the members"):
         layer(torch.zeros(1, 3, 6, 6))
     layer.selection.members = torch.zeros(2, dtype=torch.int64)
     with pytest.raises(ValueError, match=r"of 2 images .* got 6"):

@@ -171,9 +171,9 @@ def test_pickled_objects_are_refused_and_not_run(tmp_path: Path, monkeypatch: py
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ({}, "holds no weights but dict"),
-        ([1, 2], "holds no weights but list"),
-        (torch.zeros(3), "holds no weights but Tensor"),
+        ({}, "holds no weights, but dict"),
+        ([1, 2], "holds no weights, but list"),
+        (torch.zeros(3), "holds no weights, but Tensor"),
         ({"a": torch.zeros(1), "epoch": 3}, "more than named tensors: epoch"),
         ({3: torch.zeros(1)}, "more than named tensors: 3"),
     ],

@@ -177,7 +177,7 @@ def test_offline_from_truth(tmp_path):
     outs = [m.update(DepthPrediction(depth, confidence=c), torch.eye(4), K).variance for m in (mapped, plain)]
     torch.testing.assert_close(outs[0], outs[1] * fitted.factor(c).float())
     assert float(outs[0][0, 0, 0]) == float(outs[1][0, 0, 0])
-    with pytest.raises(ValueError, match="one of the confidence, but the network states none"):
+    with pytest.raises(ValueError, match="maps the confidence, but the network predicts none"):
         mapped.update(DepthPrediction(depth), torch.eye(4), K)
     constant = fit_confidence([np.stack([np.ones(90), V[0, :90], 4 * V[0, :90]], -1)])
     torch.testing.assert_close(constant.factor(torch.tensor([0.0, 1.0, 7.0])), torch.full((3,), 4.0).double())

@@ -112,7 +112,7 @@ REFUSED = {
     ),
     "an image that is a file's name": (lambda: model("a.png"), TypeError, "image must be .*Pillow image, got str"),
     "bytes for a network of floats": (
-        lambda: model(IMAGE, network=nn.Conv2d(3, 1, 1), preprocess=None), TypeError, "image of torch.uint8: give flo"
+        lambda: model(IMAGE, network=nn.Conv2d(3, 1, 1), preprocess=None), TypeError, "image of torch.uint8: pass flo"
     ),
     "an array for a wrapped network": (
         lambda: wrap_network(Brightness())(PICTURE), TypeError, r"image must be a tensor .*network.preprocess"

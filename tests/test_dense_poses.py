@@ -120,7 +120,7 @@ def test_what_remains_of_wrong_poses_is_stated_beyond_first_order():
         draws = np.sqrt(0.5) * (rng.normal(size=6) + rng.normal(size=(3, 6)))
         error[:, :6] = draws * np.repeat([0.002, 0.008], 3)
         errors.positions(K, 320, 2.0)
-        errors._variance[:], errors._left[:] = np.square([0.002, 0.008]), 0
+        errors._variance[:], errors._unexplained[:] = np.square([0.002, 0.008]), 0
         errors._covariance *= 1e-4
         found = measured(pixel, rho, views, error, 0.02, rng)
         fit = errors.corrected(pixel, found, SHARES, views, K, 2.0)

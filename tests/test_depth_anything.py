@@ -217,14 +217,14 @@ def test_missing_directories_are_named(broken, tmp_path):
 
 def test_a_hub_name_without_a_connection_says_what_to_do(tmp_path, monkeypatch):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
-    with pytest.raises(OSError, match=r"(?s)Small-hf is no directory and cannot be had.*--local-dir DIR") as caught:
+    with pytest.raises(OSError, match=r"(?s)Small-hf is no directory and cannot be read.*--local-dir DIR") as caught:
         DepthAnything.from_pretrained("depth-anything/Depth-Anything-V2-Small-hf", local_files_only=True)
     assert isinstance(caught.value.__cause__, OSError)
 
 
 def test_another_model_in_one_line_with_its_meaning_declared(other):
     images = photos(1, (64, 96))
-    with pytest.raises(ValueError, match=r"\(glpn\) does not say whether its depth is metric: declare kind='metric'"):
+    with pytest.raises(ValueError, match=r"\(glpn\) does not state whether its depth is metric: declare kind='metric'"):
         from_hugging_face(other, size=(64, 96))
     network = from_hugging_face(other, kind="metric", scale=2.0, size=(64, 96))
     assert network.preprocess == Preprocess(size=(64, 96))

@@ -101,7 +101,7 @@ def test_what_makes_no_sense_is_refused():
             decision.learn(statistics, gain)
     huge = torch.full((3,), 1e200, dtype=torch.float64)
     for call, message in (
-        (lambda: decision.learn(huge, 1.0), "so their squares"),
+        (lambda: decision.learn(huge, 1.0), "also their squares"),
         (lambda: decision.expected(torch.ones(4)), "3 finite values as before"),
         (lambda: decision.expected(torch.full((3,), math.nan)), "3 finite values as before"),
         (lambda: TrainDecision(0.1).expected(torch.ones(3)), r"call learn\(\) first"),

@@ -169,7 +169,7 @@ LENGTHS = {"length": st.integers(1, 200), "batch_size": st.integers(1, 9), "worl
 def test_processes_share_each_batch_of_one_process(length, batch_size, world, seed, epoch):
     step = batch_size * world
     if length < step:
-        with pytest.raises(ValueError, match="a step takes"):
+        with pytest.raises(ValueError, match="a step needs"):
             EpochBatches(length, batch_size, world=world)
         return
     single = EpochBatches(length, step, seed=seed)

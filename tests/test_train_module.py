@@ -73,7 +73,8 @@ def test_a_frozen_network_keeps_its_depth_and_gets_a_variance(frames, tmp_path):
     assert all(torch.equal(value, before[key]) for key, value in trained.backbone.network.state_dict().items())
     loaded = load_network("trained", tmp_path / "trained.safetensors", backbone=Own())
     assert torch.equal(loaded(image()).variance, prediction.variance)
-    with pytest.raises(ValueError, match=r"Own is a network of your own, which only Python can make.*backbone=NETWORK"):
+    words = r"Own is a network of your own, which must be built in Python.*backbone=NETWORK"
+    with pytest.raises(ValueError, match=words):
         load_trained(tmp_path / "trained.safetensors")
 
 

@@ -69,7 +69,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: EpochBatches(9, 0), "batch_size"),
     (lambda: batches(seed=-1), "seed"),
     (lambda: batches(rank=1), "rank"),
-    (lambda: EpochBatches(5, 3, world=2), "a step takes"),
+    (lambda: EpochBatches(5, 3, world=2), "a step needs"),
     (lambda: settings(strategy="ddp_spawn"), "strategy"),
     (lambda: settings(log_every=0), "log_every"),
     (lambda: settings(max_minutes=NAN), "max_minutes"),

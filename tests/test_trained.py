@@ -162,7 +162,7 @@ def test_networks_that_do_not_fit_their_spec(tmp_path):
     networks = make_networks(spec_of())
     file = tmp_path / "n.safetensors"
     for wrong in (replace(spec_of(), method="evidential"), replace(spec_of(), widths=0.2)):
-        with pytest.raises(ValueError, match=r"network 0 \(UncertaintyNetwork\) is not what its spec describes"):
+        with pytest.raises(ValueError, match=r"network 0 \(UncertaintyNetwork\) does not match its spec"):
             save_trained(file, networks, wrong)
     with pytest.raises(ValueError, match="at least one network, got n"):
         save_trained(file, [], spec_of())
@@ -198,7 +198,7 @@ def rewritten(path, change):
 METADATA = {
     "another format": (lambda m: m.update(format="something"), "no trained networks of this package"),
     "newer": (lambda m: m.update(version=2), "version 2, written by a newer release .* update it"),
-    "no version": (lambda m: m.pop("version"), "version None, which never was"),
+    "no version": (lambda m: m.pop("version"), "version None, which does not exist"),
     "spec with an unknown key": (lambda m: m["spec"].update(depth=3), r"spec .* NetworkSpec has no \['depth'\]"),
     "impossible spec": (lambda m: m["spec"].update(size=[33, 64]), "spec that cannot be built: .*multiples of 32"),
     "spec of another kind": (lambda m: m.update(spec=7), "spec that cannot be built"),

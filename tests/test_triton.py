@@ -108,7 +108,7 @@ def test_capture_keeps_the_state_in_place(monkeypatch):
     assert torch.equal(ufm.frames, plain.frames)
     with pytest.raises(ValueError, match="depth must be as at the capture"):
         captured(inputs[0][0][:, :5], *inputs[0][1:])
-    with pytest.raises(ValueError, match=r"a capture needs on_bad_frame='skip'.*a mixture that grows"):
+    with pytest.raises(ValueError, match=r"a capture needs on_bad_frame='skip'.*a growing mixture"):
         Captured(UfMStar(UfMStarConfig(backend="triton")), *inputs[0])
 
 

@@ -174,7 +174,7 @@ def test_a_full_disk_leaves_kernels_in_memory_and_is_said_once(hits, monkeypatch
     def full(self, path):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(compile_cpu._KeptFiles, "_open_for_write", full)
+    monkeypatch.setattr(compile_cpu._CacheFiles, "_open_for_write", full)
     assert [hits(), hits()] == [0, 0]
     assert [record.name for record in caplog.records] == ["ufmstar_torch"]
     assert "cannot be written to (No space left on device)" in caplog.text

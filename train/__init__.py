@@ -1,6 +1,6 @@
 """Training of the networks: losses, augmentation, data, and the loop around them.
 
-The names below load their module when they are first used, not when this package is imported.
+Each name below imports its module at its first use, not when this package is imported.
 """
 
 from __future__ import annotations

@@ -13,23 +13,22 @@ from ufmstar_torch.train.samples import SampleKey
 class EpochBatches(Sampler[list[SampleKey]]):
     """Batches of (epoch, frame) for a loader's ``batch_sampler``.
 
-    Training (``shuffle``): each epoch has its own order. The processes of a distributed run divide each batch of
-    ``world * batch_size`` among them, so that together they take the steps of one process with that batch
-    size; what is left at the end of the order and fills no batch is left out in that epoch. Validation:
-    everything once, in order, process ``rank`` takes every ``world``-th frame; processes may then have
-    unequal numbers of batches. One without any frame gets the last one, as a sample that does not count: the
-    first validation batch after a training step synchronises the processes, so each must have one.
+    Training (``shuffle``): each epoch has another order. The processes of a distributed run split each batch of
+    ``world * batch_size``, so that their steps equal those of one process with that batch size; an incomplete last
+    batch is dropped. Validation: every frame once, in order; process ``rank`` gets every ``world``-th frame, so the
+    numbers of batches may differ. A process without any frame gets the last frame, as a sample that does not count,
+    because the first validation batch after a training step synchronises the processes.
 
     Args:
         length: number of frames, or of clips.
         batch_size: frames, or clips, per process and step.
         seed: of the order.
-        rank, world: number of this process, and of all.
+        rank, world: index of this process, and the number of processes.
         shuffle: training or validation.
-        clips: the frames of every clip, which stay together; None = single frames.
+        clips: the frames of every clip, which are not separated; None = single frames.
 
     Raises:
-        ValueError: a number out of range, or fewer frames than one training step takes.
+        ValueError: a number out of range, or fewer frames than a training step needs.
     """
 
     def __init__(
@@ -48,7 +47,7 @@ class EpochBatches(Sampler[list[SampleKey]]):
         if seed < 0 or not 0 <= rank < world:
             raise ValueError(f"seed must be >= 0 and rank in [0, world), got {seed}, {rank} of {world}")
         if shuffle and length < batch_size * world:
-            raise ValueError(f"a step takes batch_size {batch_size} x {world} processes of only {length} frames")
+            raise ValueError(f"a step needs batch_size {batch_size} x {world} processes, got only {length} frames")
         self.length, self.batch_size, self.seed = length, batch_size, seed
         self.rank, self.world, self.shuffle = rank, world, shuffle
         self.clips = clips
@@ -56,7 +55,7 @@ class EpochBatches(Sampler[list[SampleKey]]):
 
     @property
     def sampler(self) -> EpochBatches:
-        """Itself: Lightning calls ``loader.batch_sampler.sampler.set_epoch`` at the start of every epoch."""
+        """This object: Lightning calls ``loader.batch_sampler.sampler.set_epoch`` at the start of every epoch."""
         return self
 
     def set_epoch(self, epoch: int) -> None:
@@ -70,7 +69,7 @@ class EpochBatches(Sampler[list[SampleKey]]):
 
     def __iter__(self) -> Iterator[list[SampleKey]]:
         epoch, order = self.epoch, self._order()
-        counts = self.shuffle or self.rank < self.length  # whether this process has frames of its own
+        counts = self.shuffle or self.rank < self.length  # False: the only frame is another process's
         for batch in range(len(self)):
             step = self.batch_size * (self.world if self.shuffle else 1)
             share = slice(self.rank, None, self.world) if self.shuffle else slice(None)

@@ -1,4 +1,4 @@
-"""Lightning's view of the training data: a train and a validation loader from one configuration."""
+"""Lightning's data module: a train and a validation loader from one configuration."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from ufmstar_torch.train.samples import Sample, SampleDataset, clips
 from ufmstar_torch.train.sequence_data import SequenceFrames, open_rgbd
 from ufmstar_torch.train.tour_data import tour_frames
 
-CHECKED = 3  # sequences whose depth, poses and images are checked: a mistake in units is made in all
+CHECKED = 3  # most sequences whose depth, poses and images are checked: a mistake in units affects all
 
 
 class DepthDataModule(LightningDataModule):
     """Train and validation loaders of samples at a network's size.
 
-    The trainer must not replace the order: ``Trainer(use_distributed_sampler=False)``.
+    The trainer must not replace the sampler: ``Trainer(use_distributed_sampler=False)``.
 
     Args:
-        config: where frames come from.
-        preprocess: the network's.
+        config: source of the frames.
+        preprocess: of the network.
         batch_size: frames per step and process.
         seed: of the order and the augmentation.
-        clip_frames: frames that follow one another and stay together in training. From two on, frames are augmented
-            in colour alone: a zoom that divides depth, or a mirror, does not leave the camera's path as it is.
+        clip_frames: length of the clips of successive frames in training. From two on, only colours are augmented,
+            because a zoom that divides depth, or a mirror, would not match the camera's path.
 
     Raises:
-        ValueError: a batch that clips do not fill.
+        ValueError: ``batch_size`` is no multiple of ``clip_frames``.
 
     Attributes:
         clips: of the training part, after ``setup``; None with ``clip_frames = 1``.
@@ -58,13 +58,13 @@ class DepthDataModule(LightningDataModule):
         self.validation_set: SampleDataset | None = None
 
     def prepare_data(self) -> None:
-        """Renders tours that are not in the cache yet; Lightning calls it in one process per computer."""
+        """Render tours that are not in the cache; Lightning calls this in one process per computer."""
         if self.config.kind == "tour":
             sources(self.config)
 
     def setup(self, stage: str | None = None) -> None:
-        """Opens both parts; every process does. Raises OSError: a path does not exist, or cannot be written for
-        rendered tours; ValueError: a path holds nothing of the kind asked for, or the two parts overlap."""
+        """Open both parts, in every process. Raises OSError: a path does not exist, or cannot be written for rendered
+        tours; ValueError: a path does not contain the configured kind of data, or the two parts overlap."""
         if self.train_set is not None:
             return
         c = self.config
@@ -78,15 +78,15 @@ class DepthDataModule(LightningDataModule):
         self.validation_set = SampleDataset(validation, self.preprocess, on_bad_file=c.on_bad_file, evaluate=True)
 
     def train_dataloader(self) -> DataLoader[Sample]:
-        """Shuffled; this process's share of every batch."""
+        """Training frames in random order; this process's share of every batch."""
         return self._loader(self.train_set, shuffle=True)
 
     def val_dataloader(self) -> DataLoader[Sample]:
-        """Every frame once, over all processes together."""
+        """Validation frames in order; this process's share."""
         return self._loader(self.validation_set, shuffle=False)
 
     def bad_files(self) -> tuple[str, ...]:
-        """The broken files met so far in either part, where they are skipped."""
+        """The broken files skipped so far in both parts."""
         return tuple(name for part in (self.train_set, self.validation_set) if part for name in part.bad_files())
 
     def _loader(self, dataset: SampleDataset | None, shuffle: bool) -> DataLoader[Sample]:
@@ -100,15 +100,15 @@ class DepthDataModule(LightningDataModule):
         else:
             batches = EpochBatches(len(dataset), self.batch_size, **order)
         if shuffle and self.trainer is not None:
-            # Workers load ahead before Lightning announces the epoch, which is not 0 in a resumed training.
+            # Workers prefetch before Lightning sets the epoch, which is not 0 in a resumed training.
             progress: Any = self.trainer.fit_loop.epoch_progress.current
             batches.set_epoch(progress.processed)
         return sample_loader(dataset, batches, c.workers)
 
 
 def sample_loader(dataset: SampleDataset, batches: EpochBatches, workers: int = 0) -> DataLoader[Sample]:
-    """A loader of samples in the order of ``batches``, by ``workers`` processes (0: this one), which are started with
-    "spawn": forked ones inherit OpenMP's threads as they are, and hang where the parent has used them."""
+    """A loader of samples in the order of ``batches``, with ``workers`` processes (0: this one). They are started with
+    "spawn", because forked processes inherit the state of OpenMP's threads and hang if the parent has used them."""
     return DataLoader(
         dataset,
         batch_sampler=batches,
@@ -116,13 +116,13 @@ def sample_loader(dataset: SampleDataset, batches: EpochBatches, workers: int = 
         pin_memory=torch.cuda.is_available(),
         multiprocessing_context="spawn" if workers else None,
         persistent_workers=workers > 0,
-        # Its own generator: without one, every iteration would draw from the global one.
+        # Without a generator, every iteration would draw from the global one.
         generator=torch.Generator(),
     )
 
 
 def sources(config: DataConfig) -> tuple[SequenceFrames, SequenceFrames]:
-    """The frames to train on, and those to validate on. Raises OSError, ValueError: as ``DepthDataModule.setup``."""
+    """The frames for training and for validation. Raises OSError, ValueError: as ``DepthDataModule.setup``."""
     c = config
     if c.kind == "nyu":
         train, validation = (SequenceFrames([open_sequence(Path(c.paths[0]) / part)]) for part in PARTS)

@@ -1,4 +1,4 @@
-"""The source of the training data and how they are loaded, as plain values."""
+"""Source and loading of the training data, as plain values."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ _PART = re.compile(r"(\d+(?:\.\d+)?)\s*(%?):(\d+(?:\.\d+)?)\s*(%?)")
 
 @dataclass(frozen=True)
 class Part:
-    """A contiguous part of a sequence, from one edge up to, not including, another one: ``0:70%``, ``75%:``.
+    """A contiguous part of a sequence, without its end: ``0:70%``, ``75%:``.
 
-    Neighbouring frames of a video show the same thing, so held-back frames must not be close in time to training
-    frames. A sequence is therefore divided into contiguous parts, best with a gap between them (``0:70%`` and
-    ``75%:``), never at random.
+    Neighbouring frames of a video show the same scene, so validation frames must not be close in time to training
+    frames. Therefore a sequence is split into contiguous parts, preferably with a gap (``0:70%`` and ``75%:``), never
+    at random.
     """
 
-    start: float  # a number of frames, or a percentage of them where ``start_share`` / ``stop_share``
+    start: float  # a number of frames, or a percentage of them if ``start_share`` / ``stop_share``
     stop: float
     start_share: bool
     stop_share: bool
 
     @classmethod
     def parse(cls, text: str) -> Part:
-        """``START:STOP``, each a frame number or a percentage of the frames; left out: the first, the end. Raises
-        ValueError: anything else, a share above 100 %, or an empty part."""
+        """Parse ``START:STOP``, each a frame number or a percentage of the frames; default: the first, the end. Raises
+        ValueError: another form, a share above 100 %, or an empty part."""
         start, colon, stop = text.partition(":")
         result = _PART.fullmatch(f"{start.strip() or '0'}:{stop.strip() or '100%'}") if colon else None
         if result is None or _impossible(result[1], result[2]) or _impossible(result[3], result[4]):
@@ -43,7 +43,7 @@ class Part:
     def frames(self, length: int) -> range:
         """The frame numbers of a sequence of that length. Raises ValueError: the part has no frame."""
         edges = [(self.start, self.start_share), (self.stop, self.stop_share)]
-        # Rounded to 1e-6 first: 70 % of 10 is 7, and not the integer part of 0.7 * 10.
+        # Rounded to 1e-6 first, so that 70 % of 10 is 7 despite rounding errors.
         numbers = [int(round(value * length / 100, 6)) if share else int(value) for value, share in edges]
         part = range(min(length, numbers[0]), min(length, numbers[1]))
         if not part:
@@ -55,7 +55,7 @@ class Part:
 
 
 def _impossible(value: str, unit: str) -> bool:
-    """A share above 100 %, or a fraction of a frame."""
+    """True for a share above 100 %, or a fraction of a frame."""
     return float(value) > 100 if unit else "." in value
 
 

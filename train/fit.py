@@ -35,23 +35,23 @@ def fit(
     """Train all members that are not finished, and write OUT/trained.safetensors and OUT/summary.json.
 
     Args:
-        job: what and how.
-        resume, overwrite: what to do with an earlier training in the folder; see ``folder.open_folder``.
-        asked: returns whether to stop; the current step is finished and kept.
+        job: recipe, data and settings.
+        resume, overwrite: treatment of an earlier training in the folder; see ``folder.open_folder``.
+        asked: returns True to stop, after the current step.
         command: the command line, for the summary.
 
     Returns:
-        The summary; its "stopped" states why not all members are finished. Processes of a distributed training other
-        than the first return "stopped" alone.
+        The summary; its "stopped" is the reason if not all members are finished. In a distributed training, all
+        processes except the first return only "stopped".
 
     Raises:
-        FolderError: the folder cannot be used as asked.
-        NonFiniteLossError: a training has diverged. The members that were finished are written before.
+        FolderError: the folder cannot be used with these options.
+        NonFiniteLossError: a training has diverged. Finished members are written first.
         ResumeError: a checkpoint cannot be read.
     """
     began = time.monotonic()
     end = began + 60 * job.settings.max_minutes if job.settings.max_minutes else None
-    # The trainer has the rank of this process, whichever launcher set it.
+    # The trainer determines the rank of this process, for every launcher.
     with quiet_lightning():
         trainer = make_trainer(job, 0)
     first = trainer.is_global_zero
@@ -68,8 +68,8 @@ def fit(
 
 
 def _meet(trainer: pl.Trainer, out: Path) -> None:
-    """Wait until the first process has prepared the folder: it joins Lightning's process group only then. Raises
-    FolderError: this machine does not see that folder."""
+    """Wait until the first process has prepared the folder, after which it joins Lightning's process group. Raises
+    FolderError: the folder does not exist on this machine."""
     if trainer.world_size == 1:
         return
     launcher: Any = trainer.strategy.launcher
@@ -80,29 +80,28 @@ def _meet(trainer: pl.Trainer, out: Path) -> None:
 
 
 def read_result(job: Job, member: int) -> dict[str, Any]:
-    """The content of a member's result.json; empty where there is none."""
+    """The content of a member's result.json; empty if there is none."""
     file = job.folder(member) / RESULT
     return dict(json.loads(file.read_text(encoding="utf-8"))) if file.is_file() else {}
 
 
 def train_members(job: Job, *, end: float | None = None, asked: Callable[[], bool] | None = None) -> str | None:
-    """Train the members that are not finished, up to ``end``, in ``time.monotonic()``'s seconds, or until ``asked``
-    returns True. The remaining time is divided evenly among the members. Returns None when all are finished, otherwise
-    why not."""
+    """Train the unfinished members until ``end``, in ``time.monotonic()``'s seconds, or until ``asked`` returns True.
+    The remaining time is divided evenly among them. Returns the reason of a stop, or None if all are finished."""
     members = [member for member in range(job.recipe.members) if not read_result(job, member).get("finished")]
     first: str | None = None
     for index, member in enumerate(members):
         if asked is not None and asked():
             return first or "stopped"
-        now, left = time.monotonic(), len(members) - index
-        deadline = None if end is None else now + max(0.0, end - now) / left
+        now, remaining = time.monotonic(), len(members) - index
+        deadline = None if end is None else now + max(0.0, end - now) / remaining
         reason = train_member(job, member, deadline=deadline, asked=asked)
         first = first or reason
     return first
 
 
 def _conclude(job: Job, stopped: str | None, seconds: float, command: Sequence[str]) -> dict[str, Any]:
-    """Write one file of all members that have weights, and the summary."""
+    """Write all members that have weights to one file, and the summary."""
     r, out = job.recipe, job.settings.out
     members = [m for m in range(r.members) if (job.folder(m) / WEIGHTS).is_file()]
     results = [read_result(job, m) for m in members]
@@ -129,7 +128,7 @@ def _conclude(job: Job, stopped: str | None, seconds: float, command: Sequence[s
 
 
 def _mean_figures(results: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """The members' last validation figures, averaged over members (not those of the ensemble)."""
+    """The last validation figures, averaged over members (not the figures of the ensemble)."""
     figures = [result["figures"] for result in results if result.get("figures")]
     common = [name for name in FIGURES if figures and all(name in of_member for of_member in figures)]
     return {name: sum(of_member[name] for of_member in figures) / len(figures) for name in common}

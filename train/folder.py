@@ -1,9 +1,9 @@
 """The output folder of a training.
 
 ```
-OUT/training.json         what the training was started with
-OUT/lock                  held while it is going on
-OUT/member_0/...          checkpoint, weights, version_N/metrics.csv of every session, of every member
+OUT/training.json         settings at the start
+OUT/lock                  locked during a training
+OUT/member_0/...          of each member: checkpoint, weights, version_N/metrics.csv of every session
 OUT/tensorboard/          logs
 OUT/trained.safetensors   all members
 OUT/summary.json          figures, command, versions, hardware, seconds
@@ -22,12 +22,12 @@ from ufmstar_torch.train.member import WEIGHTS
 from ufmstar_torch.train.settings import Job
 
 SUMMARY = "summary.json"
-# Fields of the data's configuration that change how fast samples come, not which.
+# Fields of the data's configuration that change only the speed.
 _SPEED = ("workers", "render_workers", "cache")
 
 
 def identity(job: Job) -> dict[str, Any]:
-    """The settings that decide the weights."""
+    """The settings that determine the weights."""
     data = {name: value for name, value in asdict(job.data).items() if name not in _SPEED}
     s = job.settings
     session = {"seed": s.seed, "init": s.init, "trainable": s.trainable, "precision": s.precision}
@@ -36,16 +36,16 @@ def identity(job: Job) -> dict[str, Any]:
 
 @contextmanager
 def open_folder(job: Job, *, resume: bool = False, overwrite: bool = False) -> Iterator[None]:
-    """Prepare the folder ``job.settings.out`` and hold it; see ``output_folder``."""
+    """Prepare and lock the folder ``job.settings.out``; see ``output_folder``."""
     content = {"identity": identity(job)}
     with output_folder(job.settings.out, TRAINING, content, resume=resume, overwrite=overwrite):
         yield
 
 
 def _fixed(manifest: Mapping[str, Any], _: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The identity but for the number of members: a training may go on with more of them."""
-    then = manifest["identity"]
-    return {**then, "recipe": {name: value for name, value in then["recipe"].items() if name != "members"}}
+    """The identity without the number of members, which may increase when a training is resumed."""
+    stored = manifest["identity"]
+    return {**stored, "recipe": {name: value for name, value in stored["recipe"].items() if name != "members"}}
 
 
 TRAINING = FolderKind(

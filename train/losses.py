@@ -1,9 +1,8 @@
 """Training losses: per-pixel negative log likelihoods and their mean over the valid pixels of a batch.
 
 Gaussian: Kendall and Gal 2017, Eq. 8. Evidential: Amini et al. 2020, Eq. 8 to 10; torch-uncertainty's ``DERLoss`` is
-not used, since on pixels it divides by the wrong number and takes no mask. Everything is computed at least in
-single precision, also under autocast: the square of an error leaves half precision at 256 m, and bfloat16 has
-three digits.
+not used, since on pixels it divides by the wrong number and has no mask. All computations are at least in float32, also
+under autocast: the square of an error overflows float16 at 256 m, and bfloat16 has three digits.
 """
 
 from __future__ import annotations
@@ -16,16 +15,15 @@ from torch import Tensor
 
 from ufmstar_torch.models.distribution import DepthDistribution, EvidentialDepth, GaussianDepth, PointDepth
 
-# [1] Weight of the evidence on wrong pixels: the regulariser's lambda.
+# [1] The regulariser's lambda, the weight of evidence at wrong pixels.
 EVIDENCE_WEIGHT = 0.01
-# [log m^2] Beyond +-40 (2 nm and 500,000 km as standard deviations) the loss continues as at the limit:
-# exp(-s) times the square of an error of 10 km is still far from single precision's largest number.
+# [log m^2] Log-variances are clamped to +-40 (standard deviations of 2 nm and 500,000 km), where exp(-s) times the
+# square of an error of 10 km is far from float32's largest number.
 _LOG_VARIANCE_LIMIT = 40.0
-# [m^2] Added to squared errors before their logarithm; it is below the square of any distance in the world, and
-# far above single precision's smallest normal number.
+# [m^2] Added to squared errors before their logarithm: negligible, and far above float32's smallest normal number.
 _SQUARE_FLOOR = 1e-30
-# [1] From here on the series of log Gamma(a + 1/2) - log Gamma(a) is exact to single precision (its next
-# term is below 5e-8); the difference of the functions is not: at a = 1e6 each is about 1e7.
+# [1] Above this a, the series of log Gamma(a + 1/2) - log Gamma(a) is exact in float32 (its next term is below 5e-8);
+# the difference of the functions is not: at a = 1e6 each is about 1e7.
 _SERIES_FROM = 8.0
 
 
@@ -36,21 +34,20 @@ def loss_of(
     *,
     evidence_weight: float = EVIDENCE_WEIGHT,
 ) -> Tensor:
-    """The distribution's loss, averaged over the pixels that have ground truth.
+    """The distribution's loss, averaged over the pixels with ground truth.
 
-    Depth alone: |error| [m]. Gaussian: negative log likelihood [nat]. Evidential: the same of its Student-t
-    marginal, and the evidence regulariser.
+    Depth without variance: |error| [m]. Gaussian: negative log likelihood [nat]. Evidential: negative log likelihood of
+    its Student-t marginal, plus the evidence regulariser.
 
     Args:
         distribution: parameters, each [B, H, W].
-        target: [B, H, W] ground truth depth [m]; values at other pixels are not used.
-        valid: [B, H, W] bool, True = use; pixels whose target is not finite and positive are left out as
-            well.
+        target: [B, H, W] ground truth depth [m]; ignored where not valid.
+        valid: [B, H, W] bool, True = use; pixels whose target is not finite and positive are ignored, too.
         evidence_weight: lambda of :func:`evidential_loss`.
 
     Returns:
-        A scalar. Without any valid pixel it is 0 and its gradient is 0 everywhere (and not absent: a
-        distributed run waits for every process's gradient).
+        A scalar. Without any valid pixel it is 0 and its gradient is 0 everywhere (not absent: a distributed run waits
+        for every process's gradient).
 
     Raises:
         ValueError: shapes differ, ``valid`` is not bool, a weight is out of range.
@@ -68,19 +65,19 @@ def loss_sums(
 ) -> tuple[Tensor, Tensor]:
     """The sum of the loss over valid pixels and their number (int64); arguments as :func:`loss_of`.
 
-    Processes that share a batch have unequal numbers of valid pixels, so the mean of their means is not the
-    mean over the batch. With ``total`` the sum of all processes' counts, ``world`` their number, and
-    gradients averaged over processes (as DistributedDataParallel does), ``sum * world / total`` as each process's
-    loss gives the gradient of one process that sees the whole batch.
+    Processes that share a batch have unequal numbers of valid pixels, so the mean of their means is not the mean over
+    the batch. With ``total`` the sum of all processes' counts, ``world`` the number of processes, and gradients
+    averaged over processes (DistributedDataParallel), the loss ``sum * world / total`` in each process gives the
+    gradient of the whole batch.
     """
     _check(distribution, target, valid, evidence_weight)
     usable = valid & target.isfinite() & (target > 0)
 
     def at_valid(values: Tensor, elsewhere: float = 1.0) -> Tensor:
-        # Before the loss, not after it: a gradient of NaN times 0 is NaN.
+        # Mask before the loss, because the gradient NaN times 0 is NaN.
         return torch.where(usable, values.to(torch.promote_types(values.dtype, torch.float32)), elsewhere)
 
-    # Autocast leaves all that follows in the type it is in: it is about matrix products and convolutions.
+    # Autocast does not change the dtype of the following operations, only of matrix products and convolutions.
     goal = at_valid(target)
     depth = at_valid(distribution.depth)
     if isinstance(distribution, GaussianDepth):
@@ -103,7 +100,7 @@ def gaussian_nll(depth: Tensor, log_variance: Tensor, target: Tensor) -> Tensor:
 
     Args:
         depth: [...] mean [m].
-        log_variance: [...] s, of the variance in m^2. Beyond +-40 value and gradient are those at +-40.
+        log_variance: [...] s, of the variance in m^2. Outside +-40, value and gradient are those at +-40.
         target: [...] [m].
     """
     s = log_variance + (log_variance.clamp(-_LOG_VARIANCE_LIMIT, _LOG_VARIANCE_LIMIT) - log_variance).detach()
@@ -114,7 +111,7 @@ def evidential_nll(depth: Tensor, nu: Tensor, alpha: Tensor, beta: Tensor, targe
     """-log of the Student-t marginal of the Normal-Inverse-Gamma, per pixel [nat] (Amini et al. 2020, Eq. 8).
 
     St(target; depth, scale^2 = beta (1 + nu) / (nu alpha), 2 alpha degrees of freedom). With Omega = 2 beta (1 + nu)
-    and e the error, Eq. 8 is rewritten so that nothing cancels or overflows:
+    and e the error, Eq. 8 is rewritten to avoid cancellation and overflow:
 
         (log pi - log nu + log Omega) / 2 + (alpha + 1/2) log(1 + e^2 nu / Omega)
         + log Gamma(alpha) - log Gamma(alpha + 1/2)
@@ -136,14 +133,14 @@ def evidential_loss(
 ) -> Tensor:
     """:func:`evidential_nll` + evidence_weight |target - depth| (2 nu + alpha) per pixel (Eq. 9 and 10).
 
-    The regulariser takes evidence away where the depth is wrong, which the likelihood alone does not do.
+    The regulariser reduces the evidence where the depth is wrong, which the likelihood does not.
     """
     evidence = (target - depth).abs() * (2 * nu + alpha)
     return evidential_nll(depth, nu, alpha, beta, target) + evidence_weight * evidence
 
 
 def _log_gamma_half_step(a: Tensor) -> Tensor:
-    """log Gamma(a + 1/2) - log Gamma(a), a > 0, also where both are so large that nothing of the difference is left."""
+    """log Gamma(a + 1/2) - log Gamma(a), a > 0, without cancellation for large a."""
     large = a > _SERIES_FROM
     big, small = torch.where(large, a, _SERIES_FROM), torch.where(large, 1.0, a)
     r = 1 / big

@@ -1,4 +1,4 @@
-"""The training of one network, from its first step or from its last checkpoint to its weights on disk."""
+"""The training of one network, from its start or its last checkpoint to its weights on disk."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ WEIGHTS, RESULT = "trained.safetensors", "result.json"
 
 
 def new_network(job: Job, member: int) -> DepthNetwork:
-    """The network that a member starts with; it depends on the seed alone."""
+    """The initial network of a member; its random weights depend only on the seed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(step_seed(job.seed(member), 0, -1))
         network = starting_network(job.recipe.network, job.settings.init, member, job.backbone)
@@ -39,10 +39,9 @@ def new_network(job: Job, member: int) -> DepthNetwork:
 def train_member(
     job: Job, member: int, *, deadline: float | None = None, asked: Callable[[], bool] | None = None
 ) -> str | None:
-    """Train one member, from its checkpoint if it has one, up to ``deadline``, in ``time.monotonic()``'s seconds, or
-    until ``asked`` returns True. Returns None when it is finished, otherwise why it was stopped; in both cases its
-    weights are on disk. Raises NonFiniteLossError: the training has diverged; ResumeError: the checkpoint cannot be
-    read."""
+    """Train one member, from its checkpoint if there is one, until ``deadline``, in ``time.monotonic()``'s seconds, or
+    until ``asked`` returns True. Writes its weights. Returns None if it is finished, otherwise the reason of the stop.
+    Raises NonFiniteLossError: the training has diverged; ResumeError: the checkpoint cannot be read."""
     folder = job.folder(member)
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint = folder / NAME
@@ -58,7 +57,7 @@ def train_member(
         trainer.callbacks[:0] = [stops, timer, Checkpoints(checkpoint)]
         module = TrainingModule(new_network(job, member), job.recipe, total, job.seed(member))
         trainer.fit(module, data, ckpt_path=stored, weights_only=True)
-    # A stop that is asked for at the last step leaves a finished training.
+    # After the last step, the training is finished despite a request to stop.
     reason = stops.reason if trainer.global_step < total else None
     if trainer.is_global_zero:
         figures = {"epoch": trainer.current_epoch, **module.figures}
@@ -69,8 +68,7 @@ def train_member(
 
 
 def make_data(job: Job, member: int, world: int) -> DepthDataModule:
-    """The member's data, opened, for ``world`` processes. Raises ValueError: the batch cannot be divided among the
-    processes."""
+    """Open the member's data for ``world`` processes. Raises ValueError: the batch cannot be divided among them."""
     if job.recipe.batch_size % world:
         raise ValueError(f"batch_size {job.recipe.batch_size} must be a multiple of the {world} processes")
     order = {"seed": job.seed(member), "clip_frames": job.recipe.clip_frames}
@@ -92,8 +90,8 @@ def training_length(job: Job, data: DepthDataModule) -> int:
 def make_trainer(job: Job, member: int) -> pl.Trainer:
     """Lightning's trainer; only :class:`Checkpoints` writes checkpoints."""
     r, s = job.recipe, job.settings
-    precision: Any = s.precision  # one of many literals, which Lightning checks
-    # A session's rows go into the next version_N/metrics.csv, since the logger never continues a file.
+    precision: Any = s.precision  # Lightning checks the literal
+    # Every session has a new version_N/metrics.csv, since the logger cannot continue a file.
     loggers: list[Logger] = [CSVLogger(s.out, name=f"member_{member}", flush_logs_every_n_steps=s.log_every)]
     if s.tensorboard:
         loggers.append(TensorBoardLogger(str(s.out), name="tensorboard", version=f"member_{member}"))
@@ -121,7 +119,7 @@ def make_trainer(job: Job, member: int) -> pl.Trainer:
 
 
 def _finish(job: Job, member: int, module: TrainingModule, session: dict[str, Any]) -> None:
-    """Write the weights, and then result.json, whose "finished" states that the member needs no more training."""
+    """Write the weights, and then result.json, whose "finished" is True if the member's training is complete."""
     folder = job.folder(member)
     result = {"member": member, "seed": job.seed(member), **session}
     info = {"recipe": job.recipe.to_dict(), **result}
@@ -131,8 +129,7 @@ def _finish(job: Job, member: int, module: TrainingModule, session: dict[str, An
 
 @contextmanager
 def quiet_lightning() -> Iterator[None]:
-    """Without Lightning's remarks on hardware and tips, and without a warning of torch about Lightning's own code;
-    other warnings stay."""
+    """Suppress Lightning's messages on hardware, its tips, and torch's warning about Lightning's code."""
     loggers = [logging.getLogger(f"lightning.{part}") for part in ("pytorch", "fabric")]
     before = [logger.level for logger in loggers]
     for logger in loggers:

@@ -1,4 +1,4 @@
-"""The Lightning module: loss, optimizer, schedule, running mean of the weights, and the figures that are logged."""
+"""The Lightning module: loss, optimizer, schedule, running mean of the weights, and logged figures."""
 
 from __future__ import annotations
 
@@ -36,26 +36,25 @@ class NonFiniteLossError(RuntimeError):
 class TrainingModule(pl.LightningModule):
     """Trains one network.
 
-    Every random number of a step (dropout) follows from (seed, process, step) alone, so that a resumed training gives
-    the same weights as an uninterrupted one, whatever else draws random numbers.
+    The random numbers of a step (dropout) depend only on (seed, process, step), so that a resumed training gives the
+    same weights as an uninterrupted one.
 
     Args:
-        network: an ``UncertaintyNetwork``, ``MonteCarloDropout`` or ``BatchEnsemble``: it has ``.distribution(image)``.
+        network: an ``UncertaintyNetwork``, ``MonteCarloDropout`` or ``BatchEnsemble``, with ``.distribution(image)``.
         recipe: of its training.
-        total_steps: with which the schedule ends.
+        total_steps: length of the schedule.
         seed: of the training.
 
     Attributes:
         averaged: running mean of the network's weights (``recipe.average``), or None.
-        residuals: squared errors of the training part in this epoch, as they were at each step: the variance of
-            the constant-variance baseline.
-        losses: of the training part in this epoch: (sum, pixels).
+        residuals: sums of squared errors at the training steps of this epoch, for the constant-variance baseline.
+        losses: sums of the loss at the training steps of this epoch.
         figures: of the last validation, by name.
     """
 
     def __init__(self, network: nn.Module, recipe: Recipe, total_steps: int, seed: int = 0) -> None:
         super().__init__()
-        # Half the time of a step on CPUs, and what tensor cores want.
+        # Halves the time of a step on CPUs, and suits tensor cores.
         self.network: Any = network.to(memory_format=torch.channels_last)
         self.recipe = recipe
         self.total_steps = total_steps
@@ -66,26 +65,26 @@ class TrainingModule(pl.LightningModule):
         self.validation = Validation()
         self.figures: dict[str, float] = {}
         self._batch_idx = 0
-        # No module of this one: nothing of it is kept from step to step.
+        # Not a submodule: it has no state between steps.
         self._teacher = Teacher(recipe.clip_frames, stated_range([network])) if recipe.clip_frames > 1 else None
 
     @property
     def result(self) -> DepthNetwork:
-        """The network to keep: the running mean if there is one."""
-        judged: DepthNetwork = self.network if self.averaged is None else self.averaged
-        return judged
+        """The network to validate and save: the running mean if there is one."""
+        network: DepthNetwork = self.network if self.averaged is None else self.averaged
+        return network
 
     # ---- training ----
 
     def on_train_start(self) -> None:
-        """Put the parts that are not trained into eval mode, so that their batch norms keep their statistics."""
+        """Set eval mode for frozen submodules, so that their batch norms keep their statistics."""
         for part in self.network.modules():
             parameters = list(part.parameters(recurse=False))
             if parameters and not any(p.requires_grad for p in parameters):
                 part.eval()
 
     def on_train_epoch_start(self) -> None:
-        """Empty sums."""
+        """Reset the sums."""
         self.residuals, self.losses = Sums(), Sums()
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
@@ -94,44 +93,44 @@ class TrainingModule(pl.LightningModule):
         torch.manual_seed(step_seed(self.seed, self.global_rank, self.global_step))
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """The loss of the whole batch, however many processes it is divided among.
+        """The loss of this process's share of the batch.
 
-        The value returned is this process's sum over the batch's number of pixels, times the number of processes: its
-        gradient, averaged over processes as DistributedDataParallel does, is that of the mean over all pixels. Raises
+        Returns the process's sum over the whole batch's number of pixels, times the number of processes: its gradient,
+        averaged over processes by DistributedDataParallel, is that of the mean over all pixels. Raises
         NonFiniteLossError: it is NaN or infinite.
         """
         distribution = self._distribution(batch["image"])
         target, valid = _tiled(batch["depth"], distribution), _tiled(batch["valid"], distribution)
         total, count = self._loss_sums(batch, distribution, target, valid)
         error = torch.where(valid, distribution.depth.detach().float() - target, 0.0).double()
-        mine = torch.stack([total.detach().double(), count.double(), error.square().sum(), valid.sum().double()])
-        together, world = self._over_processes(mine)
-        if not math.isfinite(together[0]):
+        sums = torch.stack([total.detach().double(), count.double(), error.square().sum(), valid.sum().double()])
+        all_sums, world = self._over_processes(sums)
+        if not math.isfinite(all_sums[0]):
             raise NonFiniteLossError(self._blame("loss", batch_idx, float(total.detach())))
-        self.residuals = self.residuals.plus(*together[2:].tolist())
-        self.losses = self.losses.plus(*together[:2].tolist())
-        mean = together[0] / together[1].clamp(min=1)
+        self.residuals = self.residuals.plus(*all_sums[2:].tolist())
+        self.losses = self.losses.plus(*all_sums[:2].tolist())
+        mean = all_sums[0] / all_sums[1].clamp(min=1)
         self.log("train_loss", mean.float(), prog_bar=True, batch_size=len(target))
         self.log("learning_rate", self.trainer.optimizers[0].param_groups[0]["lr"], batch_size=1)
-        return total * (world / together[1].clamp(min=1)).to(total)
+        return total * (world / all_sums[1].clamp(min=1)).to(total)
 
     def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
-        """Raise NonFiniteLossError where a finite loss has a gradient that is not, before it spoils the weights."""
+        """Raise NonFiniteLossError if the gradient of a finite loss is not finite, before it changes the weights."""
         if self.trainer.precision == "16-mixed":
-            return  # with it such steps are skipped, and the loss is scaled down
+            return  # the gradient scaler skips such steps and reduces the scale
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
         if gradients and not math.isfinite(get_total_norm(gradients)):
             raise NonFiniteLossError(self._blame("gradient", self._batch_idx))
 
     def optimizer_step(self, *arguments: Any, **named: Any) -> None:
-        """A step, and the running mean after it (here, so that a checkpoint after the step contains both).
+        """A step, and then an update of the running mean, so that a checkpoint after the step contains both.
 
-        Not Lightning's ``WeightAveraging``: its mean begins with the first step's weights instead of the start's, it
-        averages batch norm's counters, and it exchanges the weights in checkpoints.
+        Lightning's ``WeightAveraging`` is not used: its mean begins with the weights after the first step, it averages
+        batch norm's counters, and it swaps the weights in checkpoints.
         """
         super().optimizer_step(*arguments, **named)
         if self.averaged is not None:
-            # A shorter memory in the first steps, so that the mean forgets the random weights soon.
+            # A shorter memory in the first steps, so that the mean forgets the initial weights soon.
             decay = min(self.recipe.average, self.global_step / (self.global_step + 10))
             move_average(self.averaged, self.network, decay)
 
@@ -141,7 +140,7 @@ class TrainingModule(pl.LightningModule):
             self.log("train_loss_epoch", self.losses.mean(), sync_dist=True)
 
     def configure_optimizers(self) -> Any:
-        """Adam and the schedule, step by step."""
+        """Adam, and the schedule per step."""
         r = self.recipe
         # Weight decay pulls to 0, but the factors of a BatchEnsemble are multipliers around 1.
         factors = {id(p) for p in (self.network.factors() if isinstance(self.network, BatchEnsemble) else ())}
@@ -157,7 +156,7 @@ class TrainingModule(pl.LightningModule):
     # ---- validation ----
 
     def on_validation_epoch_start(self) -> None:
-        """Empty sums."""
+        """Reset the sums."""
         self.validation = Validation(self.device)
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
@@ -173,7 +172,7 @@ class TrainingModule(pl.LightningModule):
     # ---- state ----
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """The figures, beside what Lightning keeps."""
+        """Add the figures to Lightning's checkpoint."""
         checkpoint[FIGURES_KEY] = self.figures
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -199,31 +198,31 @@ class TrainingModule(pl.LightningModule):
         """The sum over all processes, and their number."""
         if not (dist.is_available() and dist.is_initialized()):
             return values, 1
-        together = values.clone()
-        dist.all_reduce(together)
-        return together, dist.get_world_size()
+        total = values.clone()
+        dist.all_reduce(total)
+        return total, dist.get_world_size()
 
     def _samples(self, batch_idx: int) -> list[str]:
-        """Names of the frames in this process's batch; their order follows from the epoch."""
+        """Names of the frames in this process's batch, whose order depends on the epoch."""
         loader: Any = self.trainer.train_dataloader
         batches = copy.copy(loader.batch_sampler)
         batches.set_epoch(self.current_epoch)
         return [loader.dataset.source.name(key.frame) for key in next(islice(batches, batch_idx, None))]
 
-    def _blame(self, what: str, batch_idx: int, mine: float | None = None) -> str:
+    def _blame(self, what: str, batch_idx: int, loss: float | None = None) -> str:
         moment = f"epoch {self.current_epoch}, batch {batch_idx} (step {self.global_step})"
         samples = f"samples {', '.join(self._samples(batch_idx))}"
         if self.trainer.world_size > 1:
-            samples = f"process {self.global_rank}{f' with loss {mine}' if mine is not None else ''}, {samples}"
+            samples = f"process {self.global_rank}{f' with loss {loss}' if loss is not None else ''}, {samples}"
         return (
             f"the {what} is not finite in {moment}, {samples}; a smaller learning rate or --clip 1 may help; "
-            "the checkpoint before it is kept"
+            "the previous checkpoint remains"
         )
 
 
 def step_seed(seed: int, rank: int, step: int) -> int:
-    """A seed in 63 bits that differs for every (seed, process, step)."""
-    # SplitMix64's mixing, so that neighbouring steps have nothing in common.
+    """A hash of (seed, process, step) in 63 bits."""
+    # SplitMix64's mixing, so that successive seeds are uncorrelated.
     z = (seed * 0x9E3779B97F4A7C15 + rank * 0xBF58476D1CE4E5B9 + step * 0x94D049BB133111EB + 1) % 2**64
     z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9 % 2**64
     z = (z ^ (z >> 27)) * 0x94D049BB133111EB % 2**64
@@ -241,7 +240,7 @@ def share_of_rate(step: int, total: int, recipe: Recipe) -> float:
 
 @torch.no_grad()
 def move_average(averaged: nn.Module, network: nn.Module, decay: float) -> None:
-    """averaged <- decay averaged + (1 - decay) network, in place; batch norm's statistics as well, counters copied."""
+    """averaged <- decay averaged + (1 - decay) network, in place, also for batch norm's statistics; copies counters."""
     state = network.state_dict()
     for name, mean in averaged.state_dict().items():
         if mean.is_floating_point():
@@ -251,6 +250,6 @@ def move_average(averaged: nn.Module, network: nn.Module, decay: float) -> None:
 
 
 def _tiled(target: Tensor, distribution: DepthDistribution) -> Tensor:
-    """The target once per prediction: a BatchEnsemble predicts for every member, member after member."""
+    """The target repeated for every member of a BatchEnsemble, whose predictions are concatenated."""
     times = len(distribution.depth) // len(target)
     return target if times == 1 else target.repeat(times, 1, 1)

@@ -1,5 +1,5 @@
-"""NYU Depth V2 in FastDepth's layout (``eval.sequences.nyu`` reads it), from the labelled file that the dataset's own
-site offers: the archive that FastDepth names is gone (docs/training.md).
+"""Conversion of NYU Depth V2's labelled file, from the dataset's website, to FastDepth's layout, which
+``eval.sequences.nyu`` reads. FastDepth's archive is no longer available (docs/training.md).
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ def convert_labelled(
     *,
     raw: bool = False,
 ) -> dict[str, int]:
-    """Writes ``nyu_depth_v2_labeled.mat`` (MATLAB 7.3, which is HDF5) in FastDepth's layout.
+    """Convert ``nyu_depth_v2_labeled.mat`` (MATLAB 7.3, which is HDF5) to FastDepth's layout.
 
-    Files are written atomically; those that exist are left as they are, so that an interrupted conversion goes on.
+    Files are written atomically; existing files are not replaced, so that an interrupted conversion can be resumed.
 
     Args:
         mat: the labelled dataset: ``images`` [N, 3, W, H], ``depths`` and ``rawDepths`` [N, W, H] [m]
             (MATLAB stores columns first), ``scenes``.
-        out: folder that gets ``train/<scene>/NNNNN.h5`` and ``val/...``, NNNNN the number in ``mat`` from 1.
-        splits: the site's ``splits.mat`` (``trainNdxs``, ``testNdxs``), whose 654 test frames become "val". None:
-            every fourth scene does, as a whole.
-        raw: the sensor's depth with its holes, and not the one with holes filled in.
+        out: folder of ``train/<scene>/NNNNN.h5`` and ``val/...``, NNNNN the number in ``mat`` from 1.
+        splits: the website's ``splits.mat`` (``trainNdxs``, ``testNdxs``), whose 654 test frames become "val". None:
+            every fourth scene becomes "val".
+        raw: use the sensor's depth with its holes instead of the filled depth.
 
     Returns:
         The number of frames of each part.
 
     Raises:
-        ValueError: ``mat`` has not these arrays, or ``splits`` does not cover its frames.
+        ValueError: ``mat`` lacks these arrays, or ``splits`` does not cover its frames.
         OSError: a file cannot be read or written.
     """
     import h5py
@@ -66,7 +66,7 @@ def convert_labelled(
 
 
 def _matlab_string(characters: h5py.Dataset) -> str:
-    """MATLAB 7.3 keeps a string as a column of UTF-16 code units."""
+    """A string of MATLAB 7.3, a column of UTF-16 code units."""
     return "".join(chr(code) for code in np.asarray(characters).ravel())
 
 

@@ -1,4 +1,4 @@
-"""A head on a network of one's own: any ``nn.Module`` or depth model of ``transformers``."""
+"""Training of a head on a custom network: any ``nn.Module`` or depth model of ``transformers``."""
 
 from __future__ import annotations
 
@@ -39,20 +39,20 @@ def train_module(
     settings: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> DepthNetwork:
-    """Train a head on a network, and write OUT/trained.safetensors; ``load_network("trained", FILE)`` loads it again,
-    with ``backbone=`` where that is a module.
+    """Train a head on a network, and write OUT/trained.safetensors; ``load_network("trained", FILE)`` loads it, with
+    ``backbone=`` if that is a module.
 
     Args:
         backbone, head, data, options: see :func:`own_job`.
         out: folder for all results.
-        resume, overwrite: as ``fit``.
+        resume, overwrite: see ``fit``.
         settings: other fields of ``FitSettings``.
 
     Returns:
         The trained network in eval mode; several members as one ``Ensemble``.
 
     Raises:
-        ValueError: an argument is impossible; others as ``fit`` and ``from_hugging_face``.
+        ValueError: an argument is invalid; others as ``fit`` and ``from_hugging_face``.
     """
     from ufmstar_torch.train.fit import fit
     from ufmstar_torch.train.member import WEIGHTS
@@ -79,21 +79,21 @@ def own_job(
     """The training of a head on a network.
 
     Args:
-        backbone: a module that returns metric depth or features (``ModuleSpec.of``), which stays as it is; or the
-            directory or hub name of a depth model of ``transformers``.
-        data: to train and validate on.
+        backbone: a module that returns metric depth or features (``ModuleSpec.of``), which is copied; or the directory
+            or hub name of a depth model of ``transformers``.
+        data: for training and validation.
         head: "aleatoric", "evidential", "mc-dropout", "ensemble", "batch-ensemble" or "depth-only"; or a class of head.
         settings: of the session.
-        fine_tune: train the network too; otherwise it is frozen.
-        preprocess: what the network's input needs; None = its attribute ``preprocess``, or its checkpoint's.
-        features: name of the part whose input the head reads; None = the last convolution that runs.
+        fine_tune: also train the network; otherwise it is frozen.
+        preprocess: preprocessing of the network's input; None = its attribute ``preprocess``, or its checkpoint's.
+        features: name of the submodule whose input is the head's input; None = the last convolution that runs.
         spec: declarations about a checkpoint. A relative one without an alignment is aligned to the training depths.
         members: of an ensemble or BatchEnsemble; None = 10 of either.
         network: fields of the ``NetworkSpec``, such as dropout.
         recipe: fields of the :class:`Recipe`, such as epochs.
 
     Raises:
-        ValueError: no such head, a network that does not fit it, or an impossible value.
+        ValueError: an unknown head, a network that does not fit it, or an invalid value.
     """
     row = head if isinstance(head, str) else getattr(head, "method", "")
     if row not in METHOD_ROWS or isinstance(head, nn.Module):
@@ -121,7 +121,7 @@ def own_job(
 def _of_checkpoint(
     name: str | Path, data: DataConfig, preprocess: Preprocess | None, part: str | None, spec: Any
 ) -> ModuleSpec:
-    """The specification of a checkpoint, whose images are all of one size, as batches need."""
+    """The specification of a checkpoint, by default with inputs of one size, as batches require."""
     read, declared = read_checkpoint(name), HuggingFaceSpec.read({} if spec is None else spec)
     if preprocess is not None:
         declared = replace(declared, preprocess=preprocess)
@@ -136,7 +136,7 @@ def _of_checkpoint(
 
 
 def _aligned(network: HuggingFaceDepth, data: DataConfig) -> Alignment:
-    """The alignment of a relative network to frames of the training part, one for all."""
+    """Fit one alignment of a relative network to frames of the training part."""
     module = DepthDataModule(replace(data, augmentation=None), network.preprocess)
     module.setup("fit")
     frames = module.train_set
@@ -151,8 +151,8 @@ def _aligned(network: HuggingFaceDepth, data: DataConfig) -> Alignment:
 
 
 def _new_parts(spec: NetworkSpec) -> tuple[str, ...]:
-    """The parameters that are trained on a frozen network: those of the head, of a depth that the network does not
-    predict, and the members' own factors."""
+    """The trained parameters on a frozen network: those of the head, of the depth's convolution if the network returns
+    features, and of a BatchEnsemble's factors."""
     several = spec.method == "batch_ensemble"
     assert spec.module is not None
     parts = ["head", *(["backbone.last"] if spec.module.part is None else [])]

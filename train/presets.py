@@ -1,10 +1,11 @@
-"""Recipes: the settings that decide a training's weights, and the named presets.
+"""Recipes: the settings that determine the weights, and the named presets.
 
 From the paper (Section VII): 224 x 224, 50 epochs, Adam with momentum 0.9, weight decay 1e-4, dropout 0.2 "for all
 ResNet50-Monodepth2 and FastDepth models", ten members. All methods are therefore trained with decoder dropout; at test
-time only mc_dropout samples by it. Table 1's .01 and .03 MB of aleatoric and evidential heads are those of four scales.
-The paper is silent on the rest. The authors' release of DecTrain (mit-lean/DecTrain) names its networks by batch 4,
-learning rate 1e-4, 50 epochs and dropout .2, and its ResNet50 starts from ImageNet. Other choices are ours.
+time only mc_dropout samples with it. Table 1's .01 and .03 MB of aleatoric and evidential heads correspond to four
+scales. The paper does not state the rest. The names of the networks in the authors' release of DecTrain
+(mit-lean/DecTrain) state batch 4, learning rate 1e-4, 50 epochs and dropout .2, and its ResNet50 starts from ImageNet.
+Other choices are ours.
 """
 
 from __future__ import annotations
@@ -16,17 +17,17 @@ from typing import Any
 from ufmstar_torch.checked import Checked, choice, number
 from ufmstar_torch.models.spec import NetworkSpec
 
-# Batch and learning rate of monodepth2 are DecTrain's; FastDepth was trained with eight images a step.
+# Batch and learning rate of monodepth2 are DecTrain's; FastDepth was trained with eight images per step.
 TRAINING: dict[str, dict[str, Any]] = {
     "monodepth2": {"learning_rate": 1e-4, "batch_size": 4, "schedule": "cosine"},
     "fastdepth": {"learning_rate": 1e-3, "batch_size": 8, "schedule": "cosine"},
 }
-# Heads of a variance, by architecture.
+# Number of uncertainty heads (scales), by architecture.
 _SCALES = {"monodepth2": 4, "fastdepth": 1}
-# A new head on a frozen network, and a whole pretrained network, whose weights large steps would undo.
+# For a new head on a frozen network, and for a whole pretrained network, which large steps would destroy.
 OF_HEAD: dict[str, Any] = {"learning_rate": 1e-3, "batch_size": 8, "epochs": 10, "clip": 10.0}
 OF_MODULE: dict[str, Any] = {**OF_HEAD, "learning_rate": 1e-5}
-# Largest ensemble; the seeds of two trainings differ by this (``train.settings.Job.seed``).
+# Largest ensemble, and factor of the seeds (``train.settings.Job.seed``).
 MOST_MEMBERS = 1000
 
 
@@ -96,17 +97,17 @@ class Recipe(Checked):
         """The fields as plain values for JSON."""
         values = {**super().to_dict(), "network": self.network.to_dict()}
         if self.clip_frames == 1:
-            del values["clip_frames"]  # as files have it that are older than the field
+            del values["clip_frames"]  # equal to files that are older than the field
         return values
 
     def with_members(self, count: int) -> Recipe:
-        """The recipe with another number of members, of the ensemble or of the BatchEnsemble."""
+        """A copy with another number of members of the ensemble or BatchEnsemble."""
         if self.network.method == "batch_ensemble":
             return replace(self, network=replace(self.network, members=count))
         return replace(self, members=count)
 
 
-# [1] Decoder dropout of every model that the paper trains.
+# [1] Decoder dropout of all models in the paper.
 DROPOUT = 0.2
 # Second half of a preset's name -> the network's fields, members of the ensemble.
 METHOD_ROWS: dict[str, tuple[dict[str, Any], int]] = {
@@ -117,7 +118,7 @@ METHOD_ROWS: dict[str, tuple[dict[str, Any], int]] = {
     "ensemble": ({"method": "aleatoric"}, 10),
     "batch-ensemble": ({"method": "batch_ensemble", "members": 10}, 1),
 }
-# The recipe of the weights that the package contains: small enough for the package, fast enough for two cores.
+# The recipe of the weights in the package: small enough for the package, fast enough for two cores.
 _DEMO = Recipe(
     network=NetworkSpec(
         architecture="fastdepth",
@@ -135,7 +136,7 @@ _DEMO = Recipe(
     average=0.999,
     half=True,
 )
-# UfM*'s variance as the head's: clips of four frames, and no dropout, whose noise would be disagreement as well.
+# Distillation of UfM*'s variance: clips of four frames, and no dropout, whose noise would count as disagreement.
 _DISTILLED = Recipe(
     network=NetworkSpec(architecture="fastdepth", method="aleatoric", positive="softplus"),
     clip_frames=4,
@@ -174,7 +175,7 @@ def preset(name: str) -> Recipe:
 
 
 def table() -> str:
-    """The presets as a table, one a row, and which of their values are the paper's."""
+    """The presets as a table, one per row, and the sources of their values."""
     columns = ("preset", "method", "members", "widths", "size", "epochs", "batch", "learning rate", "decay", "dropout")
     rows = [columns]
     for name, r in PRESETS.items():

@@ -1,8 +1,8 @@
-"""Figures of a validation, and those of a constant variance as yardstick.
+"""Figures of a validation, and the baseline of a constant variance.
 
-The yardstick is the best likelihood without a variance head: the same depth with one variance for all pixels.
-It depends on the squared errors only. The variance is taken from the training part ("nll_constant"), as it would be in
-practice, and for comparison from the validation itself ("nll_constant_best"), which no constant can exceed.
+The baseline is the likelihood without a variance head: the same depth with one variance for all pixels, the mean
+squared error. It is estimated on the training part ("nll_constant"), as in practice, and for comparison on the
+validation part ("nll_constant_best"), the optimum of all constants.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ufmstar_torch.prediction import DepthPrediction
 from ufmstar_torch.train.losses import gaussian_nll
 
 FIGURES = ("val_nll", "val_nll_constant", "val_nll_constant_best", "val_delta1", "val_rmse", "val_rel")
-# [m^2] Smallest variance of a constant: (1 mm)^2, as the heads have it.
+# [m^2] Smallest constant variance: (1 mm)^2, as for the heads.
 VARIANCE_FLOOR = 1e-6
 
 
@@ -39,7 +39,7 @@ class Sums:
 
 
 class Validation:
-    """The figures of one validation, over the valid pixels of all processes; NCCL exchanges sums on GPUs only."""
+    """The figures of one validation, over the valid pixels of all processes. NCCL requires the sums on the GPU."""
 
     def __init__(self, device: torch.device | str = "cpu") -> None:
         self._accuracy = [metric.to(device) for metric in (Delta1(), RMSE(), AbsRel())]
@@ -55,8 +55,8 @@ class Validation:
             self._nll.update(prediction.depth, prediction.variance.clamp(min=VARIANCE_FLOOR), depth, valid)
 
     def figures(self, training: Sums) -> dict[str, float]:
-        """The figures by their names in metrics.csv; the NLL only if the network predicts a variance, none without a
-        pixel. ``training``: squared errors of the training part [m^2]. All processes must call it."""
+        """The figures by their names in metrics.csv: the NLL only if the network predicts a variance, no figures
+        without a pixel. ``training``: squared errors of the training part [m^2]. All processes must call this."""
         accuracy = {name: value for metric in self._accuracy for name, value in metric.compute().items()}
         if not accuracy["pixels"]:
             return {}

@@ -1,4 +1,4 @@
-"""Training samples: frames as a network's input with their ground truth, and the treatment of broken files."""
+"""Training samples: a network's inputs with their ground truth, and the treatment of broken files."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _LOG = logging.getLogger(__name__)
 class Sample(TypedDict):
     """One training sample at the network's size; a loader stacks them along a first dimension.
 
-    image [3, H, W] float32 as the network's ``Preprocess`` returns it; depth [H, W] float32 [m], 0 = none;
-    valid [H, W] bool, True = has ground truth; intrinsics [3, 3] float64 [px]; T_world_cam [4, 4] float64
-    camera-to-world [m], NaN = not known.
+    image [3, H, W] float32, output of the network's ``Preprocess``; depth [H, W] float32 [m], 0 = none; valid [H, W]
+    bool, True = has ground truth; intrinsics [3, 3] float64 [px]; T_world_cam [4, 4] float64 camera-to-world [m], NaN =
+    unknown.
     """
 
     image: Tensor
@@ -36,8 +36,8 @@ class Sample(TypedDict):
 
 
 class SampleKey(NamedTuple):
-    """A frame and its epoch, which a sampler yields, so that augmentation differs between epochs and is the same for
-    any number of workers. ``counts``: otherwise no pixel of the sample is valid."""
+    """A frame and its epoch, from a sampler: augmentation depends on the epoch, but not on the number of workers.
+    ``counts`` False: no pixel of the sample is valid."""
 
     epoch: int
     frame: int
@@ -48,14 +48,13 @@ class SampleDataset(Dataset[Sample]):
     """The frames of a source as samples for a network.
 
     Args:
-        source: where frames come from.
-        preprocess: the network's.
-        augmentation: None = none, as for validation.
+        source: of the frames.
+        preprocess: of the network.
+        augmentation: None = no augmentation, as for validation.
         seed: of the augmentation.
-        on_bad_file: "raise": the first broken file stops the run. "skip": the next readable frame takes its
-            place (after the last comes the first), in every process and in every order. For training, that frame
-            is then seen twice in an epoch; for validation (``evaluate``), it counts once: its copy has no valid
-            pixel.
+        on_bad_file: "raise": the first broken file stops the run. "skip": the next readable frame (cyclically) replaces
+            it, in every process and order. In training, that frame then occurs twice in an epoch; in validation
+            (``evaluate``), its copy has no valid pixel.
         evaluate: see ``on_bad_file``.
 
     Raises:
@@ -78,16 +77,15 @@ class SampleDataset(Dataset[Sample]):
             raise ValueError("source must hold at least one frame, got none")
         self.source, self.preprocess, self.augmentation = source, preprocess, augmentation
         self.seed, self.on_bad_file, self.evaluate = seed, on_bad_file, evaluate
-        # In shared memory, so that the calling process sees the broken files that its workers meet.
+        # In shared memory, so that the calling process can read the workers' entries.
         self._bad = torch.zeros(len(source), dtype=torch.bool).share_memory_()
 
     def __len__(self) -> int:
         return len(self.source)
 
     def __getitem__(self, key: int | SampleKey) -> Sample:
-        """The sample of a frame, (epoch, frame) as ``EpochBatches`` yields it; a frame's number alone is of epoch 0.
-        Raises IndexError: no such frame; FrameError: a broken file with ``on_bad_file="raise"``, or none that can be
-        read."""
+        """The sample of a frame. ``key``: from ``EpochBatches``, or a frame's number, for epoch 0. Raises IndexError:
+        no such frame; FrameError: a broken file with ``on_bad_file="raise"``, or no readable file."""
         epoch, index, counts = SampleKey(*key) if isinstance(key, tuple) else SampleKey(0, key)
         if not 0 <= index < len(self):
             raise IndexError(f"index must lie in [0, {len(self)}), got {index}")
@@ -95,16 +93,16 @@ class SampleDataset(Dataset[Sample]):
         sample = make_sample(frame, self.preprocess, self.augmentation, (self.seed, epoch, index))
         if not counts or (self.evaluate and number != index):
             sample["valid"] = torch.zeros_like(sample["valid"])
-        if number != index:  # perhaps of another path
+        if number != index:  # the replacement may belong to another sequence
             sample["T_world_cam"] = torch.full_like(sample["T_world_cam"], torch.nan)
         return sample
 
     def bad_files(self) -> tuple[str, ...]:
-        """The broken files met so far, in this process and in the workers of its loaders."""
+        """The broken files so far, of this process and of the workers of its loaders."""
         return tuple(self.source.name(index) for index in self._bad.nonzero()[:, 0].tolist())
 
     def _readable(self, index: int) -> tuple[Frame, int]:
-        """Frame ``index``, or else the next that can be read, and its number."""
+        """The first readable frame from ``index`` on, and its number."""
         for step in range(len(self)):
             candidate = (index + step) % len(self)
             if self._bad[candidate]:
@@ -122,7 +120,7 @@ class SampleDataset(Dataset[Sample]):
 def make_sample(
     frame: Frame, preprocess: Preprocess, augmentation: Augmentation | None, seed: tuple[int, ...]
 ) -> Sample:
-    """A stored frame as the network sees it: augmented, then preprocessed; ``seed`` is the augmentation's."""
+    """Convert a stored frame to a sample: augment, then preprocess it; ``seed``: of the augmentation."""
     parts = (frame.image, frame.depth, frame.intrinsics, frame.T_world_cam)
     image, depth, K, pose = (torch.from_numpy(np.array(part)) for part in parts)
     image = image.permute(2, 0, 1).contiguous().to(torch.float32) / 255
@@ -135,8 +133,8 @@ def make_sample(
 
 
 def clips(source: SequenceFrames, length: int) -> list[range]:
-    """The frames of a source in clips that do not overlap; what is left at the end of a path is in none. Raises
-    ValueError: there is none."""
+    """Divide the frames of a source into clips without overlap, dropping incomplete clips. Raises ValueError: there is
+    no complete clip."""
     whole = [run[i : i + length] for run in source.runs() for i in range(0, len(run) - length + 1, length)]
     if not whole:
         raise ValueError(f"clip_frames: the training part has no {length} frames with known poses one after the other")

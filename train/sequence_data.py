@@ -1,4 +1,4 @@
-"""Any RGB-D sequence as training frames: those that ``open_sequence`` reads, and folders without poses."""
+"""RGB-D sequences as training frames: all layouts of ``open_sequence``, and folders without poses."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from ufmstar_torch.train.data_config import Part
 
 
 class SequenceFrames:
-    """The frames with depth of the same part of several sequences, one after the other. The part is counted over all
-    usable frames of a sequence, also those without a depth map.
+    """The frames with depth of the same part of several sequences, concatenated. The part refers to all usable frames
+    of a sequence, including those without a depth map.
 
-    Depth maps with a camera of their own are seen at the image's pixels (``eval.sequences.ground_truth``). Raises
-    ValueError: no sequence, or one whose part has no frame with depth.
+    Depth maps of a separate depth camera are projected to the image's pixels (``eval.sequences.ground_truth``). Raises
+    ValueError: no sequence, or a sequence whose part has no frame with depth.
     """
 
     def __init__(self, sequences: Sequence[FrameSequence], part: str | Part = "0:100%") -> None:
@@ -42,20 +42,20 @@ class SequenceFrames:
         return len(self._frames)
 
     def name(self, index: int) -> str:
-        """Sequence and frame."""
+        """Names of sequence and frame."""
         number, frame = self._frames[index]
         sequence = self.sequences[number]
         return f"{sequence.name}/{sequence.entries[frame].name}"
 
     def runs(self) -> list[range]:
-        """The frames of every sequence with poses."""
-        of = [number for number, _ in self._frames]
-        posed = [number for number in range(len(self.sequences)) if self.sequences[number].posed and number in of]
-        return [range(of.index(number), of.index(number) + of.count(number)) for number in posed]
+        """The indices of the frames of every sequence with poses."""
+        owner = [number for number, _ in self._frames]
+        posed = [number for number in range(len(self.sequences)) if self.sequences[number].posed and number in owner]
+        return [range(owner.index(number), owner.index(number) + owner.count(number)) for number in posed]
 
     def load(self, index: int) -> Frame:
-        """A frame with an image and, at its pixels, depth; its pose is NaN where it is not known. Raises FrameError: a
-        file is missing, cannot be decoded, or has not the sequence's size."""
+        """A frame with an image and depth at the image's pixels; its pose is NaN if unknown. Raises FrameError: a file
+        is missing, cannot be decoded, or does not have the sequence's size."""
         number, i = self._frames[index]
         try:
             frame = self.sequences[number][i]
@@ -71,8 +71,8 @@ class SequenceFrames:
 
 
 def open_rgbd(source: str | Path) -> FrameSequence:
-    """A sequence as ``open_sequence`` detects it, or else a folder of images and depth maps without poses. Raises
-    FileNotFoundError: no such path; ValueError: neither of them, with what was looked for."""
+    """Open a sequence with ``open_sequence``, or a folder of images and depth maps without poses. Raises
+    FileNotFoundError: no such path; ValueError: neither of them; the message lists the supported layouts."""
     path = Path(source)
     if has_images_and_depth(path):
         try:

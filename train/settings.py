@@ -63,12 +63,12 @@ class FitSettings(Checked):
 
 @dataclass(frozen=True)
 class Job:
-    """Recipe, data and settings of a training: values that pickle."""
+    """Recipe, data and settings of a training; can be pickled."""
 
-    recipe: Recipe  # decides the weights
-    data: DataConfig  # where samples come from
+    recipe: Recipe  # determines the weights
+    data: DataConfig  # source of the samples
     settings: FitSettings  # of this session
-    # the network of one's own that the recipe is about, with the weights to start from; None = a file or random ones
+    # custom network of the recipe, with its initial weights; None = weights of a file, or random
     backbone: nn.Module | None = field(default=None, compare=False)
 
     def folder(self, member: int) -> Path:
@@ -76,9 +76,9 @@ class Job:
         return self.settings.out / f"member_{member}"
 
     def seed(self, member: int) -> int:
-        """The seed of a member's first weights, order of samples, augmentation and dropout.
+        """The seed of a member's initial weights, order of samples, augmentation and dropout.
 
-        Trainings with different seeds share none: with seed + member, seeds 0 and 1 would have nine of ten members in
-        common.
+        Trainings with different seeds share no member's seed; with seed + member, seeds 0 and 1 would share nine of
+        ten.
         """
         return self.settings.seed * MOST_MEMBERS + member

@@ -1,4 +1,4 @@
-"""The network at the start of a training: random weights or those of a file, and which parameters are trained."""
+"""The network at the start of a training: its initial weights, random or from a file, and its trained parameters."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from ufmstar_torch.models.spec import NetworkSpec, build_backbone, build_network
 from ufmstar_torch.models.trained import load_for_training, read_info
 
 IMAGENET = "imagenet"
-# [1] Spread of a BatchEnsemble's factors around pretrained weights. With .5, that of a start from nothing, FastDepth's
-# published network errs by 63 % of the depth instead of 28 % before the first step (HoloLens frames, batch
-# statistics), with .1 by 33 %; its members still differ by half a metre.
+# [1] Standard deviation of a BatchEnsemble's factors with pretrained weights. With .5, the value for random weights,
+# the error of FastDepth's published network before the first step is 63 % of the depth instead of 28 % (HoloLens
+# frames, batch statistics), with .1 it is 33 %; its members still differ by half a metre.
 PRETRAINED_STD = 0.1
 WAYS = f"trained .safetensors, FastDepth's .onnx, ResNet weights (.pth, or {IMAGENET!r}), or Monodepth2's folder"
 
@@ -30,18 +30,18 @@ def starting_network(
     """The network of a spec with the weights of a file; other weights are drawn from torch's generator.
 
     Args:
-        spec: what to build.
-        init: None, or one of: a file that this program trained (the same method, or aleatoric and mc_dropout: all
-            of it; another one: its encoder and decoder, below a new head); FastDepth's weights as .onnx; the
-            ImageNet weights of a ResNet in torchvision's keys, or "imagenet", which torchvision downloads; the
-            folder with Monodepth2's encoder.pth and depth.pth of the same ResNet.
-        member: number in an ensemble; of a trained ensemble it starts from the same member.
-        module: the network of one's own that ``spec`` is about; copied. None = its checkpoint's.
+        spec: of the network.
+        init: None, or one of: a file of this program (all weights for the same method, also between aleatoric and
+            mc_dropout; otherwise encoder and decoder, below a new head); FastDepth's weights as .onnx; the ImageNet
+            weights of a ResNet with torchvision's keys, or "imagenet", which torchvision downloads; the folder with
+            Monodepth2's encoder.pth and depth.pth of the same ResNet.
+        member: index in an ensemble; also selects the member of a trained ensemble.
+        module: the custom network of ``spec``; copied. None = its checkpoint's.
 
     Raises:
         FileNotFoundError: there is no such file.
         CheckpointError: the file is damaged or does not fit.
-        ValueError: the file contains another architecture than the spec's; the message names the options that fit.
+        ValueError: the file contains another architecture than the spec's; the message names options that may fit.
     """
     if init is None and spec.module is not None:
         network = spec.module.build(weights=True) if module is None else copy.deepcopy(module)
@@ -56,7 +56,7 @@ def starting_network(
 
 
 def missing_start(spec: NetworkSpec, init: Path | None) -> str | None:
-    """A remark on a start that is not the authors', or None."""
+    """A remark if the initial weights differ from the authors', or None."""
     if spec.architecture != "monodepth2" or init is not None:
         return None
     encoder = f"the ResNet{spec.layers} encoder starts from random weights"
@@ -64,9 +64,9 @@ def missing_start(spec: NetworkSpec, init: Path | None) -> str | None:
 
 
 def train_only(network: nn.Module, prefixes: Sequence[str]) -> int:
-    """Leave only the parameters whose names begin with one of ``prefixes``, or match it (``*.r``), to be trained, in
-    place; the number of trained weights. Raises ValueError: a prefix fits no parameter; the message names the network's
-    parts."""
+    """Freeze all parameters except those whose names begin with one of ``prefixes``, or match it (``*.r``), in place.
+    Returns the number of trained weights. Raises ValueError: a prefix matches no parameter; the message names the
+    network's parts."""
     names = [name for name, _ in network.named_parameters()]
     for prefix in prefixes:
         if not any(_fits(name, prefix) for name in names):
@@ -90,7 +90,8 @@ def _is_trained(path: Path) -> bool:
 
 
 def _from_trained(spec: NetworkSpec, path: Path, member: int, module: nn.Module | None) -> DepthNetwork:
-    """The whole network where the spec is the file's but for input and dropout, otherwise its backbone."""
+    """The network of a trained file: all weights if the methods agree, otherwise those of the backbone. The specs may
+    differ in input, dropout and method only."""
     info = read_info(path)
     source = load_for_training(path, module)[member % info.networks]
     shared = ("size", "preprocess", "dropout", "dropout_both", "method", "members", "module")
@@ -104,7 +105,7 @@ def _from_trained(spec: NetworkSpec, path: Path, member: int, module: nn.Module 
         fill(network, source.state_dict(), str(path))
         return network
     if info.spec.method == "batch_ensemble":
-        raise ValueError(f"init: {path} holds a batch_ensemble, whose backbone is not one network's")
+        raise ValueError(f"init: {path} holds a batch_ensemble, whose backbone does not fit a single network")
     backbone = build_backbone(spec, copy.deepcopy(module))
     trained_backbone: Any = source.backbone
     fill(backbone, trained_backbone.state_dict(), str(path))

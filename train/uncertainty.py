@@ -1,4 +1,4 @@
-"""Validation of a network's uncertainty on sequences, with the evaluation's loop, rows and metrics."""
+"""Validation of a network's uncertainty on sequences, with the loop, rows and metrics of the evaluation."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ufmstar_torch.models.network import DepthNetwork, in_eval_mode
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.networks_in_turn import NetworksInTurn
 
-_BASE = "aleatoric"  # one network, with whatever variances it states
+_BASE = "aleatoric"  # one network, with all variances that it predicts
 ROWS: dict[str, Row] = {
     "network": Row(Method(_BASE)),
     "ufmstar": Row(Method(_BASE, UFM_STAR)),
@@ -43,21 +43,21 @@ def judge_network(
     frames: int | None = None,
     device: torch.device | str = "cpu",
 ) -> dict[str, SequenceMetrics]:
-    """A network's uncertainty on sequences: its own, that of UfM*, and that of the posterior.
+    """Evaluate the uncertainty of a network on sequences, alone, with UfM* and with the posterior.
 
     Args:
-        network: a ``DepthNetwork``, or a module as ``wrap_network`` takes it; left on ``device``, in the modes it has.
-        sequences: posed, with ground truth; opened, or as ``ufmstar run`` names them ("tour:7").
+        network: a ``DepthNetwork``, or a module for ``wrap_network``; stays on ``device``, its modes are restored.
+        sequences: posed, with ground truth; opened, or names as for ``ufmstar run`` ("tour:7").
         rows: of "network", "ufmstar" and "posterior".
-        preprocess: what the input of a module needs; None = images in [0, 1] as they are.
-        frames: of each sequence at most.
-        device: where everything runs.
+        preprocess: preprocessing of a module's input; None = images in [0, 1], not resized.
+        frames: most frames of each sequence.
+        device: of all computations.
 
     Returns:
-        By row, the metrics over all pixels of all sequences; ``compute()`` and ``curves()`` return them.
+        By row, the metrics over all pixels of all sequences; ``compute()`` and ``curves()`` return their values.
 
     Raises:
-        ValueError: no sequence, or no such row; others as ``evaluate_sequence``.
+        ValueError: no sequence, or an unknown row; others as ``evaluate_sequence``.
     """
     if not sequences or not rows or not set(rows) <= ROWS.keys():
         expected = f"at least one sequence, and rows of {list(ROWS)}"
@@ -79,13 +79,13 @@ def judge_network(
 class UncertaintyCallback(pl.Callback):
     """Logs the uncertainty of a Lightning module's network on validation sequences after each validation.
 
-    Logged are delta1, NLL, ECE_delta, ECE_q and AUSE as "ROW/FIGURE"; reliability plots go to
+    Logs delta1, NLL, ECE_delta, ECE_q and AUSE as "ROW/FIGURE", and writes reliability plots to
     ``uncertainty/epoch_N.png`` in the logger's folder, or the trainer's.
 
     Args:
-        sequences, rows, preprocess, frames: as :func:`judge_network`.
-        network: the network of the Lightning module; default: its attribute ``network``.
-        every: validations from one evaluation to the next.
+        sequences, rows, preprocess, frames: as in :func:`judge_network`.
+        network: returns the network of the Lightning module; default: its attribute ``network``.
+        every: validations per evaluation.
 
     Raises:
         ValueError: ``every`` is not positive.
@@ -108,7 +108,7 @@ class UncertaintyCallback(pl.Callback):
         self._how: dict[str, Any] = {"rows": rows, "preprocess": preprocess, "frames": frames}
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Judge, log and draw; in the first process alone."""
+        """Evaluate, log and plot, in the first process only."""
         self._validations += not trainer.sanity_checking
         if trainer.sanity_checking or self._validations % self._every or not trainer.is_global_zero:
             return

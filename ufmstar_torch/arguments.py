@@ -1,5 +1,4 @@
-"""Arguments at public entries: what is accepted as an image, a map, a pose or intrinsics, and checks of dtype, shape
-and device, each with one wording."""
+"""Conversion of public arguments (images, maps, poses, intrinsics) to tensors, with checks of dtype, shape, device."""
 
 from __future__ import annotations
 
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Shapes = Sequence[tuple[int, ...]]
-_RESOLUTION, _TOO_FAR = 0.01, 1e10  # [m] of the coordinates of a pose, and what coarser ones become
+_RESOLUTION, _TOO_FAR = 0.01, 1e10  # [m] coarsest accepted pose coordinates, and the value that replaces coarser ones
 Array: TypeAlias = Tensor | NDArray[Any]
 # An image may also be Pillow's, and intrinsics four numbers.
 ImageLike: TypeAlias = Any
@@ -20,7 +19,7 @@ CameraLike: TypeAlias = "Tensor | NDArray[Any] | Sequence[float] | PinholeCamera
 
 
 class PinholeCamera(Protocol):
-    """kornia's camera: a pose and intrinsics in one; it may be given as both."""
+    """kornia's camera, accepted as the pose, the intrinsics or both."""
 
     @property
     def extrinsics(self) -> Tensor:
@@ -32,10 +31,10 @@ class PinholeCamera(Protocol):
 
 
 def as_tensor(name: str, value: object) -> Tensor:
-    """The argument ``name`` as a tensor: a tensor itself, or a NumPy array of numbers.
+    """Convert the argument ``name``, a tensor or a NumPy array of numbers, to a tensor.
 
     Raises:
-        TypeError: something else.
+        TypeError: ``value`` is neither.
     """
     if isinstance(value, Tensor):
         return value
@@ -47,11 +46,13 @@ def as_tensor(name: str, value: object) -> Tensor:
 
 
 def as_image(image: ImageLike) -> Tensor:
-    """[B, 3, H, W] RGB of one image or several: a tensor [B, 3, H, W] or [3, H, W], a NumPy array [B, H, W, 3] or
-    [H, W, 3], or a Pillow image.
+    """Convert images to [B, 3, H, W] RGB.
+
+    Args:
+        image: a tensor [B, 3, H, W] or [3, H, W], a NumPy array [B, H, W, 3] or [H, W, 3], or a Pillow image.
 
     Raises:
-        TypeError: something else.
+        TypeError: another type.
         ValueError: another shape.
     """
     if isinstance(image, Tensor):
@@ -72,19 +73,24 @@ def as_image(image: ImageLike) -> Tensor:
 
 
 def as_pose(pose: CameraLike) -> Tensor:
-    """[B, 4, 4] or [4, 4] camera-to-world of such a matrix, of one without its last row [..., 3, 4], or of a
-    :class:`PinholeCamera`, whose world-to-camera matrix is inverted. Coordinates that its dtype resolves by less than
-    1 cm, as single precision does beyond 84 km, become farther than any that is accepted.
+    """Convert a pose to camera-to-world [B, 4, 4] or [4, 4].
+
+    Coordinates that the dtype does not resolve to 1 cm (float32: beyond 84 km) are set beyond the accepted range, so
+    that :func:`ufmstar_torch.frame.pose_fault` rejects them.
+
+    Args:
+        pose: [B, 4, 4], [4, 4], or [..., 3, 4] without the last row; or a :class:`PinholeCamera`, whose world-to-camera
+            matrix is inverted.
 
     Raises:
-        TypeError: something else.
+        TypeError: another type.
         ValueError: another shape.
     """
     if (camera := _camera(pose)) is not None:
         T_cam_world = require_float("pose.extrinsics", camera.extrinsics)
         if T_cam_world.dim() != 3 or T_cam_world.shape[1:] != (4, 4):
             raise ValueError(f"pose.extrinsics must be [B, 4, 4] world-to-camera, got {tuple(T_cam_world.shape)}")
-        return torch.linalg.inv_ex(T_cam_world.double()).inverse  # a singular one becomes infinite: not rigid
+        return torch.linalg.inv_ex(T_cam_world.double()).inverse  # of a singular matrix: infinite, so not rigid
     T = _numbers("pose", pose)
     if T.dtype != torch.float64 and T.shape[-1:] == (4,):
         coarse = T.abs() > _RESOLUTION / torch.finfo(T.dtype).eps
@@ -100,17 +106,20 @@ def as_pose(pose: CameraLike) -> Tensor:
 
 
 def as_intrinsics(intrinsics: CameraLike) -> Tensor:
-    """[B, 3, 3] or [3, 3] of such a matrix, of one beside an empty fourth row and column [..., 4, 4], of the four
-    numbers fx, fy, cx, cy [px], or of a :class:`PinholeCamera`.
+    """Convert intrinsics to [B, 3, 3] or [3, 3] [px].
+
+    Args:
+        intrinsics: [B, 3, 3], [3, 3], [..., 4, 4] with the fourth row and column of an identity, the four numbers fx,
+            fy, cx, cy [px], or a :class:`PinholeCamera`.
 
     Raises:
-        TypeError: something else.
-        ValueError: another shape, or a fourth row or column that is not empty.
+        TypeError: another type.
+        ValueError: another shape, or another fourth row or column.
     """
     camera = _camera(intrinsics)
     K = _numbers("intrinsics", intrinsics if camera is None else camera.intrinsics)
     if camera is not None and K.shape[-2:] == (4, 4):
-        K = K[..., :3, :3]  # the rest of kornia's matrix is not read by kornia either
+        K = K[..., :3, :3]  # kornia ignores the fourth row and column, too
     if K.shape == (4,):
         (fx, fy, cx, cy), zero, one = K, K.new_zeros(()), K.new_ones(())
         return torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one]).view(3, 3)
@@ -124,12 +133,12 @@ def as_intrinsics(intrinsics: CameraLike) -> Tensor:
 
 
 def _of_intrinsics(values: Tensor) -> bool:
-    """True if the shape is that of intrinsics and of no pose."""
+    """True if the shape fits intrinsics but no pose."""
     return values.shape == (4,) or values.shape[-2:] == (3, 3)
 
 
 def _camera(value: object) -> PinholeCamera | None:
-    """A camera of kornia, which need not be imported for that; None: something else."""
+    """``value`` if it is kornia's camera, else None; does not import kornia."""
     is_kornia = any(
         cls.__name__ == "PinholeCamera" and cls.__module__.startswith("kornia.") for cls in type(value).__mro__
     )
@@ -137,7 +146,7 @@ def _camera(value: object) -> PinholeCamera | None:
 
 
 def _numbers(name: str, value: object) -> Tensor:
-    """A floating-point tensor of a tensor, an array, or nested sequences; whole numbers become float64."""
+    """Convert a tensor, an array or nested sequences to a floating-point tensor; integers become float64."""
     if isinstance(value, list | tuple):
         try:
             value = np.array(value, dtype=np.float64)
@@ -149,15 +158,15 @@ def _numbers(name: str, value: object) -> Tensor:
 
 
 def require_float(name: str, value: object, shapes: Shapes = (), like: Tensor | None = None) -> Tensor:
-    """The argument ``name`` if it is a tensor of a floating-point dtype.
+    """Return the argument ``name`` if it is a tensor of a floating-point dtype.
 
     Args:
-        shapes: those allowed; () = any.
-        like: on whose device it must lie; None = any.
+        shapes: allowed shapes; () = any.
+        like: tensor on the required device; None = any.
 
     Raises:
-        TypeError: no tensor or of another dtype.
-        ValueError: of another shape or on another device.
+        TypeError: no tensor, or another dtype.
+        ValueError: another shape or device.
     """
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}")

@@ -1,4 +1,4 @@
-"""NumPy's files of unknown origin: damaged ones are named, and none allocates more than a fixed number of bytes."""
+"""Reading untrusted .npy and .npz files: errors name the damaged file, and allocations are bounded."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-LARGEST = 2**30  # [bytes] of an array; a depth map of 8192 x 8192 values of float64 has half of them
+LARGEST = 2**30  # [bytes] of an array; a float64 depth map of 8192 x 8192 takes half of it
 # The errors that NumPy, zipfile and its decompressors raise for damaged files (found by changing every byte).
 _DAMAGED = (
     *(OSError, EOFError, ValueError, TypeError, LookupError, ArithmeticError, RuntimeError, SyntaxError, MemoryError),
@@ -25,13 +25,16 @@ _DAMAGED = (
 
 
 def read_npy(path: str | Path, *, mapped: bool = False) -> NDArray[Any]:
-    """The array of a .npy file, or, ``mapped``, the file as an array in memory, of any size and read-only. Nothing is
-    unpickled.
+    """Read a .npy file without unpickling.
+
+    Args:
+        path: the file.
+        mapped: map the file into memory, read-only and of any size, instead of reading it.
 
     Raises:
         OSError: the file cannot be opened.
-        ValueError: it is damaged, its header states more data than it holds, or more than ``LARGEST`` bytes; the
-            message names the file.
+        ValueError: the file is damaged, or its header states more data than the file holds or than ``LARGEST`` bytes;
+            the message names the file.
     """
     with Path(path).open("rb") as file:
         try:
@@ -43,14 +46,14 @@ def read_npy(path: str | Path, *, mapped: bool = False) -> NDArray[Any]:
 
 
 def read_npz(path: str | Path, names: Sequence[str], *, or_single: bool = False) -> list[NDArray[Any]]:
-    """The arrays ``names`` of a .npz file; with ``or_single``, its only array whatever its name. Errors as
+    """Read the arrays ``names`` of a .npz file; with ``or_single``, a file's only array may have any name. Errors as
     :func:`read_npy`; also ValueError: an array is not in the file."""
     with Path(path).open("rb") as file:
         return list(_arrays(file, path, names, or_single=or_single).values())
 
 
 def read_npz_whole(path: str | Path) -> dict[str, NDArray[Any]]:
-    """All arrays of a .npz file by name; together at most ``LARGEST`` bytes. Errors as :func:`read_npy`."""
+    """Read all arrays of a .npz file by name, together at most ``LARGEST`` bytes. Errors as :func:`read_npy`."""
     with Path(path).open("rb") as file:
         return _arrays(file, path)
 
@@ -69,7 +72,7 @@ def _arrays(
                 raise ValueError(f"its arrays would take {total:,} bytes")
             arrays = {}
             for name in names:
-                with archive.open(members[name]) as member:  # ends after file_size bytes, whatever it expands to
+                with archive.open(members[name]) as member:  # reads at most file_size decompressed bytes
                     arrays[name] = _array(cast(BinaryIO, member), members[name].file_size)
             return arrays
     except _DAMAGED as error:
@@ -77,7 +80,7 @@ def _arrays(
 
 
 def _array(file: BinaryIO, size: int) -> NDArray[Any]:
-    """The array of an open .npy file of ``size`` bytes, of which the header is read first."""
+    """Read an open .npy file of ``size`` bytes after checking the size that its header states."""
     version = npy.read_magic(file)
     header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
     shape, _, dtype = header(file)

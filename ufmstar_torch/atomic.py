@@ -1,4 +1,4 @@
-"""Files that are complete or absent."""
+"""Atomic writing of files."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ _TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.tmp")  # as write_atomic names the
 
 
 def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, durable: bool = False) -> None:
-    """Write a file through a temporary one in the same folder, which then takes its place.
+    """Write a temporary file in the same folder, then rename it to ``path``.
 
-    A full disk, Ctrl-C or a crash in the middle leaves the earlier file, or none. A link stays, the file it leads to is
-    replaced. A pipe or device, such as /dev/null, is written to.
+    A full disk, Ctrl-C or a crash leaves the previous file, or none. If ``path`` is a link, the link stays and its
+    target is replaced. Pipes and devices, such as /dev/null, are written directly.
 
     Args:
         path: the file; its folder must exist.
-        write: gets the open binary file.
-        durable: wait until the disk has it, so that it survives a power cut as well (milliseconds).
+        write: writes to the open binary file.
+        durable: call fsync, so that the file also survives a power cut (milliseconds).
 
     Raises:
-        OSError: whatever the file system reports, the temporary file being removed.
+        OSError: the file system reports an error; the temporary file is removed.
     """
     path = Path(os.path.realpath(path))
     special = path.exists() and not path.is_file() and not path.is_dir()
-    # Hidden, and in the same file system, as os.replace needs.
-    # Named at random: processes on several nodes may share both a folder and an id.
+    # A hidden file in the same file system, as os.replace requires. Its name is random, because processes on several
+    # nodes may share both a folder and a process id.
     temporary = path if special else path.with_name(f".{path.name}.{uuid4().hex[:12]}.tmp")
     try:
         try:
@@ -39,7 +39,7 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, durable: bo
                 if durable and not special:
                     file.flush()
                     os.fsync(file.fileno())
-        except OSError as error:  # of a full disk neither Python nor NumPy names the file
+        except OSError as error:  # when the disk is full, neither Python nor NumPy names the file
             raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(path)) from error
         if not special:
             os.replace(temporary, path)
@@ -49,7 +49,7 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, durable: bo
 
 
 def remove_temporaries(paths: Iterable[Path]) -> None:
-    """Remove those of the files that ``write_atomic`` began and a killed process left."""
+    """Remove temporary files of ``write_atomic`` that a killed process left behind."""
     for path in list(paths):
         if _TEMPORARY.fullmatch(path.name):
             path.unlink(missing_ok=True)

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ufmstar_torch.fixed_order import apply, congruence, product
 
-# Newton-Schulz contracts a deviation e of R^T R from I to about 0.75 e^2: from the tolerated 0.1 five
-# steps reach float64 rounding with two to spare.
+# Newton-Schulz contracts a deviation e of R^T R from I to about 0.75 e^2. From the largest tolerance, 0.1, it reaches
+# float64 rounding within five steps.
 POLAR_STEPS = 6
 
 
@@ -35,7 +35,7 @@ def unproject_at(depth: Tensor, index: Tensor, width: int, intrinsics: Tensor) -
     """:func:`unproject` at some pixels, in the dtype of ``depth``.
 
     Args:
-        depth: [B, N] at those pixels [m].
+        depth: [B, N] of the pixels [m].
         index: [B, N] of the pixels in the flattened image.
         width: of the image [px].
         intrinsics: [B, 3, 3] [px].
@@ -56,8 +56,8 @@ def focal_and_centre(intrinsics: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor
 def nearest_rotation(R: Tensor) -> Tensor:
     """The rotation nearest to an almost orthonormal R [..., 3, 3], in its own dtype (polar factor).
 
-    Newton-Schulz, R <- R (3 I - R^T R) / 2, which needs no decomposition and so no wait for the device;
-    it converges to the polar factor when |R^T R - I| is well below 1, which the callers check.
+    Newton-Schulz, R <- R (3 I - R^T R) / 2, needs no decomposition and therefore no synchronisation with the device.
+    It converges to the polar factor when |R^T R - I| is well below 1, which the callers check.
     """
     eye = torch.eye(3, dtype=R.dtype, device=R.device)
     for _ in range(POLAR_STEPS):
@@ -80,7 +80,7 @@ def invert_rigid(T: Tensor) -> Tensor:
 
 
 def relative_pose(T_world_a: Tensor, T_world_b: Tensor) -> tuple[Tensor, Tensor]:
-    """R_rel [..., 3, 3] and t_rel [..., 3] [m] that take points of camera a into camera b.
+    """R_rel [..., 3, 3] and t_rel [..., 3] [m] that transform points from camera a to camera b.
 
     The translations are subtracted first, so that large world coordinates cancel before they are rotated.
     """
@@ -93,7 +93,7 @@ def project_gaussian(mean_cam: Tensor, covariance_cam: Tensor, intrinsics: Tenso
     """Gaussians in the image plane (Eq. proj_to_image_plane_mean and _covar).
 
     Args:
-        mean_cam: [B, K, 3] [m], z > 0 (callers mask what lies behind the near plane).
+        mean_cam: [B, K, 3] [m], z > 0 (callers mask Gaussians behind the near plane).
         covariance_cam: [B, K, 3, 3] [m^2].
         intrinsics: [B, 3, 3] [px].
 
@@ -111,9 +111,9 @@ def project_gaussian(mean_cam: Tensor, covariance_cam: Tensor, intrinsics: Tenso
 def resize_intrinsics(intrinsics: Tensor, old: tuple[int, int], new: tuple[int, int]) -> Tensor:
     """Intrinsics [..., 3, 3] after an image of ``old`` (H, W) was resized to ``new`` (H, W).
 
-    Resizing keeps the image's borders, which lie half a pixel outside the first pixel's centre at
-    (0, 0): u' + 1/2 = s (u + 1/2), so c' = s (c + 1/2) - 1/2 and f' = s f, as OpenCV, Pillow and
-    ``interpolate(align_corners=False)`` resample.
+    Resizing maps the image's borders, half a pixel outside the first pixel's centre (0, 0), onto each other:
+    u' + 1/2 = s (u + 1/2), so c' = s (c + 1/2) - 1/2 and f' = s f. OpenCV, Pillow and
+    ``interpolate(align_corners=False)`` resample this way.
 
     Raises:
         ValueError: a size is not positive.

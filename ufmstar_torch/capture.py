@@ -1,4 +1,4 @@
-"""UfM* as a CUDA graph: the check of a frame, the step and the sum of the variances in one launch."""
+"""UfM* as a CUDA graph: one launch checks a frame, runs the step and adds the variances."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from torch import Tensor
 from ufmstar_torch.output import UfMStarOutput
 from ufmstar_torch.ufmstar import UfMStar
 
-_WARM_UP = 3  # frames before the capture: kernels are compiled by then
+_WARM_UP = 3  # frames before the capture, which compile the kernels
 
 
 class Captured:
     """A module's step for frames of one shape, recorded once and replayed.
 
-    The module's state stays its own: it is read, saved and reset there, as ever. What a call returns is overwritten by
-    the next call.
+    The state stays in the module, where it can be read, saved and reset as usual. Each call overwrites the output of
+    the previous one.
 
     Args:
-        ufm: with a state of its own or none, in the dtype and with the streams of the frame.
-        depth, pose, intrinsics, aleatoric, epistemic, valid: a frame as :meth:`UfMStar.forward` takes it; its shapes
-            are those of all frames, its values do not matter.
-        record: turns a function into its recording. None = a CUDA graph.
+        ufm: with the frame's dtype and number of streams, or without a state.
+        depth, pose, intrinsics, aleatoric, epistemic, valid: a frame as in :meth:`UfMStar.forward`. All frames must
+            have its shapes; its values are ignored.
+        record: converts a function to a recording. None = a CUDA graph.
 
     Raises:
-        ValueError: tensors that are not on CUDA (without ``record``), or a config with which a step reads from the
-            device, or does not have one shape.
+        ValueError: a tensor is not on CUDA (without ``record``), or the config makes a step read from the device or
+            change its shapes.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Captured:
             ufm._store(state)
 
     def __call__(self, *frame: Tensor | None) -> UfMStarOutput:
-        """Process the next frame, given as at the capture.
+        """Process the next frame; arguments as at the capture.
 
         Raises:
             ValueError: another number of arguments, or a shape or dtype other than at the capture.
@@ -92,14 +92,14 @@ class Captured:
         return ufm(depth, pose, intrinsics, *optional)
 
     def _frame(self) -> None:
-        """The recorded work: a step from the state's memory back into it."""
+        """The recorded function: a step that updates the state in place."""
         self._out = self._run(self._ufm)
         for name, value in self._ufm._stored().tensors().items():
             self._state[name].copy_(value)
         self._ufm._store(self._state)
 
     def _take_over(self) -> None:
-        """The state of a module that was reset or loaded since the last call. Raises ValueError: another shape."""
+        """Copy the state of a module that was reset or loaded since the last call. Raises ValueError: another shape."""
         if not self._ufm.mean.shape[0]:
             self._restart()
         else:
@@ -111,7 +111,7 @@ class Captured:
         self._ufm._store(self._state)
 
     def _restart(self) -> None:
-        """The state as before the first frame."""
+        """Set the state to that before the first frame."""
         for name, value in self._state.items():
             value.fill_(torch.nan if name == "smoothed" else 0)
         self._state["T_world_first"].copy_(torch.eye(4, dtype=torch.float64))
@@ -125,13 +125,13 @@ def _shape(value: Tensor | None) -> str:
 
 
 def _require_fixed(ufm: UfMStar) -> None:
-    """Raises a ValueError unless a step has one shape and reads nothing."""
+    """Raise a ValueError unless a step has constant shapes and reads nothing from the device."""
     config = ufm.config
     limit = config.max_components
     slots = ufm.mean.shape[1] if ufm.mean.shape[0] else config.initial_capacity
     wrong = {
         "on_bad_frame='skip', since 'raise' reads from the device": config.on_bad_frame != "skip",
-        "max_components of at most initial_capacity, since a mixture that grows has no one shape": (
+        "max_components of at most initial_capacity, since a growing mixture changes its shape": (
             limit is None or slots < limit
         ),
         "no anchors, overlap weights, neighbourhood or merging": (

@@ -1,8 +1,8 @@
-"""Frozen settings whose values are checked when they are made, and their plain form for JSON.
+"""Frozen settings that are checked on construction and convert to and from JSON.
 
-The metadata of a field describes it: ``symbol`` (the paper's letter), ``unit`` and ``range``, ``choices``, or
-``section`` (settings of their own). An unknown name is a ``TypeError`` as for any dataclass, an impossible value a
-``ValueError`` that names the field.
+A field's metadata describe it: ``symbol`` (the paper's letter), ``unit`` and ``range``, ``choices``, or ``section``
+(nested settings). An unknown name raises ``TypeError`` as in any dataclass, an invalid value a ``ValueError`` that
+names the field.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ def number(
     open_low: bool = False,
     open_high: bool = False,
 ) -> Any:
-    """A numeric field with its allowed range [low, high], open at an end with ``open_low`` or ``open_high``. An
-    integer default requires whole numbers; with the default None, None is allowed."""
+    """A numeric field with the allowed range [low, high], where ``open_low`` and ``open_high`` exclude an end. An
+    integer default requires whole numbers; the default None allows None."""
     metadata = {"symbol": symbol, "unit": unit, "range": (low, high, open_low), "open_high": open_high}
     return field(default=default, metadata=metadata | {"optional": default is None})
 
@@ -39,13 +39,13 @@ def choice(default: str | int, *others: str | int) -> Any:
 
 
 def section(kind: type[Checked], *, optional: bool = False) -> Any:
-    """A field with settings of its own: ``kind()`` by default, or None with ``optional``."""
+    """A field with nested settings: ``kind()`` by default, or None with ``optional``."""
     metadata = {"section": kind, "optional": optional}
     return field(default=None, metadata=metadata) if optional else field(default_factory=kind, metadata=metadata)
 
 
 class Checked:
-    """Base of a frozen dataclass: checks of the values, and a plain form that refuses unknown keys."""
+    """Base of a frozen dataclass: checks the values, and converts to and from plain values."""
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
@@ -69,10 +69,10 @@ class Checked:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """From plain values, as JSON has them: lists become tuples, mappings the settings that a field's type names.
+        """From plain values, as in JSON: lists become tuples, mappings become the settings of a field's type.
 
         Raises:
-            ValueError: an unknown key, a field without default that is missing, or an impossible value.
+            ValueError: an unknown key, a missing field without a default, or an invalid value.
         """
         by_name = {f.name: f for f in fields(cls)}
         if unknown := sorted(set(values) - set(by_name)):
@@ -88,7 +88,7 @@ class Checked:
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: it holds no JSON object, or as :meth:`from_dict`; the message names the file.
+            ValueError: the file holds no JSON object, or as :meth:`from_dict`; the message names the file.
         """
         try:
             values = json.loads(Path(path).read_text(encoding="utf-8"))
@@ -113,7 +113,7 @@ class Checked:
         starts from its defaults.
 
         Raises:
-            ValueError: an unknown name, or an impossible value.
+            ValueError: an unknown name, or an invalid value.
         """
         changes: dict[str, Any] = {}
         within: dict[str, dict[str, Any]] = {}
@@ -141,7 +141,7 @@ class Checked:
 
 
 def _rich(owner: type, name: str, value: Any) -> Any:
-    """A JSON value as what the field holds."""
+    """Convert a JSON value to the field's type."""
     if isinstance(value, list):
         return tuple(value)
     if not isinstance(value, Mapping):

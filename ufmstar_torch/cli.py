@@ -1,7 +1,7 @@
-"""The command line, ``ufmstar COMMAND ...``: the top of the package: no other module imports it.
+"""The command line, ``ufmstar COMMAND ...``. No other module imports this one.
 
-A command is a module with two functions: ``read(words)`` returns its options, and ``main(options)`` carries it out and
-returns the exit code. It is imported when it is called, so that help and errors appear at once.
+A command is a module with two functions: ``read(words)`` parses its options, and ``main(options)`` runs it and returns
+the exit code. Its module is imported only when the command is called, so that help and errors appear at once.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 from ufmstar_torch.optional import naming_extra
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
-# Name, module, and what it is for.
+# By name: module and purpose.
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("eval.commands.demo", "the method on rendered rooms, without data or weights"),
     "run": ("eval.commands.run", "depth and variance of a sequence of posed images, onto disk"),
@@ -40,10 +40,10 @@ commands:
 
 ufmstar COMMAND --help shows a command's options, ufmstar --version the version.
 """
-# Errors of a network, a file or a full disk. A user gets one line, and the traceback with --debug.
+# Errors of a network, a file or a full disk, printed as one line; --debug adds the traceback.
 _FAILURES = (ImportError, MemoryError, OSError, RuntimeError, TypeError, ValueError)
 
-# OpenMP starts as many threads as it is told; thousands of them stall the machine and crash torch.
+# OpenMP starts any number of threads; thousands of them stall the machine and crash torch.
 _MOST_THREADS = 64
 
 
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code: 0 done, 1 failed, 2 wrong usage, 130 interrupted.
 
     Args:
-        arguments: without the program's name; None = the process's.
+        arguments: without the program's name; None = ``sys.argv[1:]``.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words[:1] in ([], ["-h"], ["--help"]):
@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(name: str, words: Sequence[str]) -> int:
-    """Import the command, read its options, and carry it out: errors become a line and an exit code."""
+    """Import the command, parse its options, and run it; convert errors to one line and an exit code."""
     from ufmstar_torch.eval.commands.options import UsageError
 
     debug = "--debug" in words
@@ -94,7 +94,7 @@ def _run(name: str, words: Sequence[str]) -> int:
 
 
 def _set_up(options: Any) -> None:
-    """Set torch's CPU threads. Raises ValueError: an impossible ``threads`` or ``device``."""
+    """Set torch's CPU threads and check the device. Raises ValueError: an invalid ``threads`` or ``device``."""
     threads, device = getattr(options, "threads", None), getattr(options, "device", None)
     if threads is not None:
         if threads < 1:
@@ -103,7 +103,7 @@ def _set_up(options: Any) -> None:
             raise ValueError(f"--threads must be 1 to {most}, got {threads}")
         import torch
 
-        torch.set_num_threads(threads)  # and with them those of the compiled kernels
+        torch.set_num_threads(threads)  # the compiled kernels use the same number
     if device is not None:
         from ufmstar_torch.eval.run.machine import require_device
 

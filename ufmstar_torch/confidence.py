@@ -1,27 +1,26 @@
 """A network's confidence as a variance in metres: a monotone factor of V, learnt from anchors.
 
-A confidence c says which pixels are worse, in units of its own, and whether large is good or bad is not stated either.
-At an anchor (depth g, variance s^2) of a pixel with prediction d and variance V, the network's error is known:
+A confidence c orders the pixels by quality. Its unit is unknown, and so is whether large values are good or bad. At an
+anchor (depth g, variance s^2) of a pixel with prediction d and variance V, the network's squared error is
 
-    y = min((g - d)^2 / (V + s^2), largest),      w = (V / (V + s^2))^2;
+    y = min((g - d)^2 / (V + s^2), largest),      with the weight w = (V / (V + s^2))^2;
 
-y is 1 on average where V is right, and an anchor that is noisier than V says little. The last anchors of a stream, with
-forgetting of all before them, are divided by c into bins of one size. Of each bin the mean is taken with a prior of
-kappa anchors for which V is right,
+y is 1 on average where V is right, and w is small for an anchor that is noisier than V. The last anchors of a stream
+are divided by c into bins of equal size. The mean of each bin includes a prior of kappa anchors with y = 1,
 
-    m = (sum w y + kappa) / (sum w + kappa),
+    m = (sum w y + kappa) / (sum w + kappa).
 
-and an isotonic regression over the bins (Barlow and Brunk 1972), rising or falling, whichever fits better, makes it the
+An isotonic regression of m over the bins (Barlow and Brunk 1972), rising or falling, whichever fits better, gives the
 factor h(c):
 
     V' = h(c) V.
 
 Only the order of c counts: a logit, a probability and a standard deviation of the same content give the same V'.
 
-Whether c helps is decided by anchors that the map has not learnt from: before a frame's anchors are added, the mean log
-likelihood of their errors under V h(c) is compared with that under V, and with that under V and the one factor that the
-same anchors give without c. Means of both gains fade by half in some frames; c is used where both exceed their standard
-errors, and ignored otherwise: V' = V.
+New anchors decide whether c helps, before the map is updated with them. The mean log likelihood of their errors under
+V h(c) is compared with that under V, and with that under V times the single factor that the anchors give without c.
+Both gains are averaged with exponential forgetting. c is used where both means exceed their standard errors; otherwise
+V' = V.
 """
 
 from __future__ import annotations
@@ -41,10 +40,11 @@ from ufmstar_torch.frame import LARGEST, FrameInput
 from ufmstar_torch.output import StepOutput
 from ufmstar_torch.state import UfMStarState
 
-# An anchor: c, y, w. Of the gains: fading counts of frames, sums and sums of squares over V, and over one factor.
+# Numbers per anchor: c, y, w. Statistics of the gains: the number of frames, and, for the gain over V and over one
+# factor, the sum and the sum of squares, all with exponential forgetting.
 FIELDS, GAINS = 3, 5
-# Frames that must have judged c before it is used, anchors per bin before it is judged, and the gain [nat] beyond its
-# standard error from which on it is used: less is rounding, or no use.
+# c is used after this many frames with a gain, and a frame has a gain from this many anchors per bin on. The mean gain
+# [nat] must exceed its standard error by USEFUL; a smaller gain is rounding or useless.
 FEWEST, FULL, USEFUL = 5, 4, 1e-3
 
 
@@ -53,7 +53,7 @@ class Learnt:
     """Statistics of the confidence of B streams.
 
     Attributes:
-        c, y, w: [B, N] of the last anchors, the youngest last; w = 0: there is none.
+        c, y, w: [B, N] of the last anchors, the newest last; w = 0 marks an empty entry.
         gains: [B, 5] frames, sum and sum of squares of the gain over V, and of that over one factor [nat].
     """
 
@@ -64,7 +64,7 @@ class Learnt:
 
     @classmethod
     def of(cls, packed: Tensor) -> Learnt:
-        """From a row of numbers [B, 3 N + 5] a stream; zeros are the start."""
+        """From one row of numbers per stream [B, 3 N + 5]; zeros before the first frame."""
         anchors, gains = packed[:, :-GAINS], packed[:, -GAINS:]
         c, y, w = anchors.view(len(packed), FIELDS, -1).unbind(1)
         return cls(c, y, w, gains)
@@ -74,7 +74,7 @@ class Learnt:
         return torch.cat([torch.stack([self.c, self.y, self.w], 1).flatten(1), self.gains], 1)
 
     def added(self, c: Tensor, y: Tensor, w: Tensor, limit: int) -> Learnt:
-        """With the anchors of a frame [B, n], of which at most ``limit`` are taken, evenly; the oldest go."""
+        """A copy with at most ``limit`` anchors of a frame [B, n], evenly chosen, in place of the oldest."""
         chosen = evenly(w > 0, limit)
         pairs = ((self.c, c), (self.y, y), (self.w, w))
         every = [torch.cat([old, torch.where(chosen, new, 0)], 1) for old, new in pairs]
@@ -82,14 +82,14 @@ class Learnt:
         return replace(self, **dict(zip("cyw", (value.gather(1, order) for value in every), strict=True)))
 
     def judged(self, gains: Sequence[Tensor], fresh: Tensor, half_life: float) -> Learnt:
-        """With a frame's mean gains over V and over one factor, each [B], of the streams ``fresh``."""
+        """A copy with the frame's mean gains over V and over one factor, each [B], added for the streams ``fresh``."""
         one = torch.stack([torch.ones_like(gains[0]), *(f(g) for g in gains for f in (torch.clone, torch.square))], 1)
         faded = 0.5 ** (1 / half_life) * self.gains + one.to(self.gains)
         return replace(self, gains=torch.where(fresh[:, None], faded, self.gains))
 
     def gain(self) -> Tensor:
-        """[B] by how much the confidence makes held-out anchors likelier than the better of V and one factor, less the
-        standard error and ``USEFUL`` [nat]; at most 0: it is ignored. -inf before enough frames."""
+        """[B] gain in log likelihood of new anchors over the better of V and one factor, less its standard error and
+        ``USEFUL`` [nat]. The confidence is used where it is positive. -inf before enough frames."""
         frames = self.gains[:, 0]
         n = frames.clamp_min(1)
         least = torch.full_like(n, torch.inf)
@@ -100,15 +100,15 @@ class Learnt:
 
 
 def evenly(valid: Tensor, limit: int) -> Tensor:
-    """[B, n] every k-th of the valid ones, with the least k that leaves at most ``limit``."""
+    """[B, n] True for every k-th valid entry, with the smallest k that selects at most ``limit``."""
     stride = (valid.sum(1, keepdim=True) + limit - 1) // limit
     return valid & ((valid.cumsum(1) - 1) % stride.clamp_min(1) == 0)
 
 
 def factors(learnt: Learnt, config: ConfidenceConfig) -> tuple[Tensor, Tensor, Tensor]:
-    """The map h: edges [B, K - 1] of the bins in c, factors [B, K], and the one factor without c [B, 1].
+    """The map h: edges [B, K - 1] of the bins in c, factors [B, K], and the single factor without c [B, 1].
 
-    Bin k holds the c with k edges at or below it. The edges are the anchors at equal steps of the rank.
+    Bin k holds the values c that have k edges at or below them. The edges are quantiles of the anchors' c.
     """
     learnt_from, bins = learnt.w > 0, config.bins
     ordered = torch.where(learnt_from, learnt.c, torch.inf).sort(1).values
@@ -149,7 +149,7 @@ class ConfidenceFrame(FrameExtension):
 
     Args:
         c: [B, H, W] float32.
-        of_anchors: the anchors during the same frame; None: nothing is learnt from it.
+        of_anchors: the frame's anchors; None = the map is applied but not updated.
         frame: of B streams.
         config: of the confidence.
     """
@@ -159,7 +159,7 @@ class ConfidenceFrame(FrameExtension):
         self._factor: Tensor | None = None
 
     def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
-        """Judge the map by the frame's anchors, learn from them, and compute h at every pixel."""
+        """Test the map at the frame's anchors, update it with them, and compute h at every pixel."""
         learnt = Learnt.of(state.by_stream["confidence"])
         if self._anchors is not None and self._anchors.anchors is not None:
             learnt = self._taught(learnt, total(self._anchors.disagreement(out.disagreement, self._frame.depth)))
@@ -171,7 +171,7 @@ class ConfidenceFrame(FrameExtension):
         return state, replace(out, statistics=replace(out.statistics, confidence=gain))
 
     def _taught(self, learnt: Learnt, variance: Tensor) -> Learnt:
-        """After the frame's anchors, of which the map has not learnt yet; ``variance`` is V without it [B, H, W]."""
+        """The statistics after the frame's anchors; ``variance`` is V before the map [B, H, W]."""
         assert self._anchors is not None
         anchors, dtype = self._anchors.anchors, learnt.c.dtype
         assert anchors is not None
@@ -196,7 +196,7 @@ class ConfidenceFrame(FrameExtension):
 
 
 class ConfidenceExtension(Extension):
-    """The network's confidence, judged at anchors. ``config``: with ``confidence`` and ``anchors``."""
+    """The network's confidence, calibrated at anchors. ``config``: with ``confidence`` and ``anchors``."""
 
     argument = "confidence"
 
@@ -224,7 +224,7 @@ class ConfidenceExtension(Extension):
         *,
         dense: bool,
     ) -> FrameExtension:
-        """Without a confidence it does nothing; of a subset of pixels it applies what was learnt, and learns nothing.
+        """The frame's confidence; nothing without one. Without ``dense``, the map is applied but not updated.
 
         Raises:
             TypeError, ValueError: ``confidence`` is no map of the depth's shape.
@@ -238,8 +238,8 @@ class ConfidenceExtension(Extension):
 
 
 def as_confidence(values: Any, frame: FrameInput) -> Tensor:
-    """[B, H, W] float32, as large as finite numbers are. Raises TypeError, ValueError: it is no map of the depth's
-    shape."""
+    """Convert a confidence to [B, H, W] float32, clamped to finite values. Raises TypeError, ValueError: not a map of
+    the depth's shape."""
     size = tuple(frame.depth.shape)
     c = require_float("confidence", values, [size, (size[0], 1, *size[1:])], frame.depth).detach()
     limit = torch.finfo(torch.float32).max

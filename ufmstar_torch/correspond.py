@@ -1,7 +1,7 @@
-"""Step 3, multiview Gaussian correspondence: which components of the mixture the new ones should equal.
+"""Step 3, multiview Gaussian correspondence: match the image's Gaussians with components of the mixture.
 
-Section "Multiview Gaussian Correspondence". The paper queries an R-tree for candidates; here the whole
-C x K overlap matrix is formed, which finds the same pairs: the tree only spares work on those with no overlap.
+Section "Multiview Gaussian Correspondence". The paper queries an R-tree for candidates. This module computes the whole
+C x K overlap matrix, which gives the same pairs: the tree only skips pairs without overlap.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Correspondence:
     Attributes:
         match: [B, C, K] True where k is in the correspondence set F_c after the occlusion filter.
         overlap: [B, C, K] Bhattacharyya coefficient beta_ck, 0 where c or k is no candidate.
-        distance: [B, C, K] squared disagreement [m^2] of the pairs that fusion is to average; None = W2^2.
+        distance: [B, C, K] squared disagreement [m^2] of the pairs, which fusion averages; None = W2^2.
     """
 
     match: Tensor
@@ -53,11 +53,10 @@ def correspond(
 ) -> Correspondence:
     """Match the current image's Gaussians with those of earlier views in the image plane.
 
-    A component is a candidate where its mean lies beyond ``config.near_plane`` and projects inside the
-    image. k corresponds to c when beta_ck >= eta, unless another member k' of c's set is nearer
-    (smaller depth of the mean) and overlaps k by more than eta_occl: then k is hidden. All hidden
-    members go at once, so the result depends on no order; a hidden member hides others still, as its
-    surface would. Many c may share one k and the other way round.
+    A component is a candidate where its mean lies beyond ``config.near_plane`` and projects into the image. k
+    corresponds to c when beta_ck >= eta, unless k is hidden: another member k' of c's set is nearer (smaller depth of
+    the mean) and overlaps k by more than eta_occl. All hidden members are removed at once, so the result does not
+    depend on an order, and a hidden member can hide others. Correspondences are many-to-many.
 
     Args:
         previous_cam: M_(i-1) in the current camera frame, [B, K].
@@ -91,8 +90,8 @@ def _hidden(match: Tensor, mean: Tensor, covariance: Tensor, depth: Tensor, conf
 def candidates(
     mixture_cam: GaussianMixture, intrinsics: Tensor, size: tuple[int, int], near_plane: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The mask of components in view [B, K], image-plane mean [B, K, 2] and covariance [B, K, 2, 2]; harmless values
-    where they are not."""
+    """The mask of components in view [B, K], image-plane mean [B, K, 2] and covariance [B, K, 2, 2]; finite
+    placeholders outside the mask."""
     height, width = size
     mean_cam = mixture_cam.mean.to(intrinsics.dtype)
     in_front = mixture_cam.valid & (mean_cam[..., 2] > near_plane)

@@ -1,19 +1,19 @@
 """Distance of two matched Gaussians in depth where both are seen: the alternative to W2^2 ("overlap").
 
-The paper's W2^2 compares whole Gaussians. Two views cut one surface into different pieces, and W2^2 then counts how
-the pieces differ in place and extent, with perfect depth too. Here only the depths are compared, and only where both
-Gaussians lie in the image:
+The paper's W2^2 compares whole Gaussians. Two views segment one surface differently, so W2^2 includes the differences
+in position and extent of the segments, even with perfect depth. The distance d^2 compares only the depths, and only
+where both Gaussians lie in the image:
 
 1. In the coordinates (u, z) of the current camera, u = (x/z, y/z), a Gaussian is linearised at its mean into
    N((u_0, z_0), S), S = J Sigma J^T.
 2. Depth is regressed on the image position: slope b = S_uu^-1 S_uz, thickness tau^2 = S_zz - S_zu b. On a plane 1/z is
    linear in u, so z(u) = z_0 / (1 - b.(u - u_0)/z_0) continues a tilted plane exactly.
-3. Both see u ~ N(u*, S*), the normalised product of the two image-plane Gaussians: S* = (S_uu,1^-1 + S_uu,2^-1)^-1.
+3. Both cover u ~ N(u*, S*), the normalised product of the two image-plane Gaussians: S* = (S_uu,1^-1 + S_uu,2^-1)^-1.
 4. d^2 = E (z_1(u) - z_2(u))^2 + (tau_1 - tau_2)^2, with both curves linearised at u*:
    d^2 = (z_1 - z_2)^2 + (b_1 - b_2)^T S* (b_1 - b_2) + (tau_1 - tau_2)^2, values at u*, b_i(u*) = b_i (z_i / z_i0)^2.
-   It is the mean, over what both see, of the squared Wasserstein distance of the two depths there.
+   This is the mean squared Wasserstein distance of the two depths over u.
 
-It is 0 for two views of one plane, however each cuts it, and delta^2 for frontal planes delta apart.
+d^2 is 0 for two views of one plane, however each segments it, and delta^2 for frontal planes delta apart.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from ufmstar_torch.correspond import Correspondence
 from ufmstar_torch.fixed_order import apply, congruence
 from ufmstar_torch.mixture import GaussianMixture
 
-# A continued plane's depth stays within this factor of the depth at its own mean. Matched Gaussians overlap, so u* lies
-# within both; only a surface seen almost edge-on would be continued past it, to where it has no depth at all.
+# The depth of an extrapolated plane is clamped to this factor of the depth at its mean. Matched Gaussians overlap, so
+# u* lies within both; only a surface seen almost edge-on reaches the clamp.
 _FARTHEST = 2.0
 
 
 def with_overlap_disagreement(
     pairs: Correspondence, previous_cam: GaussianMixture, current_cam: GaussianMixture
 ) -> Correspondence:
-    """The pairs with d^2 of each as what fusion averages, in place of W2^2.
+    """The pairs with d^2 as the distance that fusion averages, in place of W2^2.
 
     Args:
         pairs: of the two mixtures.
@@ -60,7 +60,7 @@ def overlap_disagreement(mean_a: Tensor, cov_a: Tensor, mean_b: Tensor, cov_b: T
 
 
 def _profile(mixture_cam: GaussianMixture) -> list[Tensor]:
-    """:func:`_in_image` of a mixture; empty slots and what lies behind the camera hold harmless values."""
+    """:func:`_in_image` of a mixture, with placeholders for empty slots and components behind the camera."""
     usable = mixture_cam.valid & (mixture_cam.mean[..., 2] > 0)
     eye = torch.eye(3, dtype=torch.float64, device=usable.device)
     ahead = eye[2]

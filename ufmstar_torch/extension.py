@@ -1,9 +1,9 @@
-"""The interface of extensions of UfM*: tensors of their own in the state, and calls around a frame.
+"""The interface of extensions of UfM*: additional state tensors, and methods called during a frame.
 
-An :class:`Extension` belongs to a module. For each frame it makes a :class:`FrameExtension`, whose methods are called
-in this order: ``before_regression`` adds columns that are regressed beside H with the same weights,
-``after_regression`` receives them at every pixel, ``after_frame`` may change the state, and ``disagreement`` M. An
-extension may also map V. By default nothing is changed. ``extensions.py`` makes the extensions of a config.
+An :class:`Extension` belongs to a module. For each frame it creates a :class:`FrameExtension`, whose methods are called
+in this order: ``before_regression`` adds columns that are regressed with H's weights, ``after_regression`` receives
+them at every pixel, ``after_frame`` may change the state, and ``disagreement`` may change M. An extension may also map
+V. The defaults change nothing. ``extensions.py`` creates the extensions of a config.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ufmstar_torch.state import UfMStarState
 Tensors = Mapping[str, Tensor]
 # (mixture in the camera frame, points [B, N, 3], values [B, N, C], config) -> sums by component [B, K, C]
 Distribute = Callable[[GaussianMixture, Tensor, Tensor, UfMStarConfig], Tensor]
-# M -> V without what extensions add to M
+# M -> V, before extensions change M
 Total = Callable[[Tensor], Tensor]
 # Map [B, H, W] -> its values at the pixels that are regressed, [B, H, W] or [B, n]
 Chosen = Callable[[Tensor], Tensor]
@@ -33,12 +33,12 @@ Chosen = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Columns:
-    """Columns that are regressed beside H, C numbers a component.
+    """Columns that are regressed in addition to H, C numbers per component.
 
     Attributes:
         values: [B, K, C], 0 for the prior.
         shift: [B, C], added to the regressed values at every pixel.
-        tensors: the extension's tensors of the state that change, after the frame.
+        tensors: the extension's changed state tensors, after the frame.
     """
 
     values: Tensor
@@ -50,15 +50,15 @@ class FrameExtension:
     """An extension during one frame.
 
     Attributes:
-        columns: C, how many columns it regresses.
-        changes_mixture: whether ``after_frame`` may change the mixture, which must be complete then.
+        columns: C, the number of columns it regresses.
+        changes_mixture: whether ``after_frame`` may change the mixture; the step then completes it before the call.
     """
 
     columns: int = 0
     changes_mixture: bool = False
 
     def before_regression(self, tensors: Tensors, mixture_cam: GaussianMixture, distribute: Distribute) -> Columns:
-        """The columns of M_i [B, K] in the camera frame; only where ``columns`` is not 0.
+        """The columns of M_i [B, K] in the camera frame; called only if ``columns`` is not 0.
 
         Args:
             tensors: of the state before the frame.
@@ -68,23 +68,23 @@ class FrameExtension:
         raise NotImplementedError(f"{type(self).__name__} states columns, but does not compute them")
 
     def in_view(self, tensors: Tensors, capacity: int, seen: Any, views: Any) -> Columns | None:
-        """Like :meth:`before_regression` for the compiled step, where it has a faster way (None: it has none): the
-        columns are written into ``seen`` and ``views`` (``kernels.regress_cpu``), which hold the first slots."""
+        """A faster :meth:`before_regression` for the compiled step, None if there is none. It writes the columns into
+        ``seen`` and ``views`` (``kernels.regress_cpu``), which hold the first slots."""
         return None
 
     def after_regression(self, values: Tensor) -> None:
         """Receive the columns [B, H, W, C] or [B, n, C] at the pixels."""
 
     def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
-        """State and output after a step; ``total`` is V as a function of M at the pixels of the output."""
+        """Change the state and the output after a step; ``total`` maps M to V at the pixels of the output."""
         return state, out
 
     def disagreement(self, disagreement: Tensor, depth: Tensor) -> Tensor:
-        """M with what the extension adds to it [m^2], at pixels of this depth [m]."""
+        """M with the extension's change [m^2], at pixels of this depth [m]."""
         return disagreement
 
     def map_variance(self, variance: Tensor, chosen: Chosen) -> Tensor:
-        """V [m^2] of this frame after everything else, at the pixels that ``chosen`` takes from a map."""
+        """Map V [m^2] of this frame, after all other terms; ``chosen`` gathers the same pixels from a map."""
         return variance
 
     def outputs(self) -> dict[str, Tensor]:
@@ -96,7 +96,7 @@ class Extension:
     """An extension of UfM*.
 
     Attributes:
-        argument: name of what a frame may bring for it (``UfMStar.forward``), "" = nothing.
+        argument: name of its keyword argument of ``UfMStar.forward``, "" = none.
         always_float64: names of the tensors that stay float64.
     """
 
@@ -107,17 +107,17 @@ class Extension:
         """Raise a ValueError unless the extension fits the config."""
 
     def require_state(self, state: Tensors) -> None:
-        """Raise a ValueError unless its tensors are such as a run leaves behind; shapes and finite values are checked
-        already."""
+        """Raise a ValueError unless a run could have produced its tensors. The caller has checked their shapes and that
+        they are finite."""
 
     def by_component(
         self, streams: int, slots: int, dtype: torch.dtype, device: torch.device | str
     ) -> dict[str, Tensor]:
-        """Its tensors [B, K, C] of the empty state: sums over what was observed of each component, row k of slot k."""
+        """Its tensors [B, K, C] in the empty state: sums over the observations of each component, row k for slot k."""
         return {}
 
     def by_stream(self, streams: int, dtype: torch.dtype, device: torch.device | str) -> dict[str, Tensor]:
-        """Its tensors [B, C] of the empty state that describe a stream as a whole."""
+        """Its tensors [B, C] in the empty state that describe a stream as a whole."""
         return {}
 
     def of_frame(
@@ -133,42 +133,42 @@ class Extension:
 
         Args:
             frame: checked.
-            network_variances: the network's own variances that count, A and E [B, H, W] [m^2].
-            argument: what the frame brings under ``argument``, or None.
-            before: the extensions that come before this one, during the same frame.
+            network_variances: the network's variances that are added to M, A and E [B, H, W] [m^2].
+            argument: value of its keyword argument (attribute ``argument``), or None.
+            before: the preceding extensions during the same frame.
             dense: whether the whole map is regressed.
 
         Raises:
-            TypeError, ValueError: ``argument`` is not what the extension takes.
+            TypeError, ValueError: ``argument`` is invalid.
         """
         return FrameExtension()
 
     def map_variance(self, variance: Tensor) -> Tensor:
-        """V [m^2] after everything else."""
+        """Map V [m^2], after all other terms."""
         return variance
 
 
 @dataclass(frozen=True)
 class FrameExtensions:
-    """All extensions during one frame, in their order."""
+    """All extensions during one frame, in order."""
 
     each: Sequence[FrameExtension] = ()
     _shifts: list[Tensor] = field(default_factory=list)
 
     @property
     def columns(self) -> int:
-        """Number of columns that all of them add."""
+        """Total number of columns."""
         return sum(one.columns for one in self.each)
 
     @property
     def changes_mixture(self) -> bool:
-        """True if any of them may change the mixture after the frame."""
+        """True if any extension may change the mixture after the frame."""
         return any(one.changes_mixture for one in self.each)
 
     def before_regression(
         self, tensors: Tensors, mixture_cam: GaussianMixture, distribute: Distribute
     ) -> tuple[dict[str, Tensor], GaussianMixture]:
-        """The tensors that change, and the mixture with the columns behind its features."""
+        """The changed tensors, and the mixture with the columns appended to its features."""
         after, features = dict[str, Tensor](), [mixture_cam.features]
         for one in self.each:
             if one.columns:
@@ -181,8 +181,8 @@ class FrameExtensions:
     def in_view(
         self, tensors: Tensors, capacity: int, seen: Any, views: Any
     ) -> tuple[dict[str, Tensor], Tensor] | None:
-        """As :meth:`FrameExtension.in_view`, of a single extension with columns: the tensors that change, and the shift
-        [B, C], which the regression then adds. None: take :meth:`before_regression`."""
+        """As :meth:`FrameExtension.in_view`, if exactly one extension has columns: the changed tensors, and the shift
+        [B, C], which the regression then adds. None: use :meth:`before_regression`."""
         with_columns = [one for one in self.each if one.columns]
         if len(with_columns) != 1:
             return None
@@ -190,7 +190,7 @@ class FrameExtensions:
         return None if columns is None else (columns.tensors, columns.shift)
 
     def after_regression(self, result: Regression) -> Regression:
-        """Hand out the columns, which are the last features; what was shifted in the regression is not again."""
+        """Pass each extension its columns, the last features. Adds the shifts unless the regression has added them."""
         if not self.columns:
             return result
         first = result.features.shape[-1] - self.columns
@@ -230,7 +230,7 @@ NONE = FrameExtensions()
 
 
 class Extensions:
-    """The extensions of a module, in their order."""
+    """The extensions of a module, in order."""
 
     def __init__(self, each: Sequence[Extension], config: UfMStarConfig) -> None:
         for one in each:
@@ -264,10 +264,10 @@ class Extensions:
     def of_frame(
         self, frame: FrameInput, network_variances: Sequence[Tensor], inputs: Mapping[str, Any], *, dense: bool
     ) -> FrameExtensions:
-        """All of them during a frame.
+        """All extensions during a frame.
 
         Raises:
-            TypeError: an argument of no extension, or as :meth:`Extension.of_frame`.
+            TypeError: an unknown argument, or as :meth:`Extension.of_frame`.
             ValueError: an argument of an extension that is off, or as :meth:`Extension.of_frame`.
         """
         arguments = {one.argument for one in self.each}
@@ -282,7 +282,7 @@ class Extensions:
         return FrameExtensions(each) if each else NONE
 
     def map_variance(self, variance: Tensor) -> Tensor:
-        """V [m^2] after everything else."""
+        """Map V [m^2], after all other terms."""
         for one in self.each:
             variance = one.map_variance(variance)
         return variance

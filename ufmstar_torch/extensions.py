@@ -1,4 +1,4 @@
-"""The extensions that a config asks for: the one place that knows all of them."""
+"""Creates the extensions of a config. No other core module imports all of them."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from ufmstar_torch.posterior.extension import PosteriorExtension
 
 
 def extensions_of(config: UfMStarConfig, further: Sequence[Extension] = ()) -> Extensions:
-    """The extensions of a config, and ``further`` ones behind them.
+    """The extensions of a config, followed by ``further`` ones.
 
     Raises:
-        ValueError: one of them does not fit the config.
+        ValueError: an extension does not fit the config.
     """
     each: list[Extension] = []
     if config.anchors is not None:

@@ -1,8 +1,8 @@
-"""Small matrix products and sums whose result depends on neither the batch, nor the padding, nor the number of threads.
+"""Small matrix products and sums whose result does not depend on the batch, the padding or the number of threads.
 
-BLAS and torch's reductions choose their order of summation by shape, by processor and by threads. A stream would then
-differ in its last bits between running alone and running in a batch. Everything here is elementwise multiplication and
-addition in one stated order; the matrices are 2x2 to 4x4.
+BLAS and torch's reductions choose their order of summation by shape, processor and threads, so a stream would differ in
+its last bits between running alone and running in a batch. These functions multiply and add elementwise in a fixed
+order; the matrices are 2x2 to 4x4.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def congruence(A: Tensor, S: Tensor) -> Tensor:
 
 
 def total(x: Tensor, dim: int) -> Tensor:
-    """Sum along ``dim`` by folding halves: entry i meets entry i + 2^j.
+    """Sum along ``dim`` by folding halves: entry i is added to entry i + 2^j.
 
     The order is that of a length rounded up to a power of two, so trailing zeros change no bit.
     """

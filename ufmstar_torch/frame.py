@@ -1,8 +1,8 @@
-"""One frame's input, checked: what UfM* is given per image, before the algorithm sees it.
+"""Checks of one frame's input.
 
-A wrong shape or dtype is an error at once. A fault that only values show (a pose that is not rigid, bad
-intrinsics) becomes a code per stream, so that on an accelerator nothing waits for the check; the caller
-raises or skips. What is wrong with single pixels becomes ``valid = False`` and is counted.
+A wrong shape or dtype raises at once. A fault in the values (a pose that is not rigid, invalid intrinsics) becomes a
+code per stream, so that the check does not synchronise with an accelerator; the caller raises or skips. Invalid pixels
+are marked ``valid = False`` and counted.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ FRAME_FAULTS = (
     "intrinsics have their principal point outside the depth map; expected the intrinsics of the depth map, not those "
     "of an image of another size (ufmstar_torch.camera.resize_intrinsics)",
 )
-# Accepted ranges. Within these ranges nothing that the algorithm squares or divides by leaves float32.
+# Accepted ranges. Within them, no square or quotient of the algorithm leaves the range of float32.
 DEPTH_RANGE = (1e-6, 1e6)  # [m]
 LARGEST = 1e12  # A and E [m^2], and entries of features
 FOCAL_RANGE = (1e-2, 1e7)  # [px]
 FARTHEST = 1e9  # [m] any coordinate of a camera
-# Shares of the image within which the principal point of real cameras and the usual crops lies, and that of a K for
-# twice or half the size does not.
+# The principal point of real cameras and usual crops lies within these shares of the image; that of a K for twice or
+# half the size does not.
 CENTRE_RANGE = (0.2, 0.8)
 
 
@@ -48,16 +48,16 @@ class FrameInput:
     Attributes:
         depth: [B, H, W] [m], float32 or float64; 0 where not valid.
         T_world_cam: [B, 4, 4] float64 camera-to-world, rotation projected onto SO(3); identity if faulty.
-        intrinsics: [B, 3, 3] float64 [px]; a harmless camera if faulty.
+        intrinsics: [B, 3, 3] float64 [px]; the identity if faulty.
         aleatoric, epistemic: [B, H, W] [m^2] in the depth's dtype, or None.
         features: [B, F, H, W] or None.
         valid: [B, H, W] True where depth lies in ``DEPTH_RANGE`` and not beyond the largest depth, A and E in
             [0, ``LARGEST``], features in +-``LARGEST``, the caller's mask agrees and the stream has no fault.
-        beyond: [B] pixels of the mask with a finite depth beyond the largest one.
-        out_of_range: [B] further pixels of the mask with a finite positive depth that are not valid.
+        beyond: [B] number of pixels of the mask with a finite depth beyond the largest one.
+        out_of_range: [B] number of other pixels of the mask with a finite positive depth that are not valid.
         fault: [B] int64 index into ``FRAME_FAULTS``, 0 = fine.
-        rotation_deviation: [B] float64 max |R^T R - I| of the pose as given.
-        known_fault: ``fault`` on the CPU where pose and intrinsics were given there: no wait; else None.
+        rotation_deviation: [B] float64 max |R^T R - I| of the original pose.
+        host_fault: ``fault`` on the CPU if pose and intrinsics were there, so that reading it does not wait; else None.
     """
 
     depth: Tensor
@@ -71,7 +71,7 @@ class FrameInput:
     rotation_deviation: Tensor
     beyond: Tensor
     out_of_range: Tensor
-    known_fault: Tensor | None = None
+    host_fault: Tensor | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -91,7 +91,7 @@ def check_values(
     rotation_tolerance: float,
     max_depth: float,
 ) -> FrameInput:
-    """Check a frame's values, where shapes and dtypes are right; all maps have one dtype and device.
+    """Check a frame's values; the caller has checked shapes and dtypes. All maps have one dtype and device.
 
     Args:
         depth: [B, H, W] [m], detached, float32 or float64.
@@ -157,8 +157,8 @@ def check_frame(
 
     Raises:
         TypeError: an argument is no tensor or has the wrong kind of dtype.
-        ValueError: an argument has the wrong shape or lies on another device than ``depth``; A is to be averaged, and
-            there is none.
+        ValueError: an argument has the wrong shape or lies on another device than ``depth``, or ``aleatoric_in_h``
+            without ``aleatoric``.
     """
     depth = require_float("depth", as_tensor("depth", depth))
     shape = tuple(depth.shape)
@@ -189,12 +189,12 @@ def check_frame(
 
 
 def raise_faults(frame: FrameInput) -> None:
-    """Raise a ValueError that names every stream at fault; waits for an accelerator unless the camera was on the CPU.
+    """Raise a ValueError that names every faulty stream; waits for an accelerator unless the camera was on the CPU.
 
     Raises:
-        ValueError: a stream is at fault, or the frame has no values.
+        ValueError: a stream is faulty, or the frame has no values.
     """
-    fault = frame.fault if frame.known_fault is None else frame.known_fault
+    fault = frame.fault if frame.host_fault is None else frame.host_fault
     if fault.device.type == "meta":
         raise ValueError("depth lies on device meta, without values: set on_bad_frame='skip'")
     faults = fault.tolist()
@@ -215,7 +215,7 @@ def _features(features: Array | None, count: int, plain: Tensor) -> Tensor | Non
 
 
 def _of_depth(name: str, value: Tensor, plain: Tensor) -> Tensor:
-    """A camera on the device where it was given (a pose on the CPU is checked without waiting)."""
+    """A checked camera on its original device (the check of a pose on the CPU does not wait for an accelerator)."""
     if value.dim() == 3 and value.shape[0] not in (1, plain.shape[0]):
         raise ValueError(f"{name} must have depth's {plain.shape[0]} streams, got {value.shape[0]}")
     if value.device.type == "meta" and plain.device.type != "meta":
@@ -228,7 +228,7 @@ def of_streams(cameras: Tensor, streams: int) -> Tensor:
     return cameras.double().expand(streams, *cameras.shape[-2:])
 
 
-# A call of torch takes microseconds, several times as many after a network: none is made that changes nothing.
+# A torch call takes microseconds, several times longer right after a network: these helpers skip calls without effect.
 def _constant(value: Tensor) -> Tensor:
     """The tensor without its graph."""
     return value.detach() if value.requires_grad else value
@@ -246,7 +246,7 @@ def _moved(value: Tensor, device: torch.device) -> Tensor:
 
 
 def pose_fault(T: Tensor, deviation: Tensor, tolerance: float) -> Tensor:
-    """[B] codes 1 to 4 and 7, on the pose's own device."""
+    """[B] codes 1 to 4 and 7, on the pose's device."""
     zero = torch.zeros((), dtype=T.dtype, device=T.device)
     last = torch.stack([zero, zero, zero, zero + 1])
     checks = [
@@ -260,7 +260,7 @@ def pose_fault(T: Tensor, deviation: Tensor, tolerance: float) -> Tensor:
 
 
 def intrinsics_fault(K: Tensor, size: tuple[float, ...]) -> Tensor:
-    """[B] codes 5, 6, 8 and 9 for a depth map of ``size`` (H, W), on the intrinsics' own device."""
+    """[B] codes 5, 6, 8 and 9 for a depth map of ``size`` (H, W), on the intrinsics' device."""
     off_diagonal = K[:, 0, 1].abs() + K[:, 1, 0].abs() + K[:, 2, :2].abs().sum(-1)
     shape = (off_diagonal != 0) | (K[:, 2, 2] != 1) | (K[:, 0, 0] <= 0) | (K[:, 1, 1] <= 0)
     fx, fy, cx, cy = focal_and_centre(K)
@@ -271,8 +271,8 @@ def intrinsics_fault(K: Tensor, size: tuple[float, ...]) -> Tensor:
 
 
 def doubtful_centre(K: Sequence[Sequence[float]], size: tuple[int, int]) -> str:
-    """Why the principal point of K [px] can hardly be that of a map of ``size`` (H, W): it lies near the border, or as
-    if cx and cy were swapped, which makes the product of their shares 1/4. "" = it can."""
+    """A warning if the principal point of K [px] is implausible for a map of ``size`` (H, W), else "": it lies near the
+    border, or the product of its shares is about 1/4, as with swapped cx and cy."""
     x, y = (K[0][2] + 0.5) / size[1], (K[1][2] + 0.5) / size[0]
     low, high = CENTRE_RANGE
     swapped = min(abs(x - 0.5), abs(y - 0.5)) > 0.08 and abs(4 * x * y - 1) < 0.15
@@ -284,8 +284,8 @@ def doubtful_centre(K: Sequence[Sequence[float]], size: tuple[int, int]) -> str:
 
 def _code(checks: dict[int, Tensor]) -> Tensor:
     """The number of the first check that is True, 0 for none."""
-    some = next(iter(checks.values()))
-    fault = torch.zeros(some.shape, dtype=torch.int64, device=some.device)
+    first = next(iter(checks.values()))
+    fault = torch.zeros(first.shape, dtype=torch.int64, device=first.device)
     for code, bad in reversed(checks.items()):
         fault = torch.where(bad, torch.full_like(fault, code), fault)
     return fault
@@ -297,7 +297,7 @@ def _first(fault: Tensor, other: Tensor, device: torch.device) -> Tensor:
 
 
 def _harmless(T: Tensor, K: Tensor, fine: Tensor) -> tuple[Tensor, Tensor]:
-    """Poses with exact rotations, and an identity or a unit camera in place of faulty ones."""
+    """Poses with exact rotations, and intrinsics; identities in place of faulty ones."""
     eye4 = torch.eye(4, dtype=T.dtype, device=T.device)
     eye3 = torch.eye(3, dtype=K.dtype, device=K.device)
     mask = fine[:, None, None]

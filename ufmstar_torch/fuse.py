@@ -1,8 +1,8 @@
 """Step 4, multiview fusion: measure the disagreement of matched Gaussians and fold it into the mixture.
 
-Section "Multiview Fusion". Both mixtures must be in one frame; distances are rigid invariants, so any
-frame serves. Everything is computed in float64 and stored in the mixture's dtype; before that, eigenvalues that the
-storage would round away are lifted, so that a thin covariance stays positive definite.
+Section "Multiview Fusion". Both mixtures must be in one frame; distances are rigid invariants, so any frame will do.
+Everything is computed in float64 and stored in the mixture's dtype. Eigenvalues that the rounding would destroy are
+raised first, so that a thin covariance stays positive definite.
 """
 
 from __future__ import annotations
@@ -32,15 +32,14 @@ def fuse(
     For each k the matched c are applied one after the other in increasing index (SPGF's emission order);
     different k are independent. With pi_c (times beta_ck if ``config.overlap_weighted``) and
     lambda = pi_c / (pi_k + pi_c): m_k <- (1-lambda) m_k + lambda W2^2(G_k, G_c), features likewise, mean and
-    covariance move by lambda along the optimal-transport geodesic, pi_k <- pi_k + pi_c. ``pairs.distance``, where it is
-    given, takes the place of W2^2.
-    A c that matches several k is fused into each of them in full.
+    covariance move by lambda along the optimal-transport geodesic, pi_k <- pi_k + pi_c. ``pairs.distance`` replaces
+    W2^2 if it is not None. A c that matches several k is fused into each of them with its full weight.
 
     Args:
         mixture: M_(i-1), [B, K].
         current: C_i, [B, C].
         pairs: their correspondence.
-        rounds: upper bound on the matches of any one k; None reads it (waits for an accelerator).
+        rounds: upper bound on the matches of any k; None = read it from the device (waits for an accelerator).
 
     Returns:
         The updated mixture, [B, K]; components without a match are unchanged to the last bit.
@@ -71,7 +70,7 @@ def _fuse_one_each(
         pi_c = pi_c * torch.gather(pairs.overlap, 1, c[:, None])[:, 0].to(dtype)
     lam = torch.where(used, pi_c / (pi_k + pi_c).clamp_min(torch.finfo(dtype).tiny), torch.zeros_like(pi_c))
 
-    # Empty slots take part with unit covariances, so that no branch divides by zero; `used` discards them.
+    # Empty slots get unit covariances, so that nothing divides by zero; `used` discards their results.
     eye = torch.eye(3, dtype=dtype, device=c.device)
     cov_k = torch.where(used[..., None, None], mixture.covariance.to(dtype), eye)
     cov_c = torch.where(used[..., None, None], of_c(current.covariance), eye)
@@ -103,24 +102,24 @@ def _where(used: Tensor, new: Tensor, old: Tensor) -> Tensor:
 def append(mixture: GaussianMixture, current: GaussianMixture, new: Tensor) -> tuple[GaussianMixture, Tensor]:
     """Add first observations to the mixture, M_i <- M_(i-1) with G_c: m = 0, count = 1.
 
-    Occupied slots are the first ones; the new components follow in increasing c. Their covariances must hold in the
+    Occupied slots come first; the new components follow in increasing c. Their covariances must survive rounding to the
     mixture's dtype (``gaussian.storage_floor``).
 
     Args:
         new: [B, C] True where c is to be added.
 
     Returns:
-        The mixture [B, K] and the number of components per stream [B] that found no free slot.
+        The mixture [B, K] and the number of components per stream [B] without a free slot.
     """
     b, capacity = mixture.weight.shape
     slot = mixture.components[:, None] + new.cumsum(dim=1) - 1
     fits = new & (slot < capacity)
-    slot = torch.where(fits, slot, torch.full_like(slot, capacity))  # one slot more catches what is not added
+    slot = torch.where(fits, slot, torch.full_like(slot, capacity))  # an additional slot collects the rest
 
     def scattered(old: Tensor, value: Tensor) -> Tensor:
-        room = torch.cat([old, old.new_zeros(b, 1, *old.shape[2:])], dim=1)
+        padded = torch.cat([old, old.new_zeros(b, 1, *old.shape[2:])], dim=1)
         index = slot.view(*slot.shape, *[1] * (old.dim() - 2)).expand(*slot.shape, *old.shape[2:])
-        return room.scatter(1, index, value.to(old.dtype))[:, :capacity]
+        return padded.scatter(1, index, value.to(old.dtype))[:, :capacity]
 
     placed = {name: scattered(old, getattr(current, name)) for name, old in mixture.tensors().items()}
     placed["disagreement"] = scattered(mixture.disagreement, torch.zeros_like(current.disagreement))
@@ -132,10 +131,10 @@ class Room(NamedTuple):
     """A mixture from which components were dropped.
 
     Attributes:
-        mixture: [B, K], the others in their order.
-        sums: [B, K, ...] by name, as the mixture's rows.
-        slot: [B, K] in which each of them was; of empty slots nothing.
-        dropped: [B] how many of the components that were remembered before are gone.
+        mixture: [B, K], the remaining components in their order.
+        sums: [B, K, ...] by name, rows as in the mixture.
+        slot: [B, K] the previous slot of each component; undefined for empty slots.
+        dropped: [B] number of dropped components that existed before the frame.
     """
 
     mixture: GaussianMixture
@@ -147,14 +146,14 @@ class Room(NamedTuple):
 def make_room(
     mixture: GaussianMixture, sums: Mapping[str, Tensor], old: Tensor, coming: Tensor, position: Tensor, limit: int
 ) -> Room:
-    """Drop what exceeds ``config.max_components``: the component farthest from the camera first, of equally far ones
-    the oldest. The others move up and keep their order, which is that of their creation. No device is waited for.
+    """Drop components beyond ``config.max_components``: the farthest from the camera first, among equally far ones the
+    oldest. The others move up and keep their order, that of creation. Does not synchronise with the device.
 
     Args:
         mixture: after the fusion, [B, K].
         sums: tensors [B, K or less, ...] by name, whose rows belong to the components.
-        old: [B] how many components were remembered before the frame; those behind them are dropped last.
-        coming: [B] how many are still to be appended.
+        old: [B] number of components before the frame; later ones are dropped last.
+        coming: [B] number of components still to be appended.
         position: [B, 3] of the camera in the mixture's frame [m].
         limit: the largest number of components.
     """

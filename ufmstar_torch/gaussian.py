@@ -1,14 +1,13 @@
 """Closed forms for Gaussians: singular values, Wasserstein distance and geodesic, overlap.
 
-All functions are batched over leading dimensions, differentiable almost everywhere and free of host
-synchronisation. Distances, geodesics and barycenters are computed in float64 whatever the caller's dtype, and
-returned in it; the decompositions work in the dtype they are given.
+All functions are batched over leading dimensions, differentiable almost everywhere and free of host synchronisation
+(except :func:`barycenter`). Distances, geodesics and barycenters are computed in float64 and returned in the caller's
+dtype; the decompositions use the dtype of their input.
 
-Why Jacobi rotations: the trigonometric eigenvalues of a symmetric 3x3 lose half the digits where two
-of them coincide, and the batched ``eigh`` is slow on GPUs. A few sweeps of Jacobi rotations are a
-fixed number of elementwise operations and reach rounding. The Wasserstein distance needs singular values
-of L_b^T L_a only (L the Cholesky factors), never the square Q itself, so that thin Gaussians keep
-their digits: W2^2(A, A) is 0 up to the rounding of tr A.
+Why Jacobi rotations: the trigonometric eigenvalues of a symmetric 3x3 lose half the digits where two of them coincide,
+and the batched ``eigh`` is slow on GPUs. A few sweeps of Jacobi rotations are a fixed number of elementwise operations
+and reach rounding. The Wasserstein distance uses only the singular values of L_b^T L_a (L the Cholesky factors), never
+the square Q, so that thin Gaussians keep their digits: W2^2(A, A) is 0 up to the rounding of tr A.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ from ufmstar_torch.fixed_order import congruence, product
 _SWEEPS = 5
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 
-# Variance of a point within one pixel [px^2]: a uniform density over a width of 1. The image plane
-# resolves nothing finer, so every projected covariance is widened by it (keeps edge-on surfaces regular).
+# Variance of a point within one pixel [px^2], a uniform density over a width of 1. It is added to every projected
+# covariance, because the image resolves nothing finer; this keeps edge-on surfaces regular.
 PIXEL_VARIANCE = 1.0 / 12.0
 
 
@@ -50,8 +49,8 @@ def right_singular(M: Tensor) -> tuple[Tensor, Tensor]:
         M: [..., 3, 3].
 
     Returns:
-        s [..., 3], not sorted, and V [..., 3, 3]. Small singular values are accurate relative to the
-        columns they come from, which squaring M would lose.
+        s [..., 3], not sorted, and V [..., 3, 3]. Small singular values are accurate relative to their columns, which
+        M^T M would lose.
     """
     eye = torch.eye(3, dtype=M.dtype, device=M.device).expand_as(M)
     columns = list(torch.cat([M, eye], dim=-2).unbind(-1))
@@ -67,7 +66,7 @@ def right_singular(M: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def cholesky3(S: Tensor) -> Tensor:
-    """Lower Cholesky factor of positive semidefinite S [..., 3, 3], without a check that would wait for the device.
+    """Lower Cholesky factor of positive semidefinite S [..., 3, 3], without a check that synchronises with the device.
 
     A pivot at or below rounding (16 eps of the largest diagonal entry) ends its column with zeros: the
     factor of a singular S then still satisfies L L^T = S up to 4 sqrt(eps) of that entry.
@@ -122,8 +121,8 @@ def _double(*values: Tensor) -> tuple[Tensor, ...]:
 def transport_map(cov_a: Tensor, cov_b: Tensor) -> Tensor:
     """Z [..., 3, 3], the symmetric positive definite map with Z Sigma_a Z = Sigma_b.
 
-    Equals the paper's Sigma_a^(-1/2) Q^(1/2) Sigma_a^(-1/2), which is the only such matrix; computed
-    as L^-T (L^T Sigma_b L)^(1/2) L^-1 with Sigma_a = L L^T. Sigma_a must be positive definite.
+    Equals the paper's Sigma_a^(-1/2) Q^(1/2) Sigma_a^(-1/2), since Z is unique. Computed as
+    L^-T (L^T Sigma_b L)^(1/2) L^-1 with Sigma_a = L L^T. Sigma_a must be positive definite.
     """
     return _transport(*_double(cov_a, cov_b))[0].to(cov_a.dtype)
 
@@ -224,7 +223,7 @@ def barycenter(
 
 def pointwise_disagreement(points: Tensor) -> Tensor:
     """m_p [...] [m^2] = tr Sigma, the spread of J views' estimates of one point (section "Pointwise multiview
-    disagreement"), with the divisor J - 1. What UfM measures; UfM*'s counterpart is :func:`wasserstein_variance`.
+    disagreement"), with the divisor J - 1. UfM measures it; UfM*'s counterpart is :func:`wasserstein_variance`.
 
     Args:
         points: [..., J, 3] [m], in one frame.
@@ -261,9 +260,9 @@ def floor_covariance(covariance: Tensor, floor: Tensor) -> Tensor:
         floor: [...] [m^2].
 
     Returns:
-        [..., 3, 3]; those that satisfy the floor already come back unchanged to the last bit.
+        [..., 3, 3]; covariances that already satisfy the floor are unchanged to the last bit.
     """
-    values, V = right_singular(covariance)  # of a positive semidefinite matrix: its eigenvalues and eigenvectors
+    values, V = right_singular(covariance)  # for a positive semidefinite matrix, its eigenvalues and eigenvectors
     low = values.amin(-1) < floor
     lifted = symmetrize(product(V * torch.maximum(values, floor[..., None])[..., None, :], V.mT))
     return torch.where(low[..., None, None], lifted, covariance)
@@ -281,7 +280,7 @@ def storage_floor(covariance: Tensor, dtype: torch.dtype) -> Tensor:
 def pixel_footprint(z: Tensor, focal: Tensor) -> Tensor:
     """(z/f)^2/12 [m^2]: the variance across one pixel at depth z, the floor of a segment's covariance.
 
-    A segment thinner than the image resolves (a rendered wall is exactly flat) would have an infinite
-    density; below this width the depth map contains nothing about its shape. Raw SPGF moments have no floor.
+    Without it, a segment thinner than the image resolves (a rendered wall is exactly flat) would have an infinite
+    density. Raw SPGF moments have no floor.
     """
     return (z / focal) ** 2 * PIXEL_VARIANCE

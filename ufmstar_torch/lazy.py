@@ -1,6 +1,6 @@
-"""Packages whose public names are imported when they are first used (PEP 562), so that a bare import stays light.
+"""Lazy import of a package's public names at their first use (PEP 562), so that importing the package is fast.
 
-A package lists its names once, as the imports that type checkers and editors read::
+A package lists its names once, as imports for type checkers and editors::
 
     if TYPE_CHECKING:
         from ufmstar_torch.config import UfMStarConfig as UfMStarConfig
@@ -24,12 +24,12 @@ def lazy_names(package: str, **completed: str) -> tuple[Callable[[str], Any], Ca
 
     Args:
         package: the package's ``__name__``. Its source is parsed when the first name is looked up.
-        completed: names whose class another module completes: that module. Type checkers read the listed class.
+        completed: by name, a module with a subclass that replaces the listed class at run time.
     """
 
     @cache
     def origins() -> dict[str, tuple[str, str]]:
-        """Module and name there of every public name."""
+        """By public name: its module, and its name in that module."""
         import ast
         import inspect
 

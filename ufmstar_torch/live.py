@@ -1,4 +1,4 @@
-"""``LiveDepth``: depth with a variance from images and poses that arrive at their own pace, in any thread."""
+"""``LiveDepth``: depth and variance from images and poses that arrive asynchronously, from any thread."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from ufmstar_torch.pipeline import UncertainDepth, UncertainPrediction
 from ufmstar_torch.stream_warnings import LOGGER
 from ufmstar_torch.trajectory import SAME_TIME, Trajectory, interpolate_pose
 
-# Why an image was dropped (another one was more recent) or skipped (it cannot be used).
+# Reasons for which an image is dropped (NEWER, CLOSED) or skipped (the others).
 NEWER, CLOSED = "a newer image was ready", "closed"
 BACKWARDS, LATE, GAP = "its stamp is not after the image before", "no pose in time", "poses too far apart around it"
 LOST = "a pose around it is not finite"
-_WAITING = 16  # images that wait for their poses: half a second at 30 frames/s
-_POSES = 4096  # poses kept: 4 s of an inertial filter at 1 kHz
+_WAITING = 16  # most images that wait for their poses: half a second at 30 frames/s
+_POSES = 4096  # most poses in the buffer: 4 s of an inertial filter at 1 kHz
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +44,8 @@ class LiveResult:
     T_world_cam: np.ndarray  # [4, 4] float64, interpolated at the stamp [m]
     out: UncertainPrediction  # depth, variance and the rest
     received: float  # when the image was pushed
-    started: float  # when its pose was known and the network began
-    finished: float  # when the variance was there
+    started: float  # when its pose was available and the network began
+    finished: float  # when the variance was computed
 
     @property
     def latency(self) -> float:
@@ -55,15 +55,15 @@ class LiveResult:
 
 @dataclass(frozen=True)
 class LiveStatistics:
-    """Counts so far. ``images`` = ``results`` + all ``dropped`` + all ``skipped`` + those that still wait."""
+    """Counts so far. ``images`` = ``results`` + all ``dropped`` + all ``skipped`` + waiting images."""
 
     images: int  # pushed
     poses: int  # pushed
     results: int  # delivered
-    dropped: Mapping[str, int]  # by reason: images without a fault of their own
-    skipped: Mapping[str, int]  # by reason: images that could not be used
-    saved: int  # how often the state was
-    restarts: int  # how often an image of another size or camera made the anchors' evidence start afresh
+    dropped: Mapping[str, int]  # by reason: usable images
+    skipped: Mapping[str, int]  # by reason: unusable images
+    saved: int  # how often the state was saved
+    restarts: int  # how often an image of another size or camera reset the anchors' evidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,31 +77,31 @@ class _Waiting:
 
 
 class LiveDepth:
-    """Runs a model in a thread of its own on the newest image whose pose is known.
+    """Runs a model in a worker thread on the newest image with a pose.
 
     ``push_image`` and ``push_pose`` may be called from any thread and return at once. Poses may be late: an image waits
-    for the first pose after it, at most ``max_wait``, and gets the pose interpolated at its stamp. Nothing queues:
-    when the model is free, the newest image with a pose is taken and all older ones are dropped. ``statistics`` counts
-    drops and skips by reason. Stamps of images and poses are of one clock, in seconds.
+    for the first pose after it, at most ``max_wait``, and gets the pose interpolated at its stamp. There is no queue:
+    when the model is free, it processes the newest image with a pose, and all older images are dropped. ``statistics``
+    counts drops and skips by reason. Stamps of images and poses must come from one clock, in seconds.
 
     Args:
-        model: an :class:`UncertainDepth` on one stream; only this object calls it from now on. Call
-            ``model.ufm.warm_up((224, 224))`` before, or the first image waits for the compiler.
-        on_result: called with each :class:`LiveResult` in the worker thread; the next image waits for it.
-        intrinsics: of the images [px], [3, 3] or fx, fy, cx, cy; None: every ``push_image`` has its own.
-        max_wait: for poses after an image [s].
-        max_gap: between the poses around an image, beyond which it is skipped [s].
-        state: file in which ``model.state_dict()`` is saved, whole or not at all, every ``save_every`` seconds [s] and
-            at the end; None = never. ``model.load_state_dict(torch.load(FILE))`` goes on from it.
+        model: an :class:`UncertainDepth` on one stream; from now on, only this object may call it. Call
+            ``model.ufm.warm_up((224, 224))`` first, or the first image waits for the compiler.
+        on_result: called with each :class:`LiveResult` in the worker thread; the next image waits until it returns.
+        intrinsics: of the images [px], [3, 3] or fx, fy, cx, cy; None = pass them to every ``push_image``.
+        max_wait: longest wait for a pose after an image [s].
+        max_gap: longest interval between the poses around an image, beyond which it is skipped [s].
+        state: file to which ``model.state_dict()`` is written atomically, every ``save_every`` seconds [s] and at the
+            end; None = never. ``model.load_state_dict(torch.load(FILE))`` resumes from it.
         save_every: see ``state``.
 
     Raises:
-        TypeError, ValueError: an argument is impossible.
+        TypeError, ValueError: an argument is invalid.
         FileNotFoundError: the folder of ``state`` does not exist.
 
-    Images of another size or camera than those before start the evidence of ``model``'s anchors afresh. An error of the
-    model, of ``on_result`` or of saving ends the worker; every later ``push_*``, ``reset``, ``wait_idle`` and ``close``
-    raises it.
+    An image of another size or camera resets the evidence of the model's anchors. An error in the model, in
+    ``on_result`` or in saving ends the worker; later calls of ``push_*``, ``reset``, ``wait_idle`` and ``close`` raise
+    it.
     """
 
     def __init__(
@@ -142,24 +142,24 @@ class LiveDepth:
         self._worker.start()
 
     def push_image(self, stamp: float, rgb: ImageLike, intrinsics: CameraLike | None = None) -> None:
-        """Offer an image.
+        """Submit an image.
 
         Args:
-            stamp: moment of its exposure [s], after the image before; an earlier one is skipped and counted.
-            rgb: [H, W, 3] NumPy array or Pillow image, or [3, H, W] tensor, as the model takes it; copied.
+            stamp: time of exposure [s], later than that of the previous image; an earlier image is skipped and counted.
+            rgb: [H, W, 3] NumPy array or Pillow image, or [3, H, W] tensor, as for the model; copied.
             intrinsics: of this image [px], [3, 3] or fx, fy, cx, cy; None: those of the constructor.
 
         Raises:
-            TypeError, ValueError: an argument is impossible, or there are no intrinsics.
+            TypeError, ValueError: an argument is invalid, or there are no intrinsics.
             BaseException: the model or ``on_result`` failed before.
         """
         self._raise()
         received, stamp = perf_counter(), _seconds(stamp)
         if len(as_image(rgb)) != 1:
-            raise ValueError("rgb must be one image: every camera has a LiveDepth of its own")
+            raise ValueError("rgb must be one image: create one LiveDepth per camera")
         K = self._intrinsics if intrinsics is None else as_intrinsics(intrinsics)
         if K is None:
-            raise ValueError("intrinsics of the image are needed: give them here, or once to LiveDepth")
+            raise ValueError("intrinsics of the image are needed: pass them here, or once to LiveDepth")
         image = rgb.clone() if isinstance(rgb, Tensor) else rgb.copy()
         with self._changed:
             self._counts["images"] += 1
@@ -169,22 +169,22 @@ class LiveDepth:
                 self._skip(BACKWARDS, stamp)
             else:
                 self._last_image = stamp
-                if len(self._waiting) == _WAITING:  # the oldest will have its pose first: it stays
+                if len(self._waiting) == _WAITING:  # drop the newest: older images get their poses first
                     self._waiting.pop()
                     self._dropped[NEWER] += 1
                 self._waiting.append(_Waiting(stamp, image, K, received))
                 self._changed.notify_all()
 
     def push_pose(self, stamp: float, T: CameraLike) -> None:
-        """Give the camera's pose at a moment; also late ones, in any order. One with the stamp of an earlier one
-        replaces it.
+        """Submit the camera's pose at a time; poses may come late and in any order. A pose replaces an earlier one with
+        the same stamp.
 
         Args:
             stamp: [s].
-            T: [4, 4] or [3, 4] camera-to-world [m]. With NaN: the position is lost, and images around it are skipped.
+            T: [4, 4] or [3, 4] camera-to-world [m]. NaN: tracking was lost, and images around the stamp are skipped.
 
         Raises:
-            TypeError, ValueError: an argument is impossible, or the pose is finite but not rigid.
+            TypeError, ValueError: an argument is invalid, or the pose is finite but not rigid.
             BaseException: the model or ``on_result`` failed before.
         """
         self._raise()
@@ -202,30 +202,31 @@ class LiveDepth:
 
     @property
     def statistics(self) -> LiveStatistics:
-        """Counts up to now."""
+        """Counts so far."""
         with self._changed:
             counts = {name: self._counts[name] for name in ("images", "poses", "results", "saved", "restarts")}
             return LiveStatistics(**counts, dropped=dict(self._dropped), skipped=dict(self._skipped))
 
     def reset(self) -> None:
-        """Forget views, poses and waiting images: after a loop closure that moved old poses, or a jump of the clock.
-        The model is reset before its next image."""
+        """Drop poses and waiting images, and reset the model before its next image. Call this after a loop closure that
+        moved old poses, or after a jump of the clock."""
         self._raise()
         with self._changed:
             self._drop_waiting(len(self._waiting), NEWER)
             self._times, self._poses, self._last_image, self._resetting = [], [], -math.inf, True
 
     def wait_idle(self, timeout: float | None = None) -> bool:
-        """Wait until no image waits and none is computed, at most ``timeout`` [s] (not in ``on_result``); whether that
-        came true. Raises BaseException: the model or ``on_result`` failed."""
+        """Wait at most ``timeout`` [s] until no image waits or is processed (not in ``on_result``). Returns False after
+        a timeout. Raises BaseException: the model or ``on_result`` failed."""
         with self._changed:
             idle = self._changed.wait_for(lambda: not (self._waiting or self._busy) or self._ended, timeout)
         self._raise()
         return idle
 
     def close(self) -> None:
-        """End after the current image, drop those that wait, save the state. May be called again, and in
-        ``on_result``, which it ends without waiting. Raises BaseException: the model or ``on_result`` failed."""
+        """End after the current image, drop waiting images, save the state. May be called repeatedly, and in
+        ``on_result``, where it does not wait for the worker. Raises BaseException: the model or ``on_result``
+        failed."""
         self._end()
         self._raise()
 
@@ -271,7 +272,7 @@ class LiveDepth:
             self._save()
 
     def _next(self) -> tuple[_Waiting, np.ndarray, bool] | None:
-        """The next image, its pose, and whether to reset the model before, as soon as there is one; None = the end."""
+        """Wait for the next image; returns it, its pose, and whether to reset the model first. None = the end."""
         with self._changed:
             self._busy = False
             while not self._ending:
@@ -286,7 +287,7 @@ class LiveDepth:
             return None
 
     def _choose(self, now: float) -> tuple[_Waiting, np.ndarray] | None:
-        """The newest image that need not wait any longer and its pose; older ones are dropped."""
+        """The newest image that needs no further wait, and its pose; drops older images."""
         latest = self._times[-1] if self._times else -math.inf
         for n in reversed(range(len(self._waiting))):
             frame = self._waiting[n]
@@ -311,7 +312,7 @@ class LiveDepth:
         return interpolate_pose(trajectory, stamp, self._max_gap)
 
     def _process(self, frame: _Waiting, T: np.ndarray, resetting: bool) -> bool:
-        """Predict and deliver an image; whether the state has changed."""
+        """Predict and deliver an image. Returns whether the state has changed."""
         if resetting:
             self.model.reset()
         started = perf_counter()
@@ -341,21 +342,21 @@ class LiveDepth:
                 self._counts["saved"] += 1
 
     def _skip(self, reason: str, stamp: float) -> None:
-        """Count an image that cannot be used; the first one for each reason is logged with the times of the poses."""
+        """Count an unusable image; logs the first one for each reason with the time range of the poses."""
         self._skipped[reason] += 1
         if self._skipped[reason] == 1:
             span = f"{self._times[0]:.3f} to {self._times[-1]:.3f} s" if self._times else "none"
-            LOGGER.warning("image at %.3f s skipped: %s (poses: %s; said once)", stamp, reason, span)
+            LOGGER.warning("image at %.3f s skipped: %s (poses: %s; logged once)", stamp, reason, span)
 
     def _drop_waiting(self, count: int, reason: str) -> None:
-        """Drop the ``count`` oldest images that wait."""
+        """Drop the ``count`` oldest waiting images."""
         del self._waiting[:count]
         if count:
             self._dropped[reason] += count
 
 
 def _seconds(stamp: float) -> float:
-    """A finite stamp. Raises TypeError, ValueError: it is none."""
+    """The stamp as a float. Raises TypeError, ValueError: not a finite number in seconds, exact to 1 ms."""
     if isinstance(stamp, bool) or not isinstance(stamp, float | int | np.floating | np.integer):
         raise TypeError(f"stamp must be a number of seconds, got {type(stamp).__name__}")
     exact = stamp.item() if isinstance(stamp, np.generic) else stamp

@@ -1,29 +1,30 @@
-"""Fewer components that read back the same map: an extension, not in the paper (``config.merge``).
+"""Reduction of the mixture with little change to the regressed map: an extension, not in the paper (``config.merge``).
 
-Components are only ever added, and a surface that every view cuts in another way collects dozens of them. From time to
-time two rules reduce the mixture; both are pure functions of it and need no history.
+The paper's method only adds components, and a surface that each view segments differently collects dozens of them.
+Every ``merge.every`` frames, two rules reduce the mixture; both are pure functions of it.
 
-**Join.** Two components become one with their common moments,
+**Join.** Two components become one with their joint moments,
 
     pi = pi_i + pi_j,   a = pi_i / pi,   mu = a mu_i + (1-a) mu_j,   m = a m_i + (1-a) m_j, features likewise,
     Sigma = a Sigma_i + (1-a) Sigma_j + a (1-a) (mu_i - mu_j)(mu_i - mu_j)^T,
 
-so that the sums of pi, pi mu, pi (Sigma + mu mu^T) and pi m over the mixture stay. Runnalls (IEEE TAES 43, 2007) bounds
-the Kullback-Leibler divergence of the reduced mixture from the former one; per pixel of the lighter component it is
+which preserve the sums of pi, pi mu, pi (Sigma + mu mu^T) and pi m over the mixture. Runnalls (IEEE TAES 43, 2007)
+bounds the Kullback-Leibler divergence of the reduced mixture from the original; per pixel of the lighter component, the
+bound is
 
     l(i, j) = [log|Sigma| - a log|Sigma_i| - (1-a) log|Sigma_j|] / (2 min(a, 1-a))   [nat],
 
-0 for equal components and KL(lighter || heavier) where the lighter one weighs nothing. A pair within ``merge.loss``
-overlaps so far that the regression mixed the two in any case. In each round those join who are each other's best.
+0 for equal components and KL(lighter || heavier) in the limit of a weightless lighter one. A pair within ``merge.loss``
+overlaps so much that the regression mixes the two anyway. In each round, pairs join that are mutually best.
 
-A component seen from two views or more does not join a heavier one that was seen from one view: what was not measured
-would read as measured. Of the counts c, c - 1 comparisons each stay: c = c_i + c_j - 1.
+A component seen from two or more views does not join a heavier one that was seen from one view, because the unmeasured
+surface would then count as measured. The count is c = c_i + c_j - 1, which preserves the number of comparisons c - 1.
 
-**Dissolve.** The share that a component has in explaining its own points, s_k = mean of w_k(x) over the cubature points
-mu_k +- sqrt(3) L_k e_i (L_k L_k^T = Sigma_k), falls while others are observed again and again. Without it a regressed
-quantity changes at these points by s_k times its difference to the others. Where s_k < ``merge.share``, and
-those that stay explain the rest, its weight, its m and features with it, and the anchors' sums go to those that stay by
-their shares at these points. Their means and covariances stay.
+**Dissolve.** A component's weight share at its own points, s_k = mean of w_k(x) over the cubature points
+mu_k +- sqrt(3) L_k e_i (L_k L_k^T = Sigma_k), falls as others are observed repeatedly. Removing it changes a regressed
+quantity at these points by s_k times its difference to the others. Where s_k < ``merge.share`` and the remaining
+components have the rest of the weight, they receive its weight, m, features and anchors' sums, in proportion to their
+shares at these points. Their means and covariances do not change.
 """
 
 from __future__ import annotations
@@ -45,20 +46,20 @@ from ufmstar_torch.output import StepOutput
 from ufmstar_torch.regress import shares
 from ufmstar_torch.state import UfMStarState
 
-# Pairs, and points x components, evaluated at a time: bounds the temporary memory to some 100 MB.
+# Most pairs, or points x components, evaluated at a time: bounds the temporary memory to some 100 MB.
 _CHUNK = 2**19
-# Cubature points mu +- sqrt(3) L e_i: their mean and covariance are the component's.
+# Cubature points mu +- sqrt(3) L e_i, which have the component's mean and covariance.
 _POINTS = 6
 _REACH = 3**0.5
-# A component's density at a point is left out below this share of the point's own density: K of them change a share
-# by less than K times this.
+# A component is omitted at another's point if its density is below this share of the other's density there. K omitted
+# components change a share by less than K times this.
 _LEAST_SHARE = 1e-9
 # The components of one stream: the fields of its mixture and "sums" [n, C], in float64.
 Components = dict[str, Tensor]
 
 
 class MergeExtension(Extension):
-    """Merging every some frames. ``config``: with ``merge``."""
+    """Merging every ``merge.every`` frames. ``config``: with ``merge``."""
 
     def __init__(self, config: UfMStarConfig) -> None:
         self._config = config
@@ -85,19 +86,21 @@ class _MergeFrame(FrameExtension):
         self._frame, self._config = frame, config
 
     def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
-        """Merge the streams that are due, and count the components."""
+        """Merge the due streams, and count the components."""
         state = merged(state, self._frame.fault == 0, self._config)
         counts = {"components": state.mixture.components, "single_view": (state.count == 1).sum(1)}
         return state, replace(out, statistics=replace(out.statistics, **counts))
 
 
 def merged(state: UfMStarState, fine: Tensor, config: UfMStarConfig) -> UfMStarState:
-    """The state after a frame, merged every ``merge.every`` frames of a stream.
+    """The state after a frame, with the streams merged whose frame count is a multiple of ``merge.every``.
 
     Args:
         state: of B streams, after the step.
         fine: [B] True where the frame was used.
-        config: with ``merge``. Checking which streams are due waits for an accelerator.
+        config: with ``merge``.
+
+    Checking which streams are due synchronises with an accelerator.
     """
     assert config.merge is not None
     if state.mean.device.type == "meta":
@@ -112,16 +115,17 @@ def merged(state: UfMStarState, fine: Tensor, config: UfMStarConfig) -> UfMStarS
 
 
 def merge(mixture: GaussianMixture, sums: Tensor, due: Tensor, config: UfMStarConfig) -> tuple[GaussianMixture, Tensor]:
-    """Join, then dissolve; the components that are left move up and keep their order.
+    """Join, then dissolve; the remaining components move up and keep their order.
 
     Args:
         mixture: [B, K] in any frame: both rules are rigid invariants up to the choice of the cubature points.
-        sums: [B, K, C] of observations beside it.
-        due: [B] the streams to merge; the others stay as they are.
+        sums: [B, K, C] sums over the observations of each component.
+        due: [B] True for the streams to merge; the others are unchanged.
         config: ``merge``, which is not None, and ``prior_weight``.
 
     Returns:
-        The mixture [B, K] and the sums. What neither joined nor received anything is unchanged to the last bit.
+        The mixture [B, K] and the sums. Components that neither joined nor received anything are unchanged to the last
+        bit.
     """
     assert config.merge is not None
     every = mixture.tensors() | {"sums": sums}
@@ -129,8 +133,8 @@ def merge(mixture: GaussianMixture, sums: Tensor, due: Tensor, config: UfMStarCo
     for b in due.nonzero().flatten().tolist():
         n = int(mixture.components[b])
         before = {name: v[b, :n].double() if v.is_floating_point() else v[b, :n] for name, v in every.items()}
-        left = dissolve(join(before, config.merge.loss, mixture.covariance.dtype), config)
-        for name, value in left.items():
+        reduced = dissolve(join(before, config.merge.loss, mixture.covariance.dtype), config)
+        for name, value in reduced.items():
             after[name][b] = 0
             after[name][b, : len(value)] = value.to(after[name].dtype)
     sums = after.pop("sums")
@@ -138,12 +142,12 @@ def merge(mixture: GaussianMixture, sums: Tensor, due: Tensor, config: UfMStarCo
 
 
 def join(g: Components, limit: float, stored: torch.dtype) -> Components:
-    """Join those who are each other's best, in rounds, until no pair is within the limit; the former of a pair stays.
+    """Join mutually best pairs, in rounds, until no pair is within the limit; the first of a pair holds the result.
 
     Args:
         g: n components.
         limit: largest loss l of a pair [nat].
-        stored: dtype whose rounding the joint covariances must survive.
+        stored: dtype to which the joint covariances will be rounded.
     """
     n = len(g["weight"])
     fresh = torch.ones(n, dtype=torch.bool, device=g["weight"].device)
@@ -158,28 +162,29 @@ def join(g: Components, limit: float, stored: torch.dtype) -> Components:
         first, second = ({name: value[which] for name, value in g.items()} for which in (stays, goes))
         common = _joint(first, second)
         fresh = torch.zeros_like(fresh).index_fill(0, stays, True)
-        left = torch.ones_like(fresh).index_fill(0, goes, False)
-        g = {name: value.index_copy(0, stays, common[name])[left] for name, value in g.items()}
-        same = (left & ~fresh)[pairs].all(0)
-        pairs, loss = (left.cumsum(0) - 1)[pairs[:, same]], loss[same]
-        joined, fresh = (joined | fresh)[left], fresh[left]
+        remains = torch.ones_like(fresh).index_fill(0, goes, False)
+        g = {name: value.index_copy(0, stays, common[name])[remains] for name, value in g.items()}
+        same = (remains & ~fresh)[pairs].all(0)
+        pairs, loss = (remains.cumsum(0) - 1)[pairs[:, same]], loss[same]
+        joined, fresh = (joined | fresh)[remains], fresh[remains]
     covariance = g["covariance"][joined]
     floored = floor_covariance(covariance, storage_floor(covariance, stored))
     return g | {"covariance": g["covariance"].index_copy(0, joined.nonzero().flatten(), floored)}
 
 
 def _close_pairs(g: Components, fresh: Tensor, limit: float) -> tuple[Tensor, Tensor]:
-    """Pairs i < j [2, P] within the limit of which one is ``fresh`` [n], and their losses [P].
+    """Pairs i < j [2, P] within the limit with at least one ``fresh`` [n] component, and their losses [P].
 
-    log|Sigma| >= a log|Sigma_i| + b log|Sigma_j| + log(1 + a b q) with q >= d_x^2 / (a Sigma_i + b Sigma_j)_xx for
-    every axis, so l > limit where q > (exp(2 min(a, b) limit) - 1) / (a b), which is at most 4 (exp(limit) - 1).
+    A bound excludes most pairs without their determinant: log|Sigma| >= a log|Sigma_i| + b log|Sigma_j| +
+    log(1 + a b q) with q >= d_x^2 / (a Sigma_i + b Sigma_j)_xx for every axis, so l > limit where
+    q > (exp(2 min(a, b) limit) - 1) / (a b), which is at most 4 (exp(limit) - 1).
     """
     slot = torch.arange(len(fresh), device=fresh.device)
     reach, weight, mean = 4 * math.expm1(limit) * (1 + 1e-9), g["weight"], g["mean"]
     spread, log_det = torch.diagonal(g["covariance"], dim1=-2, dim2=-1), _log_det(g["covariance"])
     found = [(slot[:0].expand(2, 0), weight[:0])]
     for i in slot[fresh].split(max(1, _CHUNK // max(1, len(fresh)))):
-        close = ~fresh | (slot > i[:, None])  # once, if both are
+        close = ~fresh | (slot > i[:, None])  # a pair of two fresh components once
         share = weight[i, None] / (weight[i, None] + weight)
         for axis in range(3):
             variance = share * spread[i, None, axis] + (1 - share) * spread[:, axis]
@@ -199,7 +204,7 @@ def _close_pairs(g: Components, fresh: Tensor, limit: float) -> tuple[Tensor, Te
 
 
 def _mutual(pairs: Tensor, loss: Tensor, n: int) -> Tensor:
-    """[P] True where the two of a pair are each other's best: the least loss, and of equal ones the first partner."""
+    """[P] True for mutually best pairs; a component's best partner has the least loss, on a tie the lowest index."""
     ends, others, twice = pairs.flatten(), pairs.flip(0).flatten(), loss.repeat(2)
     best = loss.new_full((n,), torch.inf).scatter_reduce(0, ends, twice, "amin")
     others = torch.where(twice == best[ends], others, n)
@@ -214,7 +219,7 @@ def _parts(g: Components, h: Components) -> tuple[Tensor, Tensor]:
 
 
 def _joint(g: Components, h: Components) -> Components:
-    """The components with the common moments of pairs."""
+    """The components with the joint moments of pairs."""
     a, b = _parts(g, h)
 
     def average(name: str) -> Tensor:
@@ -241,15 +246,16 @@ def _log_det(S: Tensor) -> Tensor:
     return torch.log(p0 * p1 * p2)
 
 
-def own_shares(g: Components, prior_weight: float) -> Tensor:
-    """[n] s_k, each component's share in explaining its own cubature points, with the exact sum over the components."""
+def self_shares(g: Components, prior_weight: float) -> Tensor:
+    """[n] s_k, each component's mean weight share at its own cubature points, by the exact sum over the components."""
     mean, points, whitening = g["mean"], _cubature(g), inverse_lower3(cholesky3(g["covariance"]))
     sigma = torch.diagonal(g["covariance"], dim1=-2, dim2=-1).sqrt()
     log_peak = torch.diagonal(whitening, dim1=-2, dim2=-1).log().sum(-1) - 1.5 * math.log(2 * math.pi)
     log_peak = log_peak + g["weight"].log()
     evidence = mean.new_full((len(mean), _POINTS), prior_weight)
     for i in torch.arange(len(mean), device=mean.device).split(max(1, _CHUNK // max(1, len(mean)))):
-        # The own density is peak exp(-3/2) at all six points; the radius [1] at which another falls below its share.
+        # Component i has the density peak exp(-3/2) at its six points. Beyond ``radius`` standard deviations, the
+        # density of another component falls below _LEAST_SHARE of that.
         radius = (2 * (log_peak - log_peak[i, None] + 1.5 - math.log(_LEAST_SHARE))).clamp_min(0).sqrt()
         near = torch.ones_like(radius, dtype=torch.bool)
         for axis in range(3):
@@ -276,9 +282,9 @@ def _mean_shares(g: Components, points: Tensor, config: UfMStarConfig) -> Tensor
 
 
 def dissolve(g: Components, config: UfMStarConfig) -> Components:
-    """The components without those that others explain."""
+    """Remove the components whose share at their own points is small, and distribute their sums to the others."""
     assert config.merge is not None
-    weak = own_shares(g, config.prior_weight) < config.merge.share
+    weak = self_shares(g, config.prior_weight) < config.merge.share
     if not bool(weak.any()):
         return g
     share = _mean_shares(g, _cubature(g)[weak], config) * ~weak
@@ -298,5 +304,5 @@ def dissolve(g: Components, config: UfMStarConfig) -> Components:
         "features": values[:, 1:],
         "sums": g["sums"] + learnt,
     }
-    left = torch.ones_like(weak).index_fill(0, goes, False)
-    return {name: value[left] for name, value in after.items()}
+    remains = torch.ones_like(weak).index_fill(0, goes, False)
+    return {name: value[remains] for name, value in after.items()}

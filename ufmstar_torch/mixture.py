@@ -17,7 +17,7 @@ class GaussianMixture:
     """B unnormalised mixtures of at most K components. A slot of weight 0 is empty and holds zeros.
 
     Attributes:
-        mean: [B, K, 3] mu_X [m], in the frame that the owner states (``mean_cam``, first camera, ...).
+        mean: [B, K, 3] mu_X [m], in the frame that the variable's name states (``mixture_cam``: the camera's).
         covariance: [B, K, 3, 3] Sigma_XX [m^2], symmetric.
         weight: [B, K] pi, the number of pixels observed so far [px]; 0 = empty slot.
         disagreement: [B, K] m, the running squared 2-Wasserstein distance [m^2].
@@ -51,7 +51,7 @@ class GaussianMixture:
 
     @property
     def capacity(self) -> int:
-        """K, occupied or not."""
+        """K, the number of slots."""
         return self.mean.shape[1]
 
     @property
@@ -73,7 +73,7 @@ class GaussianMixture:
         return dict(vars(self))
 
     def replace(self, **changes: Tensor) -> GaussianMixture:
-        """A copy with some fields exchanged."""
+        """A copy with some fields replaced."""
         return GaussianMixture(**{**self.tensors(), **changes})
 
     def to(self, *args: Any, **kwargs: Any) -> GaussianMixture:
@@ -88,7 +88,7 @@ class GaussianMixture:
         mu <- R mu + t, Sigma <- R Sigma R^T; empty slots stay zero.
 
         Args:
-            R: [B, 3, 3] rotation from the present frame into the new one.
+            R: [B, 3, 3] rotation from the current frame into the new one.
             t: [B, 3] translation [m].
         """
         mean = apply(R[:, None], self.mean) + t[:, None]

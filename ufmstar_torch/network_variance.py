@@ -1,4 +1,4 @@
-"""V = M + A + E (section "Uncertainty Regression"), with the network's A and E as far as the config counts them."""
+"""V = M + A + E (section "Uncertainty Regression"), with the network's A and E that the config adds."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ufmstar_torch.frame import FrameInput
 
 @dataclass(frozen=True)
 class NetworkVariance:
-    """A and E at some pixels, alike in shape [m^2]; None = not predicted, or not counted."""
+    """A and E at some pixels, of equal shape [m^2]; None = not predicted, or not added."""
 
     aleatoric: Tensor | None
     epistemic: Tensor | None
@@ -24,12 +24,12 @@ class NetworkVariance:
         return cls(frame.aleatoric if config.add_aleatoric else None, frame.epistemic if config.add_epistemic else None)
 
     def maps(self) -> list[Tensor]:
-        """A and E as far as they count."""
+        """A and E, without those that are None."""
         return [value for value in (self.aleatoric, self.epistemic) if value is not None]
 
     def at(self, chosen: Chosen, features: Tensor, config: UfMStarConfig) -> NetworkVariance:
-        """At the regressed pixels, with their features [..., F]. With ``config.aleatoric_in_h`` the last two are A of
-        the mixture and how far it explains the pixel: the rest is the pixel's own A."""
+        """A and E at the regressed pixels, whose features are [..., F]. With ``config.aleatoric_in_h`` the last two
+        features are the mixture's A and its weight share s; A is then that plus (1 - s) times the pixel's A."""
         a, e = (None if value is None else chosen(value) for value in (self.aleatoric, self.epistemic))
         if a is not None and config.aleatoric_in_h:
             mixed, explained = features[..., -2:].unbind(-1)

@@ -1,8 +1,8 @@
-"""Online training: whether to train on an image, from what is known of it before it has a label.
+"""Online training: decides before an image is labelled whether to train on it.
 
-The paper's application (section "Introduction"; DecTrain, Fu et al.): a robot labels and trains where that pays. The
-gain of an update is predicted from statistics of the image by linear regression, which learns from the updates that
-were made; nothing is trained beforehand.
+The paper's application (section "Introduction"; DecTrain, Fu et al.): a robot labels and trains where the gain exceeds
+the cost. A linear regression predicts the gain of an update from statistics of the image. It learns online from the
+gains of past updates.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ufmstar_torch.output import MeanUncertainty, SampleStatistics
 
-_TINY = 1e-6  # [m^2]; below it a variance is nothing beside any depth error
+_TINY = 1e-6  # [m^2]; a smaller variance is negligible
 
 
 def image_statistics(result: MeanUncertainty, motion: Tensor) -> Tensor:
@@ -23,11 +23,11 @@ def image_statistics(result: MeanUncertainty, motion: Tensor) -> Tensor:
 
     Args:
         result: of the image, B = 1.
-        motion: [4, 4] the camera's pose relative to the image trained on last, or to the image before [m].
+        motion: [4, 4] the camera's pose relative to the last image trained on, or to the previous image [m].
 
     Returns:
-        [F] float64: the logarithms of mean, standard deviation, median and maximum of V, M, A, E, B and depth (as far
-        as network and config have them), the share of M that was measured, the camera's translation relative to the
+        [F] float64: the logarithms of mean, standard deviation, median and maximum of V, M, A, E, B and depth (those
+        that network and config have), the share of pixels with a measured M, the camera's translation relative to the
         mean depth and its rotation [rad], and the share of pixels with a landmark.
 
     Raises:
@@ -51,19 +51,19 @@ def _logarithms(part: SampleStatistics) -> list[float]:
 
 
 class TrainDecision:
-    """Trains on an image where the expected gain of the update exceeds its cost.
+    """Decides to train on an image where the expected gain of the update exceeds its cost.
 
-    Ridge regression of the gain on the image's statistics, both standardised by their running mean and deviation; old
-    updates fade, as the network changes by them. What the regression does not know counts in favour of training: the
-    prediction's standard error is added.
+    Ridge regression of the gain on the image's statistics, both standardised by their running mean and deviation, with
+    exponential forgetting, as the network changes. The standard error of the prediction is added to it, which favours
+    exploration.
 
     Args:
         cost: of an update (a label and a training step), in the unit of the gain.
-        first: so many images are trained on in any case.
+        first: number of images to train on before the regression decides.
         half_life: updates after which an update counts half.
 
     Attributes:
-        updates: number of gains that were learnt.
+        updates: number of observed gains.
 
     Example::
 
@@ -78,36 +78,36 @@ class TrainDecision:
     def __init__(self, cost: float, *, first: int = 8, half_life: float = 64.0) -> None:
         if not math.isfinite(cost) or first < 2 or not half_life > 0:
             raise ValueError(f"cost must be finite, first at least 2, half_life positive: {cost}, {first}, {half_life}")
-        self.cost, self.first, self.updates, self._keep = cost, first, 0, 0.5 ** (1 / half_life)
-        self._sums = torch.zeros(0, 0, dtype=torch.float64)  # of z z^T with z = (1, statistics, gain), fading
+        self.cost, self.first, self.updates, self._decay = cost, first, 0, 0.5 ** (1 / half_life)
+        self._sums = torch.zeros(0, 0, dtype=torch.float64)  # decaying sum of z z^T with z = (1, statistics, gain)
 
     def __call__(self, statistics: Tensor) -> bool:
-        """True if an image with these statistics [F] is worth training on."""
+        """True if training on an image with these statistics [F] is expected to pay."""
         if self.updates < self.first:
             return True
         gain, error = self.expected(statistics)
         return gain + error > self.cost
 
     def learn(self, statistics: Tensor, gain: float) -> None:
-        """Take in the gain of an update on an image: by how much the loss fell.
+        """Learn from the gain of an update on an image, the decrease of the loss.
 
         Raises:
             ValueError: another number of statistics than before, or a value that is not finite.
         """
         z = torch.cat([torch.ones(1), self._checked(statistics), torch.tensor([gain], dtype=torch.float64)])
         if not bool((squares := z.outer(z)).isfinite().all()):
-            raise ValueError(f"gain and statistics must be finite, and so their squares, got {z[1:].tolist()}")
-        self._sums = self._keep * (self._sums if len(self._sums) else torch.zeros_like(squares)) + squares
+            raise ValueError(f"gain and statistics must be finite, also their squares, got {z[1:].tolist()}")
+        self._sums = self._decay * (self._sums if len(self._sums) else torch.zeros_like(squares)) + squares
         self.updates += 1
 
     def expected(self, statistics: Tensor) -> tuple[float, float]:
         """The expected gain of an update on an image with these statistics [F], and its standard error.
 
         Raises:
-            ValueError: as :meth:`learn`, or nothing was learnt yet.
+            ValueError: as :meth:`learn`, or :meth:`learn` was never called.
         """
         if not self.updates:
-            raise ValueError("an expected gain needs learn() before")
+            raise ValueError("expected needs at least one gain: call learn() first")
         statistics = self._checked(statistics)
         n, mean = self._sums[0, 0], self._sums[0, 1:] / self._sums[0, 0]
         covariance = self._sums[1:, 1:] / n - mean.outer(mean)
@@ -121,9 +121,9 @@ class TrainDecision:
         return float(mean[-1] + scale[-1] * (x @ weights)), float(scale[-1] * spread)
 
     def _checked(self, statistics: Tensor) -> Tensor:
-        """[F] float64. Raises ValueError: not as many as before, or not finite."""
+        """The statistics as [F] float64. Raises ValueError: another F than before, or values that are not finite."""
         values, size = statistics.detach().flatten().double(), len(self._sums) - 2
         if not bool(values.isfinite().all()) or size not in (-2, len(values)):
-            expected = size if size > 0 else "some"
-            raise ValueError(f"statistics must be {expected} finite values as before, got {values.tolist()}")
+            expected = f"{size} finite values as before" if size > 0 else "finite values"
+            raise ValueError(f"statistics must be {expected}, got {values.tolist()}")
         return values

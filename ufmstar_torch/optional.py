@@ -1,11 +1,11 @@
-"""Packages that are not always installed, imported where they are first needed."""
+"""Import of optional packages, with errors that name the extra to install."""
 
 from __future__ import annotations
 
 from importlib import import_module
 from typing import Any
 
-# By the name under which a package is imported, the extra of ``ufmstar-torch`` that brings it.
+# By import name: the extra of ``ufmstar-torch`` that installs the package.
 EXTRAS = {
     **dict.fromkeys(("torchvision", "onnx", "onnxruntime", "safetensors", "transformers"), "models"),
     **dict.fromkeys(("filelock", "torchmetrics", "scipy", "cv2", "imageio", "imageio_ffmpeg", "kornia_rs"), "eval"),
@@ -20,8 +20,8 @@ EXTRAS = {
 
 
 def optional(module: str, need: str, install: str) -> Any:
-    """The module. Raises ModuleNotFoundError: it is not installed; the message states the ``need`` ("pictures need
-    matplotlib") and what pip has to ``install``."""
+    """Import a module. Raises ModuleNotFoundError: it is not installed; the message states the ``need`` ("pictures need
+    matplotlib") and the package to ``install``."""
     try:
         return import_module(module)
     except ModuleNotFoundError as error:
@@ -29,7 +29,7 @@ def optional(module: str, need: str, install: str) -> Any:
 
 
 def naming_extra(error: BaseException, who: str) -> BaseException:
-    """An error of ``who``; of a missing package, with the extra that brings it."""
+    """The error; if a package is missing, one that names the extra that ``who`` needs."""
     package = (getattr(error, "name", None) or "").partition(".")[0]
     if not isinstance(error, ModuleNotFoundError) or package not in EXTRAS:
         return error

@@ -20,32 +20,33 @@ class FrameStatistics:
         pairs: fused (c, k) pairs.
         new: segments appended to the mixture.
         dropped: components that were dropped because ``max_components`` was reached, the farthest first; and segments
-            nearer than the near plane, which are not remembered.
+            nearer than the near plane, which are not appended.
         valid_pixels: pixels used.
         beyond: pixels not used because their depth is beyond ``config.segment.max_depth``.
-        out_of_range: further pixels with a finite positive depth that are not used: depth, A, E or features outside the
-            ranges that ``UfMStar.forward`` states.
-        unmeasured: of the pixels used (with a subset, of those regressed), where M rests by less than half on surfaces
-            seen from two views or more; what they get is ``config.unmeasured``.
-        single_view: components that one frame alone has seen. Close to all of ``components`` after some frames: hardly
-            anything is compared between views, and the logger ``ufmstar_torch`` has named likely causes.
+        out_of_range: other pixels with a finite positive depth that are not used, because depth, A, E or features lie
+            outside the ranges of ``UfMStar.forward``.
+        unmeasured: pixels used (with a subset, pixels regressed) where less than half of M rests on surfaces seen from
+            two or more views; ``config.unmeasured`` decides their M.
+        single_view: components seen by only one frame. If it stays close to ``components``, hardly anything is compared
+            between views; the logger ``ufmstar_torch`` then lists likely causes.
         fault: index into ``ufmstar_torch.frame.FRAME_FAULTS``; not 0 = the frame was skipped.
         rotation_deviation: max |R^T R - I| of the pose, removed by projection onto SO(3).
-        anchors: with ``config.anchors``, given and usable; 0 for a standing camera, say. None without.
-        anchors_used: of those, no gross outliers. 0 = nothing new was learnt: M + A + E is plain UfM*'s and B what had
-            been learnt before, which at the start is nothing.
-        anchors_rejected: those that are off from the prediction by more than a factor of 100. Where they are the most,
-            they show an error, by which the variance is widened.
-        pose_error: by how much poses and images disagree: standard deviation of tracked corners from their epipolar
-            lines [px] of the image that was searched; NaN = not measured, None = no source of anchors measures it.
-            Without anchors no image is searched, which would cost as much as the step: a run measures some pairs of
-            frames instead (``image_fit`` of its summary).
-        calibration: with ``config.posterior``, mean z^2 of held-out anchors lately: 1 = the posterior is off by as much
-            as it states, more = it is too certain. NaN before any; None without.
-        unseen: likewise, variance of log g/d that held-out anchors show for surfaces far from all anchors: large where
-            evidence covers little of what the camera sees.
-        confidence: with ``config.confidence``, by how much the network's confidence makes held-out anchors likelier,
-            less the standard error [nat]; at most 0 = it is ignored, -inf = not judged yet. None without.
+        anchors: usable anchors (0, for example, while the camera stands still). None without ``config.anchors``.
+        anchors_used: usable anchors without gross outliers. If 0, the frame adds no evidence: B follows from earlier
+            frames, and is 0 at the start.
+        anchors_rejected: anchors that differ from the prediction by more than a factor of 100. If they are the
+            majority, they count as an error of the prediction and widen the variance.
+        pose_error: disagreement of poses and images: standard deviation of tracked corners from their epipolar lines
+            [px] of the searched image; NaN = not measured, None = no source of anchors measures it. Without anchors
+            it is not measured, because the search costs as much as the step; a run measures some pairs of frames
+            instead (``image_fit`` of its summary).
+        calibration: running mean of z^2 of held-out anchors: 1 = the posterior variance matches the errors, more = it
+            is too small. NaN before any anchor; None without ``config.posterior``.
+        unseen: likewise, variance of log g/d at held-out anchors on surfaces far from all other anchors; large where
+            the evidence covers little of the image.
+        confidence: gain of the network's confidence in log likelihood of held-out anchors, less its standard error
+            [nat]. The confidence is ignored where it is at most 0; -inf = too few frames. None without
+            ``config.confidence``.
     """
 
     components: Tensor
@@ -70,7 +71,7 @@ class FrameStatistics:
     confidence: Tensor | None = None
 
     def __repr__(self) -> str:
-        """The counts of every stream that are not 0, in a line."""
+        """The counts that are not 0, in one line."""
         names = (f.name for f in fields(self) if f.name != "rotation_deviation")
         counts = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         shown = [f"{name}={_short(value)}" for name, value in counts.items() if _any(value)]
@@ -79,12 +80,12 @@ class FrameStatistics:
 
 @dataclass(frozen=True)
 class StepOutput:
-    """The regressed disagreement and what led to it.
+    """The regressed maps, segments and counts of a step.
 
     Attributes:
         disagreement: M [B, H, W] [m^2] after the moving average, NaN where not valid; [B, n] on a subset.
         features: regressed features [B, H, W, F] or [B, n, F].
-        measured: [B, H, W] or [B, n] share in [0, 1] of M that rests on surfaces seen from two views or more.
+        measured: [B, H, W] or [B, n] share in [0, 1] of M that rests on surfaces seen from two or more views.
         current_cam: C_i in the camera frame.
         statistics: of this frame.
     """
@@ -98,24 +99,24 @@ class StepOutput:
 
 @dataclass(frozen=True, repr=False)
 class UfMStarOutput:
-    """The prediction of one frame with its variance. Maps have the layout in which ``depth`` was given.
+    """The prediction of one frame with its variance. Maps have the shape of the argument ``depth``.
 
     Attributes:
-        depth: the depth as given [m].
-        variance: V, the total variance of the depth [m^2]: M, plus A and E where given (and not switched
-            off in the config) and B with ``config.anchors``, at least ``config.variance_floor``. NaN where not valid.
+        depth: the argument ``depth`` [m].
+        variance: V, the total variance of the depth [m^2]: M, plus A and E if passed (and not switched off in the
+            config), plus B with ``config.anchors``; at least ``config.variance_floor``. NaN where not valid.
         disagreement: M, the multiview disagreement [m^2]. NaN where not valid.
-        aleatoric, epistemic: A and E as given [m^2], or None; with ``config.aleatoric_in_h`` A of the mixture.
-        anchored: B, the mean square error that anchors found beyond M + A + E [m^2] (``evidence``); None unless
+        aleatoric, epistemic: the arguments A and E [m^2], or None; with ``config.aleatoric_in_h`` A of the mixture.
+        anchored: B, the mean square error at anchors in excess of M + A + E [m^2] (``evidence``); None unless
             ``config.anchors``.
-        bias: the relative error r = g/d - 1 that anchors lead to expect; None unless ``config.anchors``.
-        posterior_depth, posterior_variance: what :meth:`posterior` returns; None unless ``config.posterior``.
+        bias: the relative error r = g/d - 1 that anchors predict; None unless ``config.anchors``.
+        posterior_depth, posterior_variance: the results of :meth:`posterior`; None unless ``config.posterior``.
         posterior_outlier: probability p that the pixel lies on another surface than the anchors that corrected it. NaN
-            before any anchor; None likewise.
-        posterior_inlier_variance: V_1 [m^2], the variance if it does not. ``posterior_variance`` V contains both: where
-            it does, the variance is (V - (1 - p) V_1)/p.
+            before any anchor; None unless ``config.posterior``.
+        posterior_inlier_variance: V_1 [m^2], the variance if it lies on their surface. ``posterior_variance`` V is that
+            of the mixture: on another surface, the variance is (V - (1 - p) V_1)/p.
         features: regressed further entries of H, [B, H, W, F], in the caller's units.
-        measured: share in [0, 1] of M that rests on surfaces seen from two views or more; below one half the pixel
+        measured: share in [0, 1] of M that rests on surfaces seen from two or more views; below one half the pixel
             counts as not measured (``config.unmeasured``). NaN where not valid.
         valid: True where the pixel was used.
         current_cam: C_i, the segments of this frame in the camera frame, float64.
@@ -140,7 +141,7 @@ class UfMStarOutput:
     posterior_inlier_variance: Tensor | None = None
 
     def __repr__(self) -> str:
-        """Shape, median standard deviation and counts in a line."""
+        """Shape, median standard deviation and counts in one line."""
         std = "" if self.variance.device.type == "meta" else f", median std {float(self.std.nanmedian()):.3g} m"
         return f"UfMStarOutput({' x '.join(map(str, self.variance.shape))}{std}, {self.statistics!r})"
 
@@ -153,7 +154,7 @@ class UfMStarOutput:
         """p(depth | network, UfM*, anchors): depth [m] and its variance [m^2], NaN where not valid
         (``ufmstar_torch.posterior``).
 
-        Before the first anchor these are ``depth`` and ``variance``, to the bit.
+        Before the first anchor they equal ``depth`` and ``variance`` to the last bit.
 
         Raises:
             ValueError: without ``config.posterior``.
@@ -165,10 +166,10 @@ class UfMStarOutput:
 
 @dataclass(frozen=True)
 class SampleStatistics:
-    """Statistics of a map over the pixels of an image that have a value, per stream [B]; NaN without any.
+    """Statistics of a map over the pixels of an image with a value, per stream [B]; NaN if there are none.
 
     Attributes:
-        mean, median, maximum: in the unit of the map; of an even number of pixels, the lower of the two middle ones.
+        mean, median, maximum: in the unit of the map; for an even number of pixels, the lower of the two middle values.
         variance: between the pixels, in the unit squared; NaN with fewer than two.
         pixels: number of pixels with a value.
     """
@@ -182,19 +183,19 @@ class SampleStatistics:
 
 @dataclass(frozen=True, repr=False)
 class MeanUncertainty:
-    """Averages over a sample of an image's pixels, per stream [B]: of V, and of each of its parts.
+    """Averages of V and of its parts over a sample of an image's pixels, per stream [B].
 
     Attributes:
-        total: V [m^2], with ``config.unmeasured="nan"`` over the pixels that are measured.
+        total: V [m^2]; with ``config.unmeasured="nan"`` only over measured pixels.
         disagreement: M [m^2], likewise.
-        aleatoric, epistemic: A and E [m^2] as far as V counts them, or None.
+        aleatoric, epistemic: A and E [m^2], or None if V does not include them.
         anchored: B [m^2]; None unless ``config.anchors``.
         depth: the predicted depth [m].
-        standard_error: of the mean of V as an estimate of that over all valid pixels [m^2]; NaN with fewer than two
+        standard_error: of the mean of V as an estimate of the mean over all valid pixels [m^2]; NaN with fewer than two
             pixels.
-        measured: share in [0, 1] of the sampled pixels whose M rests on surfaces seen from two views or more; about 0
-            in a first view, whose mean is that of ``config.unmeasured``. NaN without a valid pixel.
-        statistics: per-stream counts of this frame; ``unmeasured`` are the other sampled pixels.
+        measured: share in [0, 1] of the sampled pixels whose M rests on surfaces seen from two or more views; about 0
+            in a first view, where ``config.unmeasured`` decides the mean. NaN without a valid pixel.
+        statistics: per-stream counts of this frame; ``unmeasured`` counts the other sampled pixels.
     """
 
     total: SampleStatistics
@@ -218,7 +219,7 @@ class MeanUncertainty:
         return self.total.pixels
 
     def __repr__(self) -> str:
-        """Means, errors and counts in a line."""
+        """Means and counts in one line."""
         counts = f"pixels={_short(self.pixels)}, measured={_short(self.measured)}"
         return f"MeanUncertainty(mean={_short(self.mean)} m^2, {counts}, {self.statistics!r})"
 

@@ -1,4 +1,4 @@
-"""Step 1 and the rest together: network(s), their alternation, anchors and UfM*."""
+"""The whole pipeline: networks and their alternation (step 1), anchors, and UfM*."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from ufmstar_torch.anchors.anchors import Anchors, require_anchors
-from ufmstar_torch.anchors.streams import Given, StreamLandmarks
+from ufmstar_torch.anchors.streams import SourceLike, StreamLandmarks
 from ufmstar_torch.arguments import Array, CameraLike, ImageLike, as_image, as_intrinsics, as_pose, as_tensor
 from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
-from ufmstar_torch.networks_in_turn import NetworksInTurn, Preprocess, in_unit_range, modules_of, own_preprocess
+from ufmstar_torch.networks_in_turn import NetworksInTurn, Preprocess, in_unit_range, modules_of, shared_preprocess
 from ufmstar_torch.output import FrameStatistics, MeanUncertainty, UfMStarOutput
 from ufmstar_torch.prediction import DepthPrediction
 from ufmstar_torch.recalibrate import Recalibration
@@ -31,7 +31,7 @@ class UncertainPrediction:
 
     Attributes:
         prediction: the network's output (for "full": the predictive mean, mean A and E over the members).
-        ufm: the output of UfM*; ``ufm.variance`` [m^2] is the answer.
+        ufm: the output of UfM*; ``ufm.variance`` [m^2] is the result.
         member: index of the network that was run, or None if all were.
     """
 
@@ -67,13 +67,13 @@ class UncertainPrediction:
 
 @dataclass(frozen=True)
 class _Predicted:
-    """A prediction on its way to UfM*'s device.
+    """A prediction that is being copied to UfM*'s device.
 
     Attributes:
-        image, pose, intrinsics: of the image, as tensors.
+        image, pose, intrinsics: the image and its camera, as tensors.
         prediction, member: as in :class:`UncertainPrediction`.
         features: [B, F, H, W] for UfM*, or None.
-        ready: when the values have arrived; None = they are there for whatever is queued on their device.
+        ready: recorded after the copies; None = no copy to wait for.
     """
 
     image: Tensor
@@ -86,41 +86,41 @@ class _Predicted:
 
 
 class UncertainDepth(NetworksInTurn):
-    """Depth with a variance from any pretrained network(s): image, pose and intrinsics in.
+    """Depth and variance from any pretrained network(s), for images with pose and intrinsics.
 
     Args:
-        networks: one network or a sequence of them (an ensemble's members; BatchEnsemble members as
-            separate callables); None: predictions are given to :meth:`update`. Each maps an image [B, 3, H, W] to a
-            :class:`DepthPrediction`; one with an attribute ``takes_intrinsics = True`` is called as
-            ``network(x, K)`` with K [B, 3, 3] [px] of ``x``. ``ufmstar_torch.UncertainDepth`` takes everything that
-            ``ufmstar_torch.models.wrap_network`` takes without further declarations: metric depth is assumed.
-        config: of UfM*; where ``segment.max_depth`` is None, it becomes the networks' (:attr:`max_depth`).
+        networks: one network or a sequence of them (an ensemble's members; BatchEnsemble members as separate
+            callables); None: pass predictions to :meth:`update`. Each network maps an image [B, 3, H, W] to a
+            :class:`DepthPrediction`; one with an attribute ``takes_intrinsics = True`` is called as ``network(x, K)``
+            with K [B, 3, 3] [px] of ``x``. ``ufmstar_torch.UncertainDepth`` also accepts everything that
+            ``ufmstar_torch.models.wrap_network`` accepts without further declarations: metric depth is assumed.
+        config: of UfM*; if ``segment.max_depth`` is None, it is set to the networks' (:attr:`max_depth`).
         mode: "alternate" runs member n = i mod N (counted from 0) on image i; with one network this is the
-            single-model mode, and with ``samples`` it is the sampling-based mode. "full" runs every member
-            (or ``samples`` passes of a stochastic network) per image and takes the predictive mean, the mean
-            aleatoric variance and the variance between the members as epistemic variance.
-        posterior: also a corrected depth and its variance, ``out.ufm.posterior()``: ``config`` with the sections
-            ``anchors`` and ``posterior``, and ``anchors="dense"`` where no other source is named. For anchors given
-            with every image, set the two sections instead.
-        samples: number of stochastic passes per image in mode "full" with one network (MC-Dropout; the
-            network must sample by itself in eval mode). None: the network is deterministic.
+            single-model mode, and with a stochastic network the sampling-based mode. "full" runs every member (or
+            ``samples`` passes of a stochastic network) per image and takes the predictive mean, the mean aleatoric
+            variance, and the variance between the members as epistemic variance.
+        posterior: also compute a corrected depth and its variance, ``out.ufm.posterior()``. Sets the sections
+            ``anchors`` and ``posterior`` of ``config``, and ``anchors="dense"`` unless another source is passed. To
+            pass anchors with every image, set the two sections instead.
+        samples: number of stochastic passes per image in mode "full" with one network (MC-Dropout; the network must
+            sample in eval mode). None: the network is deterministic.
         preprocess: maps image and intrinsics to the networks' input. "own": the networks' attribute ``preprocess``;
-            for networks without one, bytes become floats in [0, 1]. None passes both through.
-        anchors: what yields the anchors of every image, with ``config.anchors``: "corners" (tracked in the image),
+            for networks without one, bytes become floats in [0, 1]. None = no preprocessing.
+        anchors: source of the anchors of every image, with ``config.anchors``: "corners" (tracked in the image),
             "dense" (searched in earlier images), a file of landmarks, or a
-            :class:`~ufmstar_torch.anchors.landmarks.LandmarkSource`; of several streams, a list with one for
-            each. Saved and reset with the state. None: those given with an image, if any.
-        recalibration: a map of V, after everything else (``Recalibration.from_json(FILE)``); None = V as it is.
-        multiview_device: of UfM* and of the results, whatever the networks' is. "cpu" is faster for one camera with the
-            networks on a GPU, and the paper's split; None = the networks'. :meth:`stream` runs both at the same time.
+            :class:`~ufmstar_torch.anchors.landmarks.LandmarkSource`; for several streams, a list with one source for
+            each. Saved and reset with the state. None: anchors may be passed with each image.
+        recalibration: a map of V, applied last (``Recalibration.from_json(FILE)``); None = no map.
+        multiview_device: device of UfM* and of the results; None = the networks' device. "cpu", the paper's split, is
+            faster for one camera with the networks on a GPU. :meth:`stream` runs both devices at the same time.
 
-    The networks are put into eval mode here and run without gradients. A stochastic network decides itself
-    to sample in eval mode, as decoder dropout at test time does.
+    The constructor puts the networks into eval mode; they run without gradients. A stochastic network must sample in
+    eval mode, as decoder dropout at test time does.
 
     Raises:
-        TypeError: something that is no network.
-        ValueError: no network, networks whose own ``preprocess`` differs, an unknown mode, ``samples`` that fit
-            neither, or anchors without ``config.anchors``.
+        TypeError: an argument is no network.
+        ValueError: no network, networks with different ``preprocess`` attributes, an unknown mode, ``samples`` that fit
+            neither mode nor networks, or anchors without ``config.anchors``.
 
     Example::
 
@@ -141,7 +141,7 @@ class UncertainDepth(NetworksInTurn):
         posterior: bool = False,
         samples: int | None = None,
         preprocess: Preprocess | Literal["own"] | None = "own",
-        anchors: Given | list[Given] | tuple[Given, ...] | None = None,
+        anchors: SourceLike | list[SourceLike] | tuple[SourceLike, ...] | None = None,
         recalibration: Recalibration | None = None,
         multiview_device: torch.device | str | None = None,
     ) -> None:
@@ -154,7 +154,7 @@ class UncertainDepth(NetworksInTurn):
         if mode == "full" and single and samples is None:
             raise ValueError("mode 'full' needs several networks, or samples for a stochastic one")
         if len({id(member) for member in members}) < len(members):
-            raise ValueError("networks must differ, got one of them twice: the passes of a stochastic one are samples")
+            raise ValueError("networks must differ, got one of them twice: for passes of a stochastic one set samples")
         super().__init__(members or None, samples=samples, preprocess=preprocess)
         config = UfMStarConfig() if config is None else config
         for name, value, kind in (("config", config, UfMStarConfig), ("recalibration", recalibration, Recalibration)):
@@ -177,13 +177,13 @@ class UncertainDepth(NetworksInTurn):
     def accepted(
         self, networks: object, preprocess: Preprocess | Literal["own"] | None
     ) -> tuple[list[nn.Module], Preprocess | None]:
-        """The networks as modules, and what makes their input; a class that knows more networks can accept more.
+        """Convert the networks to modules, and resolve their preprocessing; a subclass may accept more types.
 
         Raises:
-            TypeError, ValueError: as the class has them.
+            TypeError, ValueError: see the class.
         """
         members = modules_of(networks)
-        return members, own_preprocess(members) if preprocess == "own" else preprocess
+        return members, shared_preprocess(members) if preprocess == "own" else preprocess
 
     def forward(
         self,
@@ -200,16 +200,15 @@ class UncertainDepth(NetworksInTurn):
         Args:
             image: [B, 3, H, W] or [3, H, W] as the preprocessing (or the network) expects it, a NumPy array
                 [B, H, W, 3] or [H, W, 3], or a Pillow image.
-            pose: [B, 4, 4] or [4, 4] camera-to-world [m], or without its last row; a tensor or a NumPy array.
+            pose: [B, 4, 4] or [4, 4] camera-to-world [m], or without the last row; a tensor or a NumPy array.
             intrinsics: [B, 3, 3] or [3, 3] of ``image`` [px], or fx, fy, cx, cy; likewise.
             valid: [B, h, w] bool at the depth map's size, True = use.
             features: [B, F, h, w] likewise, F = ``config.features``.
-            anchors: sparse depths of this frame, [B, N] padded and masked, with ``config.anchors``; their pixels are
-                those of ``image`` and ``intrinsics``, whatever the preprocessing makes of them. None = those of the
-                constructor's source, or none.
+            anchors: sparse depths of this frame, [B, N] padded and masked, with ``config.anchors``, at pixels of
+                ``image`` before the preprocessing. None = the constructor's source, or no anchors.
 
         Raises:
-            ValueError, TypeError: as :meth:`UfMStar.forward`; neither alternation nor landmarks have advanced then.
+            ValueError, TypeError: as :meth:`UfMStar.forward`; alternation and landmarks then do not advance.
         """
         return self._fused(self._predicted(image, pose, intrinsics, features), valid, anchors)
 
@@ -219,11 +218,11 @@ class UncertainDepth(NetworksInTurn):
     def stream(self, frames: Iterable[tuple[ImageLike, CameraLike, CameraLike]]) -> Iterator[UncertainPrediction]:
         """The predictions of a video, in order, with the networks one image ahead of UfM*.
 
-        With networks on a GPU and ``multiview_device="cpu"`` the two run at the same time, so each result comes when
-        the next image has been given.
+        With networks on a GPU and ``multiview_device="cpu"``, both run at the same time. Each result is yielded after
+        the next frame has been read.
 
         Args:
-            frames: image, pose and intrinsics of each, as :meth:`forward` takes them.
+            frames: image, pose and intrinsics of each frame, as in :meth:`forward`.
 
         Raises:
             ValueError, TypeError: as :meth:`forward`.
@@ -247,18 +246,17 @@ class UncertainDepth(NetworksInTurn):
         features: Array | None = None,
         anchors: Anchors | None = None,
     ) -> UfMStarOutput:
-        """Process a prediction that is there already (cached, or from elsewhere), as :meth:`forward` does after its
-        networks.
+        """Process an existing prediction, for example a cached one, as :meth:`forward` does after its networks.
 
         Args:
             prediction: [B, h, w].
             pose: as in :meth:`forward`.
             intrinsics: as in :meth:`forward`, of the depth map [px].
             valid, features: as in :meth:`forward`.
-            anchors: [B, N] in the pixels of the depth map; None = none, also with a source of anchors.
+            anchors: [B, N] at pixels of the depth map; None = no anchors, even with a source of anchors.
 
         Raises:
-            ValueError, TypeError: as :meth:`UfMStar.forward`; the images are not counted then.
+            ValueError, TypeError: as :meth:`UfMStar.forward`; the image is then not counted.
         """
         maps = maps_of(prediction, self.ufm)
         out = self.ufm(pose=pose, intrinsics=intrinsics, valid=valid, features=features, anchors=anchors, **maps)
@@ -279,15 +277,14 @@ class UncertainDepth(NetworksInTurn):
         seed: int = 0,
         average: bool = False,
     ) -> MeanUncertainty:
-        """Like :meth:`forward`, but an average variance per image, for active learning.
+        """Like :meth:`forward`, but computes an average variance per image, for active learning.
 
         Args:
             image, pose, intrinsics, valid, features, anchors: as in :meth:`forward`.
             pixels, fraction, seed, average: as in :meth:`UfMStar.mean_uncertainty`.
 
         Raises:
-            ValueError, TypeError: as :meth:`UfMStar.mean_uncertainty`; neither alternation nor landmarks have advanced
-                then.
+            ValueError, TypeError: as :meth:`UfMStar.mean_uncertainty`; alternation and landmarks then do not advance.
         """
         predicted = self._predicted(image, pose, intrinsics, features)
         sample: dict[str, Any] = {"pixels": pixels, "fraction": fraction, "seed": seed, "average": average}
@@ -311,18 +308,18 @@ class UncertainDepth(NetworksInTurn):
 
     @contextmanager
     def _anchored(self, predicted: _Predicted, anchors: Anchors | None) -> Iterator[Anchors | None]:
-        """The image's anchors, from the caller or the source, in the pixels of the depth map, once the prediction has
-        arrived; an error inside undoes them.
+        """The image's anchors, from the caller or the source, at pixels of the depth map. Waits for the prediction's
+        copies. An error in the context undoes the source's update.
 
         Raises:
-            ValueError: both, or as :meth:`StreamLandmarks.update`.
+            ValueError: anchors from both the caller and a source, or as :meth:`StreamLandmarks.update`.
         """
         if predicted.ready is not None:
             predicted.ready.synchronize()
         K = predicted.intrinsics
         if self.landmarks is not None:
             if anchors is not None:
-                raise ValueError("anchors come from the source that UncertainDepth was made with: give none")
+                raise ValueError("anchors come from the source that UncertainDepth was made with: pass none")
             config = self.ufm.config
             skip = config.on_bad_frame == "skip"
             anchors = self.landmarks.update(predicted.image, predicted.pose, K, config.rotation_tolerance, skip=skip)
@@ -335,7 +332,7 @@ class UncertainDepth(NetworksInTurn):
             raise
 
     def _undo(self, statistics: FrameStatistics) -> None:
-        """The landmarks of streams that skipped an image forget it."""
+        """Undo the landmark update of streams that skipped the image."""
         if self.landmarks is not None:
             self.landmarks.undo(statistics.fault.nonzero().flatten().tolist())
 
@@ -350,7 +347,7 @@ class UncertainDepth(NetworksInTurn):
     ) -> _Predicted:
         """The prediction for the next image, or, with ``ahead``, for the one after that."""
         if not self.networks:
-            raise ValueError("UncertainDepth(None) has no networks: give the predictions to update")
+            raise ValueError("UncertainDepth(None) has no networks: pass predictions to update")
         picture, T, K_image = as_image(image), as_pose(pose), as_intrinsics(intrinsics)
         first = self._next == 0 and not ahead and picture.is_cpu and picture.dtype in _BLACK
         if first and float(picture.max()) <= _BLACK[picture.dtype]:
@@ -369,14 +366,14 @@ class UncertainDepth(NetworksInTurn):
         return _Predicted(picture, T, K_image, replace(prediction, **there), member, H, ready)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """The networks move; UfM* stays on its own device, if it has one."""
+        """Move the networks; UfM* stays on ``multiview_device`` unless that is None."""
         super()._apply(fn, recurse)
         if self.multiview_device is not None:
             self.ufm.to(self.multiview_device)
         return self
 
     def reset(self, streams: Sequence[int] | Tensor | None = None, *, keep_evidence: bool = False) -> None:
-        """Forget the views (:meth:`UfMStar.reset`); resetting all streams also restarts the alternation."""
+        """Reset UfM* (:meth:`UfMStar.reset`) and the landmarks; resetting all streams also restarts the alternation."""
         self.ufm.reset(streams, keep_evidence=keep_evidence)
         if self.landmarks is not None:
             b = self.ufm.mean.shape[0]
@@ -386,7 +383,7 @@ class UncertainDepth(NetworksInTurn):
             self._count(0)
 
     def _count(self, images: int) -> None:
-        """Images seen, as a number for the alternation and as a buffer for state_dict."""
+        """Set the number of processed images, as a number for the alternation and as a buffer for ``state_dict``."""
         self._next = images
         with outliving():  # the buffer must outlive the caller's inference mode
             self.image_index = torch.full_like(self.image_index, images)
@@ -417,10 +414,10 @@ class UncertainDepth(NetworksInTurn):
         self._next = int(self.image_index)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """As any module's, but all of it or nothing: where it raises, networks, state and landmarks are as before.
+        """``nn.Module.load_state_dict``, but atomic: if it raises, networks, state and landmarks are unchanged.
 
         Raises:
-            RuntimeError: a state that is incomplete, of other networks or sources, or impossible.
+            RuntimeError: the state is incomplete, of other networks or sources, or invalid.
         """
         before = {name: value.clone() for name, value in self.state_dict().items()}
         try:
@@ -431,7 +428,7 @@ class UncertainDepth(NetworksInTurn):
 
 
 def maps_of(prediction: DepthPrediction, ufm: UfMStar) -> dict[str, Any]:
-    """The arguments of :meth:`UfMStar.forward` that a prediction has: depth, A, E, and the confidence if it is used."""
+    """The arguments of :meth:`UfMStar.forward` from a prediction: depth, A, E, and the confidence if used."""
     maps = {
         "depth": prediction.depth,
         "aleatoric": prediction.aleatoric_variance,
@@ -441,13 +438,14 @@ def maps_of(prediction: DepthPrediction, ufm: UfMStar) -> dict[str, Any]:
 
 
 def _require_count(value: object) -> None:
-    """Raise a ValueError unless it is a number of images."""
+    """Raise a ValueError unless ``value`` is a number of images."""
     if not isinstance(value, Tensor) or value.dtype != torch.int64 or value.dim() or bool(value < 0):
         raise ValueError(f"image_index must be a whole number of images, got {value}")
 
 
 def _copied(values: dict[str, Tensor], device: torch.device | None) -> tuple[dict[str, Any], torch.cuda.Event | None]:
-    """The values on ``device`` (None: where they are), and when copies from CUDA into pinned memory will have ended."""
+    """Copy the values to ``device`` (None: no copy). Copies from CUDA to the CPU are asynchronous, into pinned memory,
+    and return an event to wait for."""
     if device is None:
         return values, None
     source = values["depth"].device

@@ -1,4 +1,4 @@
-"""The output of every depth network, and how one is called."""
+"""The output of every depth network, and the call of a network."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class DepthPrediction:
         epistemic_variance: [B, H, W] learned model variance E [m^2], or None.
         confidence: [B, H, W] a map of any unit that ranks the pixels by quality, or None; its meaning in metres is
             learnt from anchors (``ufmstar_torch.confidence``).
-        intrinsics: [B, 3, 3] of the depth map [px]; None as a network returns it: those of the network's input.
-        ms: time of the inference, or of all of them together [ms]; None = not measured.
+        intrinsics: [B, 3, 3] of the depth map [px]; None = those of the network's input.
+        ms: total time of the inferences [ms]; None = not measured.
 
     Raises:
-        TypeError: something else than tensors and arrays.
+        TypeError: a map is neither a tensor nor an array.
         ValueError: the shapes disagree or depth is not [B, H, W].
     """
 
@@ -55,7 +55,7 @@ class DepthPrediction:
                 )
 
     def to(self, to: torch.device | torch.dtype) -> DepthPrediction:
-        """The prediction with its maps on a device, or of a dtype; the intrinsics stay where they are."""
+        """A copy with the maps on a device, or of a dtype; the intrinsics are unchanged."""
         maps = {name: value.to(to) for name in ("depth", *_OPTIONAL) if (value := getattr(self, name)) is not None}
         return replace(self, **maps)
 
@@ -66,13 +66,13 @@ class DepthPrediction:
 
     @property
     def K(self) -> Tensor:
-        """[B, 3, 3] the intrinsics [px], of a prediction that has them."""
+        """[B, 3, 3] the intrinsics [px], which must not be None."""
         assert self.intrinsics is not None
         return self.intrinsics
 
     @property
     def variance(self) -> Tensor | None:
-        """[B, H, W] the network's own total variance A + E [m^2], None if it predicts neither."""
+        """[B, H, W] the network's total variance A + E [m^2], None if it predicts neither."""
         a, e = self.aleatoric_variance, self.epistemic_variance
         if a is None or e is None:
             return e if a is None else a
@@ -80,36 +80,35 @@ class DepthPrediction:
 
 
 def takes_intrinsics(network: Callable[..., Any]) -> bool:
-    """True if a network declares that it is called as ``network(x, K)``: an attribute ``takes_intrinsics = True``."""
+    """True if a network must be called as ``network(x, K)``: it has an attribute ``takes_intrinsics = True``."""
     return bool(getattr(network, "takes_intrinsics", False))
 
 
 def stated_range(networks: Iterable[Callable[..., Any]]) -> float | None:
-    """[m] The largest depth that any of the networks can predict, by their attribute ``max_depth``; None unless each of
-    them states one, a positive number."""
+    """[m] The largest attribute ``max_depth`` of the networks; None unless it is a positive number in each of them."""
     stated = [getattr(network, "max_depth", None) for network in networks]
     ranges = [float(value) for value in stated if isinstance(value, int | float) and value > 0]
     return max(ranges) if ranges and len(ranges) == len(stated) else None
 
 
 def states_confidence(networks: Iterable[Callable[..., Any]]) -> bool:
-    """True if each of the networks states a confidence, by its attribute ``states_confidence``."""
+    """True if every network has a true attribute ``states_confidence``: it predicts a confidence."""
     stated = [bool(getattr(network, "states_confidence", False)) for network in networks]
     return bool(stated) and all(stated)
 
 
 def infer(network: Callable[..., Any], image: Tensor, intrinsics: Tensor | None, *, takes: bool | None = None) -> Any:
-    """One inference: ``network(image, K)`` of a network that takes intrinsics, ``network(image)`` of any other.
+    """One inference: ``network(image, K)`` if the network takes intrinsics, else ``network(image)``.
 
     Args:
         network: see :func:`takes_intrinsics`.
         image: [B, 3, H, W] the network's input.
-        intrinsics: [B, 3, 3] or [3, 3] of ``image`` [px], that is of the preprocessed image. The network gets them as
-            [B, 3, 3] on the image's device, in its type but at least in single precision.
-        takes: whether it takes intrinsics; None: as it declares.
+        intrinsics: [B, 3, 3] or [3, 3] of ``image`` [px], that is of the preprocessed image. The network receives
+            [B, 3, 3] on the image's device, in the image's dtype but at least float32.
+        takes: whether the network takes intrinsics; None = :func:`takes_intrinsics`.
 
     Raises:
-        ValueError: the network takes intrinsics and there are none.
+        ValueError: the network takes intrinsics, but ``intrinsics`` is None.
     """
     if not (takes_intrinsics(network) if takes is None else takes):
         return network(image)

@@ -1,4 +1,4 @@
-"""A monotone map of the variance, fitted where the truth is known (``ufmstar recalibrate``) and applied elsewhere."""
+"""A monotone map of the variance, fitted on sequences with ground truth (``ufmstar recalibrate``)."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ _HARMLESS = ("on_bad_frame", "backend", "initial_capacity", "max_components")
 
 @dataclass(frozen=True)
 class Recalibration(Checked, Extension):
-    """V -> V', the same at every pixel.
+    """A map V -> V', the same at every pixel.
 
-    Between two knots log V' is linear in log V. Above the last knot V' / V is that of the last knot. Below the first
-    one the map is constant, since no smaller variance was ever observed to hold: V = 0 gets the first knot's V'.
+    Between two knots log V' is linear in log V. Above the last knot V' / V is constant. Below the first knot V' is
+    constant, since the data support no smaller variance: V = 0 gets the first knot's V'.
 
     A map of the network's confidence c is V' = h(c) V, with log h linear in c between two knots and constant beyond;
     h = 1 where c is NaN.
@@ -39,14 +39,14 @@ class Recalibration(Checked, Extension):
     Attributes:
         variance: V at the knots [m^2], positive and increasing; or c, increasing.
         recalibrated: V' at the knots [m^2], positive and not decreasing; or h, positive.
-        covariate: what the map is one of, "variance" or "confidence".
-        row: name of the method that it was fitted to, as "UfM*-Anchored-DepthOnly".
-        ufm: settings of UfM* that it was fitted to (``UfMStarConfig.to_dict``); {} = unknown.
-        network: names of the files of its network's weights, separated by commas; "" = unknown.
-        sequences: names of the sequences that it was fitted to: it must not be judged on them.
+        covariate: argument of the map, "variance" or "confidence".
+        row: name of the method in the fit, for example "UfM*-Anchored-DepthOnly".
+        ufm: settings of UfM* in the fit (``UfMStarConfig.to_dict``); {} = unknown.
+        network: file names of the network's weights in the fit, separated by commas; "" = unknown.
+        sequences: names of the sequences in the fit, which must not serve for its evaluation.
 
     Raises:
-        ValueError: knots that are not such numbers.
+        ValueError: invalid knots.
     """
 
     variance: tuple[float, ...]
@@ -57,7 +57,7 @@ class Recalibration(Checked, Extension):
     network: str = ""
     sequences: tuple[str, ...] = ()
 
-    argument: ClassVar[str] = CONFIDENCE  # what a frame brings for a map of it
+    argument: ClassVar[str] = CONFIDENCE  # see Extension; used by a map of the confidence
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -76,7 +76,7 @@ class Recalibration(Checked, Extension):
         """V' at every pixel.
 
         Args:
-            variance: [...] V >= 0 [m^2], NaN where there is none.
+            variance: [...] V >= 0 [m^2], NaN = no value.
 
         Returns:
             [...] in the same dtype [m^2], NaN where ``variance`` is NaN.
@@ -91,11 +91,11 @@ class Recalibration(Checked, Extension):
         return torch.where(variance.isnan(), variance, (inside + beyond).exp().to(variance.dtype))
 
     def map_variance(self, variance: Tensor) -> Tensor:
-        """V' of V."""
+        """V' of V, for a map of the variance."""
         return self(variance) if self.covariate == VARIANCE else variance
 
     def factor(self, confidence: Tensor) -> Tensor:
-        """h(c) [...] of a map of the confidence, in double precision."""
+        """h(c) [...] in float64, for a map of the confidence."""
         c, h = (torch.tensor(x, dtype=torch.float64, device=confidence.device) for x in self._knots())
         position = confidence.double().contiguous()
         upper = torch.searchsorted(c, position).clamp(1, len(c) - 1)
@@ -111,39 +111,39 @@ class Recalibration(Checked, Extension):
         *,
         dense: bool,
     ) -> FrameExtension:
-        """A map of the confidence during a frame. Raises ValueError: it is one, and the frame brings no confidence."""
+        """A map of the confidence during a frame. Raises ValueError: the frame has no confidence."""
         if self.covariate == VARIANCE:
             return FrameExtension()
         if argument is None:
-            raise ValueError("the recalibration is one of the confidence, but the network states none")
+            raise ValueError("the recalibration maps the confidence, but the network predicts none")
         return _Scaled(self.factor(as_confidence(argument, frame)))
 
     def require(self, config: UfMStarConfig, network: str = "") -> None:
-        """Check that V means what it meant when the map was fitted.
+        """Check that settings and network are those of the fit.
 
         Args:
-            config: of the UfM* whose variance is to be mapped.
-            network: names of the files of the network's weights, separated by commas; "" = unknown.
+            config: of the UfM* whose variance is mapped.
+            network: file names of the network's weights, separated by commas; "" = unknown.
 
         Raises:
-            ValueError: the map was fitted under other settings of UfM*, or to another network.
+            ValueError: the map was fitted with other settings of UfM*, or to another network.
         """
-        fitted, now = flat(self.ufm), flat(plain(config))
-        names = sorted((fitted.keys() | now.keys()) - set(_HARMLESS)) if fitted else []
-        changed = [name for name in names if fitted.get(name) != now.get(name)]
+        fitted, current = flat(self.ufm), flat(plain(config))
+        names = sorted((fitted.keys() | current.keys()) - set(_HARMLESS)) if fitted else []
+        changed = [name for name in names if fitted.get(name) != current.get(name)]
         if changed:
-            each = ", ".join(f"{name} = {fitted.get(name)!r} (now {now.get(name)!r})" for name in changed)
+            each = ", ".join(f"{name} = {fitted.get(name)!r} (now {current.get(name)!r})" for name in changed)
             raise ValueError(f"the recalibration was fitted to UfM* with {each}")
         if network and self.network and network != self.network:
             raise ValueError(f"the recalibration was fitted to the network {self.network}, not {network}")
 
     def save(self, path: str | Path) -> None:
-        """Write it as JSON, which :meth:`from_json` reads."""
+        """Write the map as JSON for :meth:`from_json`."""
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         Path(path).write_text(json.dumps(self.to_dict(), indent=2) + "\n", encoding="utf-8")
 
     def _knots(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """At least two knots: a single one is doubled with the same ratio above."""
+        """The knots, at least two; a single knot gets a second one above it, with the same V' / V or h."""
         v, r = self.variance, self.recalibrated
         if len(v) > 1:
             return v, r
@@ -161,6 +161,6 @@ class _Scaled(FrameExtension):
         return variance * chosen(self._factor).to(variance.dtype)
 
 
-def stored_next_to(weights: str | Path) -> Path:
-    """The file of a recalibration that lies beside weights: fastdepth.onnx -> fastdepth.recalibration.json."""
+def recalibration_path(weights: str | Path) -> Path:
+    """Path of the recalibration in the weights' folder: fastdepth.onnx -> fastdepth.recalibration.json."""
     return Path(weights).with_suffix(".recalibration.json")

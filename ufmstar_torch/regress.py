@@ -1,7 +1,7 @@
 """Step 5, uncertainty regression: Gaussian mixture regression of the disagreement at any 3D point.
 
-Section "Uncertainty Regression". H is constant within a component, so the conditional mean is the
-average of m_k with weights w_k(x), a weak prior (pi_0, mu_0) taking over where no component explains x.
+Section "Uncertainty Regression". H is constant within a component, so the conditional mean is the average of m_k with
+weights w_k(x). A weak prior (pi_0, mu_0) dominates where all components have a low density.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from ufmstar_torch.fixed_order import total
 from ufmstar_torch.gaussian import cholesky3, inverse_lower3
 from ufmstar_torch.mixture import GaussianMixture
 
-# Points x components evaluated at a time: bounds the temporary memory to some 100 MB in float32. On CUDA as many as a
-# quarter of the free memory holds, if that is more, with _NUMBERS for each pair: 3 of the offset, its distance, density
-# and their temporaries.
+# Most points x components evaluated at a time: bounds the temporary memory to some 100 MB in float32. On CUDA it may
+# be a quarter of the free memory, if that is more. A pair takes _NUMBERS numbers: offset, distance, density,
+# temporaries.
 _CHUNK = 2**22
 _NUMBERS = 16
 
@@ -42,13 +42,13 @@ def regress(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> 
     """Gaussian mixture regression, the exact sum over all components or the paper's neighbourhood.
 
     m_hat(x) = (sum_k pi_k N(x; mu_k, Sigma_k) m_k + pi_0 mu_0) / (sum_k pi_k N(x; mu_k, Sigma_k) + pi_0).
-    With ``config.regression == "neighbourhood"`` only components near x take part: those whose
-    axis-aligned box of ``neighbourhood_sigmas`` standard deviations comes within ``near_radius`` of x
-    on every axis, or, where there are none, within ``far_radius``; none at all leaves the prior.
+    With ``config.regression == "neighbourhood"`` the sum is over the components near x: those whose axis-aligned box of
+    ``neighbourhood_sigmas`` standard deviations comes within ``near_radius`` of x on every axis, or, if there are none,
+    within ``far_radius``. Without any, the result is the prior.
 
     Args:
         mixture: [B, K], covariances positive definite.
-        points: [B, P, 3] [m], in the mixture's frame; not finite points give NaN.
+        points: [B, P, 3] [m], in the mixture's frame; points that are not finite give NaN.
         config: prior_weight, prior_mean, regression and its radii.
 
     Returns:
@@ -66,11 +66,11 @@ def regress(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> 
 
 
 def _pairs_at_a_time(device: torch.device, size: int) -> int:
-    """Number of pairs of a point and a component that may be held at a time, in numbers of ``size`` bytes."""
+    """Most pairs of a point and a component in memory at a time, for numbers of ``size`` bytes."""
     if device.type != "cuda" or not torch.cuda.is_initialized():  # fake tensors need no device
         return _CHUNK
     free = torch.cuda.mem_get_info(device)[0]
-    free += torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)  # kept by torch, but not in use
+    free += torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)  # torch's cache
     return max(_CHUNK, free // (4 * _NUMBERS * size))
 
 
@@ -101,7 +101,7 @@ def regress_image(
 
 
 def _where(valid: Tensor, disagreement: Tensor, features: Tensor) -> Regression:
-    """NaN where not valid."""
+    """The regression with NaN where not valid."""
     return Regression(torch.where(valid, disagreement, torch.nan), torch.where(valid[..., None], features, torch.nan))
 
 
@@ -109,10 +109,10 @@ def shares(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> T
     """Share of each component in the density at a point, w_k(x) = pi_k N_k(x) / (sum_k pi_k N_k(x) + pi_0).
 
     Args:
-        mixture, points, config: as :func:`regress`; for few points, all pairs are held at once.
+        mixture, points, config: as :func:`regress`; few points, because all pairs are in memory at once.
 
     Returns:
-        [B, P, K] in [0, 1]; 1 less their sum is the prior's.
+        [B, P, K] in [0, 1]; the prior's share is 1 minus their sum.
     """
     density = _density(mixture, *_densities(mixture, torch.float64), points.double(), config)
     evidence = total(density, -1)[..., None] + config.prior_weight
@@ -120,7 +120,7 @@ def shares(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> T
 
 
 def distribute(mixture: GaussianMixture, points: Tensor, values: Tensor, config: UfMStarConfig) -> Tensor:
-    """Values at points, summed by component: sum_n w_k(x_n) y_n, with the :func:`shares` w_k.
+    """Sums of values at points by component, sum_n w_k(x_n) y_n, with the :func:`shares` w_k.
 
     Args:
         mixture, points, config: as :func:`shares`.
@@ -186,7 +186,7 @@ def _near(mixture: GaussianMixture, offset: Tensor, config: UfMStarConfig) -> Te
 def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Tensor]:
     """Exponential moving average of the dense map, M_i <- (1-alpha) M_(i-1) + alpha M_i.
 
-    NaN marks a pixel without a value: where only one of the two maps has one, the memory keeps that one.
+    NaN marks a pixel without a value. If only one of the two maps has a value, the memory stores that value.
 
     Args:
         previous: [B, H, W] or [B, n] [m^2], the memory; all NaN at the first frame.
@@ -194,22 +194,22 @@ def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Ten
         alpha: in (0, 1].
 
     Returns:
-        The new memory in the dtype of ``previous``, and what to show: NaN where ``current`` has no value, in its dtype.
+        The new memory in the dtype of ``previous``, and the map to output: NaN where ``current`` is NaN, in its dtype.
     """
-    now = current.to(previous.dtype)
-    mixed = (1 - alpha) * previous + alpha * now
-    memory = torch.where(now.isnan(), previous, torch.where(previous.isnan(), now, mixed))
-    return memory, torch.where(now.isnan(), torch.nan, memory).to(current.dtype)
+    new = current.to(previous.dtype)
+    mixed = (1 - alpha) * previous + alpha * new
+    memory = torch.where(new.isnan(), previous, torch.where(previous.isnan(), new, mixed))
+    return memory, torch.where(new.isnan(), torch.nan, memory).to(current.dtype)
 
 
 def moving_average(
     memory: Tensor, disagreement: Tensor, size: tuple[int, int], alpha: float, pixels: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """The moving average of a frame: the new memory [B, H, W] in its dtype, and the map to show.
+    """The moving average of a frame: the new memory [B, H, W] in its dtype, and the map to output.
 
     Args:
-        memory: [B, h, w] of the frame before [m^2].
-        disagreement: [B, H, W], or [B, n] at ``pixels``, where the dense map serves as memory.
+        memory: [B, h, w] of the previous frame [m^2].
+        disagreement: [B, H, W], or [B, n] at ``pixels``, which updates the memory at these pixels.
         size: H and W.
         alpha: in (0, 1].
         pixels: [B, n] indices into the flattened image, or None.
@@ -220,15 +220,15 @@ def moving_average(
 
 
 def memory_for(memory: Tensor, size: tuple[int, int]) -> Tensor:
-    """The memory of a moving average [B, h, w] for a frame of ``size``: it restarts when the size changes."""
+    """The memory of a moving average [B, h, w] for a frame of ``size``; all NaN after a change of the size."""
     return memory if memory.shape[1:] == size else memory.new_full((memory.shape[0], *size), torch.nan)
 
 
 def at_pixels(values: Tensor, pixels: Tensor | None) -> Tensor:
-    """The values of a map [B, H, W] at pixels [B, n], indices into the flattened image; None = the map."""
+    """The values of a map [B, H, W] at pixels [B, n], indices into the flattened image; None = all pixels."""
     return values if pixels is None else torch.gather(values.flatten(1), 1, pixels)
 
 
 def with_pixels(values: Tensor, pixels: Tensor | None, changed: Tensor) -> Tensor:
-    """The map [B, H, W] with other values [B, n] at pixels [B, n]; None = all of them [B, H, W]."""
+    """The map [B, H, W] with the values ``changed`` [B, n] at pixels [B, n]; None = at all pixels [B, H, W]."""
     return changed if pixels is None else values.flatten(1).scatter(1, pixels, changed).view(values.shape)

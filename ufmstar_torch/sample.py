@@ -1,4 +1,4 @@
-"""Means over some pixels of an image, for active learning (section "Compute- and memory efficiency")."""
+"""Means over a sample of an image's pixels, for active learning (section "Compute- and memory efficiency")."""
 
 from __future__ import annotations
 
@@ -21,36 +21,37 @@ def mean_uncertainty(out: StepOutput, maps: Mapping[str, Tensor | None], used: T
 
     Args:
         out: of the step on the sample [B, n].
-        maps: [B, n] the variance, its parts and the depth, by name; those that are missing have no statistics.
-        used: [B, n] which pixels count.
+        maps: [B, n] the variance, its parts and the depth, by name; None = no statistics.
+        used: [B, n] True for the pixels to average.
     """
     sampled = {name: torch.where(used, value, torch.nan) for name in _MAPS if (value := maps.get(name)) is not None}
     each = sample_statistics(torch.stack(list(sampled.values())))
-    of = {name: SampleStatistics(*(value[i] for value in vars(each).values())) for i, name in enumerate(sampled)}
-    count, variance = used.sum(1), of["variance"]
-    left = 1 - count / out.statistics.valid_pixels.clamp_min(1)  # without replacement: all pixels, no error
+    by_map = {name: SampleStatistics(*(value[i] for value in vars(each).values())) for i, name in enumerate(sampled)}
+    count, variance = used.sum(1), by_map["variance"]
+    # finite population correction: a sample of all pixels has no error
+    unsampled = 1 - count / out.statistics.valid_pixels.clamp_min(1)
     return MeanUncertainty(
         total=variance,
-        disagreement=of["disagreement"],
-        aleatoric=of.get("aleatoric"),
-        epistemic=of.get("epistemic"),
-        anchored=of.get("anchored"),
-        depth=of["depth"],
-        standard_error=(variance.variance / variance.pixels * left).sqrt(),
+        disagreement=by_map["disagreement"],
+        aleatoric=by_map.get("aleatoric"),
+        epistemic=by_map.get("epistemic"),
+        anchored=by_map.get("anchored"),
+        depth=by_map["depth"],
+        standard_error=(variance.variance / variance.pixels * unsampled).sqrt(),
         measured=((out.measured >= unmeasured.HALF) & used).sum(1) / count,
         statistics=out.statistics,
     )
 
 
 def sample_size(size: tuple[int, int], pixels: int | None, fraction: float | None) -> int:
-    """Pixels to sample of an image of ``size`` (H, W): ``pixels``, or a share of all; neither: 1000.
+    """Number of pixels to sample in an image of ``size`` (H, W): ``pixels``, or a ``fraction`` of all; default 1000.
 
     Raises:
-        ValueError: both, or one out of range.
+        ValueError: both arguments, or one out of range.
     """
     every = size[0] * size[1]
     if pixels is not None and fraction is not None:
-        raise ValueError("give pixels or fraction, not both")
+        raise ValueError("pass pixels or fraction, not both")
     if fraction is not None:
         if not 0 < fraction <= 1:
             raise ValueError(f"fraction must lie in (0, 1], got {fraction}")
@@ -65,29 +66,29 @@ def sample_size(size: tuple[int, int], pixels: int | None, fraction: float | Non
 def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:
     """A uniform sample of the valid pixels of each image, without replacement.
 
-    The seed and the number of pixels alone decide in which random order an image's pixels are asked, and the first
-    ``count`` valid ones are taken: equal streams of a batch draw the same pixels.
+    The first ``count`` valid pixels in a random order, which depends only on the seed and the number of pixels: equal
+    streams of a batch draw the same pixels.
 
     Args:
         valid: [B, H, W] bool.
         count: pixels per image, 1 <= count <= H W.
-        seed: of the random order, drawn on the CPU so that every device samples alike.
+        seed: of the random order, drawn on the CPU so that all devices sample the same pixels.
 
     Returns:
-        index [B, count] into the flattened image and used [B, count]; fewer than ``count`` valid pixels
-        leave the rest of ``used`` False.
+        index [B, count] into the flattened image and used [B, count]; with fewer than ``count`` valid pixels the rest
+        of ``used`` is False.
     """
     flat = valid.flatten(1)
     pixels, on_cpu = flat.shape[1], valid.device.type == "cpu"
-    requested = 2 * count if on_cpu else pixels  # elsewhere a look at how many were valid would wait for the device
+    requested = 2 * count if on_cpu else pixels  # elsewhere, counting the valid ones would synchronise
     while True:
         order = random_order(pixels, seed)[:requested].to(valid.device, non_blocking=not on_cpu)
         usable = flat[:, order]
         if requested >= pixels or bool((usable.sum(1) >= count).all()):
             break
         requested *= 2
-    behind = usable.sum(1, keepdim=True) + (~usable).cumsum(1) - 1
-    position = torch.where(usable, usable.cumsum(1) - 1, behind)  # the valid ones first, each part in the random order
+    rank_invalid = usable.sum(1, keepdim=True) + (~usable).cumsum(1) - 1
+    position = torch.where(usable, usable.cumsum(1) - 1, rank_invalid)  # valid pixels first, both in random order
     index = torch.empty_like(position).scatter_(1, position, order.expand_as(position))[:, :count]
     return index, torch.gather(flat, 1, index)
 
@@ -96,10 +97,10 @@ def sample_statistics(values: Tensor) -> SampleStatistics:
     """Statistics of maps over a sample of pixels.
 
     Args:
-        values: [..., B, n], NaN where a pixel has no value.
+        values: [..., B, n], NaN = no value.
 
     Returns:
-        [..., B] of each.
+        Each statistic [..., B].
     """
     present = ~values.isnan()
     count = present.sum(-1)
@@ -114,5 +115,5 @@ def sample_statistics(values: Tensor) -> SampleStatistics:
 
 @functools.lru_cache(maxsize=4)  # the draw costs more than a sample
 def random_order(pixels: int, seed: int) -> Tensor:
-    """A permutation of the numbers below ``pixels``; not to be modified."""
+    """A permutation of the numbers below ``pixels``; the caller must not modify it."""
     return torch.randperm(pixels, generator=torch.Generator().manual_seed(seed))

@@ -1,11 +1,11 @@
 """Step 2, 3D Gaussian segmentation: Single Pass Gaussian Fitting, depth map -> mixture C_i.
 
-Section "3D Gaussian segmentation" (Li, Karaman, Sze, ICRA 2022): every row is cut into segments that are
-lines in x and z (scanline segmentation), and the segments of successive rows are joined into planes
-(segment fusion). This is the vectorised torch reference; ``docs/algorithm.md`` explains the method.
+Section "3D Gaussian segmentation" (Li, Karaman, Sze, ICRA 2022): scanline segmentation divides every row into segments
+that are lines in x and z, and segment fusion joins the segments of successive rows into planes. This is the vectorised
+torch reference; ``docs/algorithm.md`` explains the method.
 
-Moments are kept about a point of the surface itself (first pixel of a segment, then the running mean, Chan et al.),
-never about the camera, so that they lose nothing to the distance from it.
+Moments are taken about a point of the surface (the first pixel of a segment, then the running mean, Chan et al.), never
+about the camera, so that the distance from it causes no cancellation.
 """
 
 from __future__ import annotations
@@ -22,15 +22,14 @@ from ufmstar_torch.segment_scanline import Frame, Segments, scanlines
 
 @torch.no_grad()
 def segment(inputs: SegmentInput) -> tuple[GaussianMixture, Tensor]:
-    """Fit Gaussians to the surfaces of B depth maps, float64 inside.
+    """Fit Gaussians to the surfaces of B depth maps, in float64.
 
-    Nothing is differentiated. Nothing waits for an accelerator: there, loops and tables have their static bounds.
+    Not differentiable. Does not synchronise with an accelerator: there, loops and tables have static bounds.
 
     Returns:
-        The mixture [B, K] in the camera frame in order of emission: sample covariance (divisor N - 1;
-        zeros for N = 1; eigenvalues not floored), weight = N [px], disagreement 0, count 1. Its dtype is
-        depth's. K is the largest number of Gaussians of any stream, at least 1; on an accelerator the bound that the
-        pruning rule implies.
+        The mixture [B, K] in the camera frame in order of emission: sample covariance (divisor N - 1; zeros for N = 1;
+        eigenvalues not floored), weight = N [px], disagreement 0, count 1. Its dtype is that of the depth. K is the
+        largest number of Gaussians of any stream, at least 1; on an accelerator, :func:`max_gaussians`.
         Labels [B, H, W] int64: each pixel's slot, -1 = none.
     """
     frame = Frame.of(inputs)
@@ -41,17 +40,17 @@ def segment(inputs: SegmentInput) -> tuple[GaussianMixture, Tensor]:
 def _output(
     frame: Frame, segments: Segments, emitted: Tensor, count: Tensor, member: Tensor
 ) -> tuple[GaussianMixture, Tensor]:
-    """Prune, and write the mixture and the labels."""
+    """Prune the Gaussians, and assemble the mixture and the labels."""
     inputs = frame.inputs
     total = emitted.shape[1]
     g = parts(emitted)
     exists = torch.arange(total, device=count.device) < count[:, None]
     retained = exists & _keeps(g.n[..., 0], g.merged[..., 0], inputs.config)
-    capacity = max(1, int(retained.sum(1).max())) if reads_are_free(count.device) else min(total, most_kept(inputs))
+    capacity = max(1, int(retained.sum(1).max())) if reads_are_free(count.device) else min(total, max_gaussians(inputs))
     table = emitted.new_zeros(emitted.shape[0], capacity + 1, GAUSSIAN_WIDTH)
     append(table, torch.zeros_like(count), emitted, retained)
 
-    # A pixel's segment of its row -> Gaussian in order of creation -> slot.
+    # From a pixel's segment to the Gaussian's index in order of creation, and from that to its slot.
     created = torch.where(exists, g.born[..., 0].to(torch.int64), total)
     slot = torch.where(retained, retained.cumsum(1) - 1, -1)
     slot_of = slot.new_zeros(slot.shape[0], total + 1).scatter(1, created, slot)
@@ -62,18 +61,19 @@ def _output(
 
 
 def _keeps(pixels: Tensor, merged: Tensor, limits: SPGFConfig) -> Tensor:
-    """The pruning rule: "both" drops what is small in pixels and in rows, "either" what is small in one."""
+    """[...] True where a Gaussian survives: "both" drops it if it is too small in pixels and in rows, "either" if it is
+    too small in one of them."""
     large, tall = pixels >= limits.min_pixels, merged >= limits.min_rows
     if limits.prune == "none":
         return torch.ones_like(large)
     return large | tall if limits.prune == "both" else large & tall
 
 
-def most_kept(inputs: SegmentInput) -> int:
-    """Bound on the Gaussians of an image that survive pruning: each has at least so many pixels."""
+def max_gaussians(inputs: SegmentInput) -> int:
+    """Most Gaussians of an image that survive pruning, by the least number of pixels of each."""
     _, height, width = inputs.depth.shape
     limits = inputs.config
-    by_rows = limits.min_rows * (limits.sparse + 1)  # of min_rows segments, each with more than ``sparse``
+    by_rows = limits.min_rows * (limits.sparse + 1)  # pixels of min_rows segments
     least = {"none": 1, "both": min(limits.min_pixels, by_rows), "either": max(limits.min_pixels, by_rows)}
     return max(1, height * width // least[limits.prune])
 

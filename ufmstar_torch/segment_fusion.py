@@ -1,6 +1,6 @@
-"""Second half of SPGF: the segments of successive rows are joined into Gaussians, planes as wide as a bin.
+"""Second half of SPGF: joins the segments of successive rows into Gaussians, planes of at most the depth bin's length.
 
-All images at once, row by row and segment by segment. Moments are kept about the running mean.
+Processes all images at once, row by row and segment by segment. Moments are taken about the running mean.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from ufmstar_torch.segment_scanline import Frame, OpenSegment, Segments
 
 
 class Gaussian(NamedTuple):
-    """Active or emitted Gaussians: the columns of a table [..., 25], each group [..., width]."""
+    """Active or emitted Gaussians: the columns of a table [..., 25], each field [..., width]."""
 
     mean: Tensor  # 3
     scatter: Tensor  # 6: xx, xy, xz, yy, yz, zz about the mean
     l: Tensor  # 3, the line vector
     mu0: Tensor  # 3
     pi: Tensor  # 3, the plane vector
-    pi2: Tensor  # 1, as all that follow
-    n: Tensor
-    merged: Tensor  # the specification's n
-    nearest: Tensor
+    pi2: Tensor  # 1, like all further fields
+    n: Tensor  # pixels
+    merged: Tensor  # segments
+    nearest: Tensor  # smallest depth bin
     u_left: Tensor
     u_right: Tensor
-    row: Tensor  # that extended it last
-    born: Tensor  # how many had been created before
+    row: Tensor  # last row that extended it
+    born: Tensor  # index in order of creation
 
 
 _WIDTHS = (3, 6, 3, 3, 3, 1, 1, 1, 1, 1, 1, 1, 1)
@@ -38,7 +38,7 @@ _TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def _lift(frame: Frame, segments: Segments) -> Tensor:
-    """[R, M, 25] every segment as a Gaussian of its own: what involves y follows from y = ry z."""
+    """[R, M, 25] a Gaussian of each segment; moments in y follow from y = ry z."""
     s = OpenSegment(*segments.table[..., None].unbind(-2))
     ry, n = frame.ry[..., None], s.n.clamp_min(1.0)
     mean_x, mean_z = s.x_left + s.dx / n, s.z_left + s.dz / n
@@ -72,8 +72,8 @@ def fuse_segments(frame: Frame, segments: Segments) -> tuple[Tensor, Tensor, Ten
     After a row at most M Gaussians are active, since each has a segment of that row.
 
     Returns:
-        The emitted Gaussians [B, G, 25] in order, their number [B], and of every segment the Gaussian's
-        index in order of creation [B, H, M].
+        The emitted Gaussians [B, G, 25] in order, their number [B], and the index, in order of creation, of each
+        segment's Gaussian [B, H, M].
     """
     b, height, _ = frame.inputs.depth.shape
     present = segments.count.view(b, height)
@@ -94,7 +94,7 @@ def fuse_segments(frame: Frame, segments: Segments) -> tuple[Tensor, Tensor, Ten
         fresh = torch.cat([lifted[:, v, :, :-1], new_index[..., None].to(lifted)], -1)
 
         both, exists = torch.cat([active, fresh], 1), torch.cat([exists, alone], 1)
-        # After the last row all are complete together, in the order of the active list.
+        # The last row completes all Gaussians, in the order of the active list.
         going = exists & (parts(both).row[..., 0] == v) & (v < height - 1)
         emitted_count = append(emitted, emitted_count, both, exists & ~going)
         active = lifted.new_zeros(b, wide + 1, GAUSSIAN_WIDTH)
@@ -104,14 +104,14 @@ def fuse_segments(frame: Frame, segments: Segments) -> tuple[Tensor, Tensor, Ten
 
 
 def reads_are_free(device: torch.device) -> bool:
-    """Can a value decide how often a loop runs? Elsewhere than on the CPU that would wait for the device."""
+    """True on the CPU, where a loop bound may depend on a value; on other devices, reading it would synchronise."""
     return device.type == "cpu"
 
 
 def _trip_counts(inputs: SegmentInput, present: Tensor) -> tuple[list[int], int, int]:
-    """Segments to visit in each row, the most in any row, and the most Gaussians of any stream.
+    """Number of segments to visit in each row, its maximum, and the largest number of Gaussians of any stream.
 
-    Read from the data on the CPU; elsewhere bounds, since reading would wait for the device.
+    Read from the data on the CPU; static bounds elsewhere (:func:`reads_are_free`).
     """
     height = inputs.depth.shape[1]
     if not reads_are_free(present.device):
@@ -126,35 +126,35 @@ def parts(table: Tensor) -> Gaussian:
 
 
 def append(table: Tensor, count: Tensor, values: Tensor, mask: Tensor) -> Tensor:
-    """Write the values [B, N, C] that ``mask`` [B, N] selects behind the ``count`` [B] first entries of the
-    buffer ``table`` [B, T + 1, C], whose last entry catches the others. Returns the new count."""
-    at = torch.where(mask, count[:, None] + mask.cumsum(1) - 1, table.shape[1] - 1)
-    table.scatter_(1, at[..., None].expand_as(values), values)
+    """Write the values [B, N, C] where ``mask`` [B, N] is True after the ``count`` [B] first entries of the buffer
+    ``table`` [B, T + 1, C], whose last entry collects the others. Returns the new count."""
+    index = torch.where(mask, count[:, None] + mask.cumsum(1) - 1, table.shape[1] - 1)
+    table.scatter_(1, index[..., None].expand_as(values), values)
     return count + mask.sum(1)
 
 
 def _join_row(
     frame: Frame, active: Tensor, exists: Tensor, row: Tensor, present: Tensor, trips: int
 ) -> tuple[Tensor, Tensor]:
-    """Offer the segments ``row`` [B, M, 25] of one row, one after the other, to the active Gaussians [B, A, 25].
+    """Join the segments ``row`` [B, M, 25] of one row, one after the other, with the active Gaussians [B, A, 25].
 
-    Returns the Gaussians, and the index of the one that each segment joined [B, M], -1 = none.
+    Returns the Gaussians, and the index of the Gaussian that each segment joined [B, M], -1 = none.
     """
     joined = torch.full(row.shape[:2], -1, dtype=torch.int64, device=row.device)
     for j in range(trips):
         h = row[:, j : j + 1]
-        at, overlaps = _best_overlap(parts(active), exists, parts(h))
-        at = at[..., None].expand_as(h)
-        o = active.gather(1, at)
+        best, overlaps = _best_overlap(parts(active), exists, parts(h))
+        best = best[..., None].expand_as(h)
+        o = active.gather(1, best)
         join = (present > j)[:, None] & overlaps & _same_plane(parts(o), parts(h), frame)
         merged = torch.cat(_merged(parts(o), parts(h)), -1)
-        active = active.scatter(1, at, torch.where(join[..., None], merged, o))
+        active = active.scatter(1, best, torch.where(join[..., None], merged, o))
         joined[:, j] = torch.where(join, parts(o).born[..., 0].to(torch.int64), -1)[:, 0]
     return active, joined
 
 
 def _best_overlap(o: Gaussian, exists: Tensor, h: Gaussian) -> tuple[Tensor, Tensor]:
-    """[B, 1] the first active Gaussian whose stored interval overlaps the segment's most, and if one does."""
+    """[B, 1] index of the first active Gaussian whose interval overlaps the segment's most, and whether any does."""
     shared = torch.minimum(o.u_right, h.u_right) - torch.maximum(o.u_left, h.u_left)
     span = torch.maximum(o.u_right, h.u_right) - torch.minimum(o.u_left, h.u_left)
     overlap = exists[..., None] & (shared > 0)
@@ -164,7 +164,7 @@ def _best_overlap(o: Gaussian, exists: Tensor, h: Gaussian) -> tuple[Tensor, Ten
 
 
 def _same_plane(o: Gaussian, h: Gaussian, frame: Frame) -> Tensor:
-    """[B, 1] does segment h continue the surface of Gaussian o?"""
+    """[B, 1] True where segment h continues the surface of Gaussian o."""
     limits = frame.inputs.config
     reach = frame.lengths2.gather(1, o.nearest[..., 0].to(torch.int64))
     (hx, _, hz), (ox, oy, oz) = h.l.unbind(-1), o.l.unbind(-1)

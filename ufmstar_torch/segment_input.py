@@ -11,7 +11,7 @@ from torch import Tensor
 from ufmstar_torch.config import SPGFConfig, UfMStarConfig
 from ufmstar_torch.frame import FrameInput
 
-# Bins are walked one by one; more than this would be a mistake in the units, not a wish.
+# Implementations iterate over the bins; more than this indicate a mistake in the units.
 MAX_DEPTH_BINS = 10_000
 
 
@@ -20,10 +20,10 @@ class SegmentInput:
     """Checked arguments of SPGF, detached from any graph.
 
     Attributes:
-        depth: [B, H, W] [m], float32 or float64; a pixel takes part where it lies in (0, ``config.depth_limit``].
+        depth: [B, H, W] [m], float32 or float64; pixels outside (0, ``config.depth_limit``] are ignored.
         intrinsics: [B, 3, 3] [px], centre of the first pixel at (0, 0).
         config: thresholds scaled to H x W.
-        features: [B, F, H, W], averaged over the pixels of each Gaussian and not read elsewhere, or None.
+        features: [B, F, H, W], averaged over the pixels of each Gaussian, or None.
     """
 
     depth: Tensor
@@ -33,30 +33,30 @@ class SegmentInput:
 
     @classmethod
     def of(cls, depth: Tensor, intrinsics: Tensor, config: SPGFConfig, features: Tensor | None = None) -> SegmentInput:
-        """The input for maps of any size, whose thresholds ``config`` states for its reference size.
+        """The input for maps of any size; ``config`` has the thresholds for its reference size.
 
         Raises:
-            ValueError: thresholds that cut the depth into too many bins.
+            ValueError: the thresholds divide the depth into too many bins.
         """
         return cls(depth, intrinsics, _scaled(config, *depth.shape[1:]), features)
 
     @classmethod
     def of_frame(cls, frame: FrameInput, config: UfMStarConfig) -> SegmentInput:
-        """The input of step 2 from a checked frame, whose depth is 0 where a pixel is not valid."""
+        """The input of step 2 from a checked frame, whose depth is 0 at invalid pixels."""
         return cls.of(frame.depth, frame.intrinsics, config.segment, frame.features)
 
     @property
     def segments_per_row(self) -> int:
-        """Most segments that one row can hold: each has more than ``sparse`` pixels. At least 1."""
+        """Most segments in a row, each of which has more than ``sparse`` pixels; at least 1."""
         return max(1, self.depth.shape[2] // (self.config.sparse + 1))
 
     @property
     def depth_bins(self) -> int:
-        """Enough depth bins to reach max_depth whatever the camera: none is shorter than L0."""
+        """Number of depth bins that reaches max_depth for every camera, since no bin is shorter than L0."""
         return math.ceil(self.config.depth_limit / self.config.min_gaussian_length) + 2
 
 
-@functools.lru_cache(maxsize=16)  # a frame's worth of checks, for a value that never changes
+@functools.lru_cache(maxsize=16)  # constructing a config repeats its checks in every frame
 def _scaled(config: SPGFConfig, height: int, width: int) -> SPGFConfig:
     if config.depth_limit > MAX_DEPTH_BINS * config.min_gaussian_length:
         raise ValueError(

@@ -1,6 +1,6 @@
-"""First half of SPGF: every row of the depth map is cut into segments that are lines in x and z.
+"""First half of SPGF: divides every row of the depth map into segments that are lines in x and z.
 
-All rows of all images at once, column by column. Moments are kept about a segment's first pixel.
+Processes all rows of all images at once, column by column. Moments are taken about a segment's first pixel.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ufmstar_torch.segment_input import SegmentInput
 
 
 class OpenSegment(NamedTuple):
-    """Open segments: the columns of a table [..., 15]. d = p - pL; within a row y = ry z, so x and z say all."""
+    """Open segments: the columns of a table [..., 15]. d = p - pL; within a row y = ry z, so x and z suffice."""
 
     n: Tensor
     dx: Tensor  # sums of d_x, d_z, d_x^2, d_x d_z, d_z^2
@@ -34,12 +34,12 @@ class OpenSegment(NamedTuple):
     u_left: Tensor
     u_right: Tensor
     nearest: Tensor  # smallest depth bin
-    born: Tensor  # how many segments the row had started before
+    born: Tensor  # index in the row, in order of creation
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The images as R = B H rows [R, W] in float64, 0 where a pixel does not take part."""
+    """The images as R = B H rows [R, W] in float64, 0 where a pixel is ignored."""
 
     inputs: SegmentInput
     z: Tensor
@@ -63,7 +63,7 @@ class Frame:
         rx = (torch.arange(width, dtype=dtype, device=z.device) - cx[:, None]) / fx[:, None]
         ry = (torch.arange(height, dtype=dtype, device=z.device) - cy[:, None]) / fy[:, None]
         lengths, edges = _depth_bins(inputs, 0.5 * torch.minimum(width / fx, height / fy))
-        # An accelerator does not refuse a camera of NaN, since the check would wait: no index beyond the table then.
+        # On an accelerator, NaN in the intrinsics is not rejected here (that would synchronise): clamp the index.
         bins = torch.searchsorted(edges, z.reshape(b, -1)).clamp_max(inputs.depth_bins - 1)
         return cls(
             inputs, z.reshape(-1, width), use.reshape(-1, width),
@@ -77,7 +77,7 @@ class Frame:
 
 
 def _depth_bins(inputs: SegmentInput, s: Tensor) -> tuple[Tensor, Tensor]:
-    """Lengths and far edges [B, bins] of the depth bins [m]; edges beyond max_depth do no harm."""
+    """Lengths and far edges [B, bins] of the depth bins [m]; edges may lie beyond max_depth."""
     limits = inputs.config
     length = torch.full_like(s, limits.min_gaussian_length)
     edge = torch.zeros_like(s)
@@ -93,9 +93,12 @@ def _depth_bins(inputs: SegmentInput, s: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class Segments:
-    """Finished segments of every row in order of output, M at most.
+    """Finished segments of every row in order of output, at most M.
 
-    table: [R, M, 15] as :class:`OpenSegment`; count: [R]; pixel: [R, W] the pixel's segment, -1 = none.
+    Attributes:
+        table: [R, M, 15] as :class:`OpenSegment`.
+        count: [R].
+        pixel: [R, W] the pixel's segment, -1 = none.
     """
 
     table: Tensor
@@ -130,14 +133,13 @@ def _columns(frame: Frame) -> Iterator[_Column]:
         "tau_x": t.clamp(limits.noise_floor, limits.line_thresh),
     }
     for u in range(frame.z.shape[1]):
-        here = {name: value[:, u : u + 1] for name, value in maps.items()}
-        yield _Column(u=u, **here)
+        yield _Column(u=u, **{name: value[:, u : u + 1] for name, value in maps.items()})
 
 
 def scanlines(frame: Frame) -> Segments:
     """Scanline segmentation of all rows at once, column by column.
 
-    ``queue`` [R, max_open, 15] holds the open segments, newest first; an empty place has n = 0.
+    ``queue`` [R, max_open, 15] holds the open segments, newest first; an empty entry has n = 0.
     """
     limits = frame.inputs.config
     rows, width = frame.z.shape
@@ -161,13 +163,13 @@ def scanlines(frame: Frame) -> Segments:
         owner[:, p.u] = torch.where(p.use[:, 0], born, -1).to(torch.int64)
     for q in range(limits.max_open):
         done.add(queue[:, q], torch.ones_like(done.count, dtype=torch.bool))
-    # An owner of -1 looks up place -1, which is the last one and holds -1.
+    # Pixels without a segment read entry ``width``, which is -1.
     pixel = done.finished_index.gather(1, torch.where(owner < 0, width, owner))
     return Segments(done.table[:, :-1], done.count, pixel)
 
 
 def _fits(open_: OpenSegment, p: _Column, limits: SPGFConfig) -> Tensor:
-    """[R, max_open] which open segments the pixel continues."""
+    """[R, max_open] True where the pixel continues an open segment."""
     near = (open_.n > 0) & (p.u - open_.u_right <= limits.occlusion_gap) & (open_.w2 < p.length2)
     close = ((p.z - open_.z_right).abs() < p.tau_z) & ((p.x - open_.x_right).abs() < p.tau_x)
     flat = open_.dx == 0
@@ -177,7 +179,7 @@ def _fits(open_: OpenSegment, p: _Column, limits: SPGFConfig) -> Tensor:
 
 
 def _fresh(p: _Column, started: Tensor) -> Tensor:
-    """[R, 1, 15] a segment without pixels, anchored at the present one."""
+    """[R, 1, 15] a segment without pixels that starts at the current pixel."""
     zero = torch.zeros_like(p.x)
     values = dict.fromkeys(OpenSegment._fields, zero)
     values |= {"x_left": p.x, "z_left": p.z, "u_left": zero + p.u, "nearest": p.bins.to(zero), "born": started}
@@ -185,7 +187,7 @@ def _fresh(p: _Column, started: Tensor) -> Tensor:
 
 
 def _extended(open_: OpenSegment, p: _Column, y_factor: Tensor) -> OpenSegment:
-    """Every open segment with the pixel added; the caller picks the one it belongs to."""
+    """All open segments with the pixel added; the caller selects its segment."""
     dx, dz = p.x - open_.x_left, p.z - open_.z_left
     return open_._replace(
         n=open_.n + 1,
@@ -203,7 +205,7 @@ def _extended(open_: OpenSegment, p: _Column, y_factor: Tensor) -> OpenSegment:
 
 
 class _Finished:
-    """Collects finished segments; one entry more than needed catches what is not to be kept."""
+    """Collects finished segments; an additional last entry receives the segments that are dropped."""
 
     def __init__(self, z: Tensor, most: int, sparse: int) -> None:
         rows, width = z.shape
@@ -216,8 +218,8 @@ class _Finished:
         """Output the segments [R, 15] where ``mask`` [R] is True and they are not too sparse."""
         open_ = OpenSegment(*segment.unbind(-1))
         keep = mask & (open_.n > self.sparse)
-        at = torch.where(keep, self.count, self.most)[:, None, None].expand(-1, 1, segment.shape[1])
-        self.table.scatter_(1, at, segment[:, None])
+        index = torch.where(keep, self.count, self.most)[:, None, None].expand(-1, 1, segment.shape[1])
+        self.table.scatter_(1, index, segment[:, None])
         start = torch.where(keep, open_.born.to(torch.int64), self.width)
         self.finished_index.scatter_(1, start[:, None], torch.where(keep, self.count, -1)[:, None])
         self.count = self.count + keep

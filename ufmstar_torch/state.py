@@ -1,4 +1,4 @@
-"""All that UfM* remembers between images: the one place where the tensors of the state are named."""
+"""The state of UfM* between images: defines all of its tensors."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class UfMStarState:
         mean, covariance, weight, disagreement, count, features: M_i (:class:`GaussianMixture`) in the frame of each
             stream's first camera.
         T_world_first: [B, 4, 4] float64 pose of that camera; identity before the first frame.
-        started: [B] bool, True once a stream has seen a frame.
+        started: [B] bool, True after the first frame of a stream.
         frames: [B] int64 number of frames used.
-        skipped: [B] int64 number of frames skipped for a fault.
+        skipped: [B] int64 number of frames skipped because of a fault.
         smoothed: [B, H, W] moving average of the dense disagreement [m^2] in the mixture's dtype, NaN without a
             value; of size 0 x 0 before the first average.
-        by_component: tensors of extensions [B, K, C] by name, sums over what was observed of each component.
+        by_component: tensors of extensions [B, K, C] by name, sums over the observations of each component.
         by_stream: tensors of extensions [B, C] by name, which describe a stream as a whole.
     """
 
@@ -69,15 +69,15 @@ class UfMStarState:
         return GaussianMixture(self.mean, self.covariance, self.weight, self.disagreement, self.count, self.features)
 
     def require(self, config: UfMStarConfig, like: UfMStarState) -> None:
-        """Check tensors that come from elsewhere, a checkpoint say, before they become a state.
+        """Check tensors from outside, for example a checkpoint, before they are used.
 
         Args:
             config: of UfM*.
-            like: a state with the tensors of the extensions, of any number of streams and components.
+            like: a state with the tensors of the extensions, with any number of streams and components.
 
         Raises:
-            ValueError: shapes that do not fit each other or the config; values that are not finite or out of their
-                range; covariances that are not positive definite; more slots than ``config.max_components``.
+            ValueError: shapes that do not fit each other or the config; values that are not finite or out of range;
+                covariances that are not positive definite; more slots than ``config.max_components``.
         """
         if self.weight.dim() != 2:
             raise ValueError(f"weight must be [B, K], got {tuple(self.weight.shape)}")
@@ -93,7 +93,7 @@ class UfMStarState:
         tensors = self.tensors()
         for name, shape in shapes.items():
             if (actual := tuple(tensors[name].shape)) != shape:
-                raise ValueError(f"{name} must have shape {shape} beside weight {(b, k)}, got {actual}")
+                raise ValueError(f"{name} must have shape {shape} to match weight {(b, k)}, got {actual}")
         if config.max_components is not None and k > max(config.max_components, 1):
             raise ValueError(f"{k} slots exceed max_components = {config.max_components}")
         if self.weight.device.type == "meta":
@@ -108,7 +108,7 @@ class UfMStarState:
         if bool((occupied[:, 1:] & ~occupied[:, :-1]).any()):
             raise ValueError("weight has an empty slot before an occupied one")
         covariance = self.covariance[occupied].double()
-        # A rotation leaves the rounding of one entry and its mirror image apart.
+        # A rotation rounds an entry and its transpose differently.
         lopsided = (covariance - covariance.mT).abs() > 1e-4 * covariance.abs().amax((-2, -1), keepdim=True)
         if bool(lopsided.any()) or bool(torch.linalg.cholesky_ex(covariance).info.any()):
             raise ValueError("covariance holds matrices that are not symmetric and positive definite")
@@ -121,7 +121,7 @@ class UfMStarState:
         return {**{name: getattr(self, name) for name in NAMES}, **self.by_component, **self.by_stream}
 
     def with_tensors(self, changed: Mapping[str, Tensor]) -> UfMStarState:
-        """A copy with some of its tensors exchanged, by name."""
+        """A copy with some tensors replaced, by name."""
         tensors = {**self.tensors(), **changed}
         return UfMStarState(
             **{name: tensors[name] for name in NAMES},
@@ -130,7 +130,7 @@ class UfMStarState:
         )
 
     def restarted(self, again: Tensor) -> UfMStarState:
-        """The state with the streams of the mask ``again`` [B] as they were before their first frame."""
+        """A copy with the streams of the mask ``again`` [B] set to the state before their first frame."""
         start = {"T_world_first": torch.eye(4, dtype=torch.float64, device=again.device), "smoothed": torch.nan}
 
         def value(name: str, old: Tensor) -> Tensor:
@@ -140,5 +140,5 @@ class UfMStarState:
         return self.with_tensors({name: value(name, old) for name, old in self.tensors().items()})
 
 
-# Names of the tensors that the paper's state has, in order.
+# Names of the tensors without extensions, in order.
 NAMES = tuple(f.name for f in fields(UfMStarState) if f.name not in ("by_component", "by_stream"))

@@ -18,12 +18,13 @@ from ufmstar_torch.checked import Checked
 class StatefulModule(nn.Module):
     """A module whose state is a fixed set of buffers.
 
-    Buffers are float32 or float64 whatever ``.half()`` is asked for. A saved state brings its own shapes (streams,
-    components, image size) and contains the config with which it was made.
+    Buffers stay float32 or float64, even after ``.half()``. Loading a saved state changes the buffers' shapes (streams,
+    components, image size). A saved state contains the module's config.
 
     Attributes:
         STATE: the buffers' names.
-        ALWAYS_FLOAT64: those of them that keep float64 under ``.float()``: a world coordinate of kilometres needs it.
+        ALWAYS_FLOAT64: names of the buffers that stay float64 under ``.float()``, as world coordinates of kilometres
+            require.
         config: of the module.
     """
 
@@ -34,15 +35,15 @@ class StatefulModule(nn.Module):
     if TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Tensor:
-            """The buffers are the only attributes that are not in ``__dict__``."""
+            """Attributes that are not in ``__dict__`` are buffers."""
 
     def _store(self, state: Mapping[str, Tensor]) -> None:
-        """Exchange all buffers."""
+        """Replace all buffers."""
         self._buffers.update({name: state[name] for name in self.STATE})
 
     def _chosen(self, streams: Sequence[int] | Tensor, count: int) -> Tensor:
-        """Bool mask [count] of streams given as indices or as a mask, on the state's device. Raises IndexError: an
-        index is out of range; ValueError: a mask of the wrong length."""
+        """Convert stream indices or a mask to a bool mask [count] on the state's device. Raises IndexError: an index is
+        out of range; ValueError: a mask of the wrong length."""
         device = getattr(self, self.STATE[0]).device
         indices = torch.as_tensor(streams, device=device)
         if indices.dtype == torch.bool and indices.shape != (count,):
@@ -52,14 +53,14 @@ class StatefulModule(nn.Module):
         return chosen
 
     def _settle(self) -> None:
-        """Write what is pending into the buffers, before they are saved, loaded, copied or moved."""
+        """Write pending results into the buffers before they are saved, loaded, copied or moved."""
 
     def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
         self._settle()
         super()._save_to_state_dict(destination, prefix, keep_vars)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """``.to()`` and friends, with the exceptions that the class states."""
+        """Applies ``.to()`` and similar conversions, with the exceptions in the class's docstring."""
         self._settle()
         before = {name: getattr(self, name) for name in self.STATE}
         super()._apply(fn, recurse)
@@ -71,14 +72,14 @@ class StatefulModule(nn.Module):
         return self
 
     def get_extra_state(self) -> Tensor:
-        """The config as bytes, so that a checkpoint (safetensors too) contains it."""
+        """The config as a tensor of bytes, which safetensors can store, too."""
         return _bytes_of(self.config).clone()
 
     def set_extra_state(self, state: Tensor) -> None:
-        """The module keeps its own config; :meth:`_load_from_state_dict` warns where the saved one differs."""
+        """Does nothing: the module's config stays; :meth:`_load_from_state_dict` warns if the saved one differs."""
 
     def _warn_of_config(self, state: object) -> None:
-        """Warn where the config of a saved state differs from this module's."""
+        """Warn if the config of a saved state differs from this module's."""
         saved, ours = flat(_config_of(state)), flat(plain(self.config))
         changed = sorted(k for k in saved.keys() | ours.keys() if saved.get(k) != ours.get(k))
         if changed:
@@ -86,13 +87,13 @@ class StatefulModule(nn.Module):
             warnings.warn(f"the loaded state was made with another config: {each}", stacklevel=4)
 
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
-        """Check a state that is about to be loaded, in the buffers' dtypes; errors as :meth:`accepted`."""
+        """Check a state before it is loaded, in the buffers' dtypes; errors as :meth:`accepted`."""
 
     def accepted(self, state_dict: Mapping[str, Any], prefix: str = "") -> dict[str, Tensor]:
-        """The tensors of a saved state, in the buffers' dtypes, once all of them are checked; nothing changes.
+        """Check a saved state without loading it. Returns its tensors in the buffers' dtypes.
 
         Raises:
-            ValueError: tensors that do not fit together, or values that no run can produce.
+            ValueError: tensors that do not match each other, or invalid values.
         """
         self._settle()
         try:
@@ -110,7 +111,7 @@ class StatefulModule(nn.Module):
         self, state_dict: dict[str, Any], prefix: str, metadata: Any, strict: bool,
         missing: list[str], unexpected: list[str], errors: list[str],
     ) -> None:  # fmt: skip
-        """Check the whole of a saved state, then take its shapes and copy its values: all of it or nothing."""
+        """Check a saved state completely before adopting its shapes and copying its values."""
         expected = [prefix + name for name in (*self.STATE, "_extra_state")]
         absent = [key for key in expected if key not in state_dict]
         foreign = [key for key in state_dict if key.startswith(prefix) and key not in expected]
@@ -124,7 +125,7 @@ class StatefulModule(nn.Module):
             errors.append(str(error))
             return
         if prefix + "_extra_state" in state_dict:
-            self._warn_of_config(state_dict[prefix + "_extra_state"])  # an error for some: before anything changes
+            self._warn_of_config(state_dict[prefix + "_extra_state"])  # before any change: it may be raised as an error
         for name, value in saved.items():
             if value.shape != (buffer := getattr(self, name)).shape:
                 setattr(self, name, torch.empty(value.shape, dtype=buffer.dtype, device=buffer.device))
@@ -132,7 +133,7 @@ class StatefulModule(nn.Module):
 
 
 def _fitting(name: str, saved: object, buffer: Tensor) -> Tensor:
-    """A saved tensor in the dtype of its buffer. Raises ValueError: it is no tensor, or of another kind of dtype."""
+    """A saved tensor in its buffer's dtype. Raises ValueError: no tensor, or another kind of dtype."""
     kind = saved.dtype if isinstance(saved, Tensor) else type(saved).__name__
     both_floats = isinstance(saved, Tensor) and saved.is_floating_point() and buffer.is_floating_point()
     if not isinstance(saved, Tensor) or not (both_floats or saved.dtype == buffer.dtype):
@@ -142,12 +143,12 @@ def _fitting(name: str, saved: object, buffer: Tensor) -> Tensor:
 
 @lru_cache(maxsize=16)
 def _bytes_of(config: Checked) -> Tensor:
-    """Its plain values as the bytes of JSON."""
+    """The config's plain values as bytes of JSON."""
     return torch.tensor(list(json.dumps(config.to_dict()).encode()), dtype=torch.uint8)
 
 
 def _config_of(state: object) -> dict[str, Any]:
-    """The config in a saved ``_extra_state``. Raises ValueError: it is no tensor of bytes that hold a JSON object."""
+    """The config in a saved ``_extra_state``. Raises ValueError: no tensor of bytes with a JSON object."""
     if not isinstance(state, Tensor) or state.dtype != torch.uint8 or state.dim() != 1:
         raise ValueError("_extra_state must be a tensor of bytes [n], the config as JSON")
     try:
@@ -160,22 +161,22 @@ def _config_of(state: object) -> dict[str, Any]:
 
 
 def plain(config: Checked) -> dict[str, Any]:
-    """Its values as JSON returns them."""
+    """The config's values after a round trip through JSON."""
     return _config_of(_bytes_of(config))
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested values by dotted name, as segment.min_pixels; lists of mappings by number."""
-    found: dict[str, Any] = {}
+    """Nested values by dotted name, for example segment.min_pixels; lists of mappings by number."""
+    by_name: dict[str, Any] = {}
     for name, value in values.items():
         if isinstance(value, list) and value and isinstance(value[0], Mapping):
             value = {str(number): item for number, item in enumerate(value)}
-        found |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) and value else {prefix + name: value}
-    return found
+        by_name |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) and value else {prefix + name: value}
+    return by_name
 
 
 def full_precision(device: torch.device) -> AbstractContextManager[object]:
-    """Autocast off, where it is on: it would turn products into half precision."""
+    """Disable autocast, which would compute products in half precision."""
     kind = device.type
     if kind == "meta" or not torch.amp.is_autocast_available(kind) or not torch.is_autocast_enabled(kind):
         return nullcontext()
@@ -183,5 +184,5 @@ def full_precision(device: torch.device) -> AbstractContextManager[object]:
 
 
 def outliving() -> AbstractContextManager[object]:
-    """The caller's inference mode off, where it is on: a state must outlive it."""
+    """Disable the caller's inference mode, since tensors of the state must outlive it."""
     return torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext()

@@ -1,9 +1,9 @@
-"""One image through steps 2 to 5: a pure function from state and frame to state and output.
+"""Steps 2 to 5 for one image: a pure function from state and frame to state and output.
 
-The mixture is kept in the frame of each stream's first camera: poses are taken relative to it in
-float64, so large world coordinates never reach the float32 state, and what a frame does not update never changes.
+The mixture is stored in the frame of each stream's first camera. Poses are converted to that frame in float64, so large
+world coordinates never reach the float32 state, and components that a frame does not update never change.
 
-:class:`Step` is what ``UfMStar`` calls; :func:`step` is the reference. Its kernels can be replaced one by one
+``UfMStar`` calls a :class:`Step`; :func:`step` is the reference. Its kernels can be replaced individually
 (``step_parts``); another implementation of the whole step has the same signature.
 """
 
@@ -31,7 +31,7 @@ from ufmstar_torch.step_parts import REFERENCE, Kernels, StepObserver
 
 
 class Step(Protocol):
-    """One image through steps 2 to 5; see :func:`step`."""
+    """Steps 2 to 5 for one image; see :func:`step`."""
 
     def __call__(
         self,
@@ -66,13 +66,13 @@ def step(
         config: of UfM*.
         pixels: [B, n] indices into the flattened image to regress only there; None = every pixel.
         smooth: apply the exponential moving average.
-        extensions: what they do during this frame.
-        observer: is called after every stage.
-        kernels: which implementation of each part.
-        grow: whether the mixture may get more slots; False: the caller has seen to it.
+        extensions: extensions during this frame.
+        observer: called after every stage.
+        kernels: implementation of each part.
+        grow: whether the mixture may get more slots; False: the caller has provided enough.
 
     Returns:
-        The new state and the output. A stream whose frame is at fault keeps its state and gets NaN.
+        The new state and the output. For a stream with a faulty frame, the state is unchanged and the output is NaN.
     """
     stage = unobserved if observer is None else observer.stage
     fine = frame.fault == 0
@@ -90,7 +90,7 @@ def step(
     if config.disagreement == "overlap":
         pairs = with_overlap_disagreement(pairs, previous_cam, current_cam)
     matched = pairs.match.any(dim=2)
-    # A Gaussian nearer than the near plane could never be matched again: it is not appended.
+    # A Gaussian nearer than the near plane is not appended: it could never be matched.
     far_enough = current_cam.mean[..., 2] > config.near_plane
     new = current_cam.valid & far_enough & ~matched
     current_first = current_cam.rigid(*relative_pose(frame.T_world_cam, first))
@@ -139,7 +139,7 @@ def step(
 
 
 def frame_statistics(frame: FrameInput, counts: Mapping[str, Tensor]) -> FrameStatistics:
-    """The statistics of a frame, of which the step counted ``counts`` and the check the others."""
+    """The statistics of a frame: ``counts`` from the step, the others from the check of the frame."""
     return FrameStatistics(
         **counts,
         beyond=frame.beyond,
@@ -150,18 +150,18 @@ def frame_statistics(frame: FrameInput, counts: Mapping[str, Tensor]) -> FrameSt
 
 
 def unobserved(name: str) -> None:
-    """Without an observer nothing happens between stages."""
+    """The stage callback without an observer: does nothing."""
 
 
 def _segment(frame: FrameInput, config: UfMStarConfig, kernels: Kernels, stored: torch.dtype) -> GaussianMixture:
     """Step 2: C_i in the camera frame, float64.
 
-    SPGF's raw moments have no floor: eigenvalues are lifted to the variance across one pixel at that depth, (z/f)^2/12,
-    and to what the dtype ``stored`` of the mixture holds, as the fusion does.
+    SPGF's raw moments have no floor. Eigenvalues are raised to the variance across one pixel at that depth, (z/f)^2/12,
+    and to the least value that survives rounding to the mixture's dtype ``stored``, as in the fusion.
     """
     mixture = kernels.spgf(SegmentInput.of_frame(frame, config))[0].to(torch.float64)
     fx, fy, _, _ = focal_and_centre(frame.intrinsics)
-    # Nearer than the near plane nothing is ever matched; the footprint there keeps the floor above zero.
+    # Gaussians nearer than the near plane are never matched; clamping z keeps their floor above zero.
     z = mixture.mean[..., 2].clamp_min(config.near_plane)
     floor = pixel_footprint(z, torch.minimum(fx, fy)[:, None])
     floor = torch.maximum(floor, storage_floor(mixture.covariance, stored))
@@ -172,10 +172,10 @@ def _segment(frame: FrameInput, config: UfMStarConfig, kernels: Kernels, stored:
 def _room(
     mixture: GaussianMixture, pairs: Correspondence, new: Tensor, config: UfMStarConfig, grow: bool
 ) -> tuple[int, int | None]:
-    """Slots that the frame needs, and a bound on the matches of any one component (None: the kernel reads it).
+    """The number of slots that the frame needs, and a bound on the matches of a component (None: the kernel reads it).
 
-    This is the step's only wait for an accelerator: one small read, which growth needs. With a capacity that cannot
-    grow nothing is read and the static bounds serve. Raises ValueError: growth on the meta device.
+    Growth needs the step's only synchronisation with an accelerator, a read of two numbers. If the capacity cannot
+    grow, the static bounds are returned without a read. Raises ValueError: growth on the meta device.
     """
     device, limit = mixture.mean.device.type, config.max_components
     if not grow or (device != "cpu" and limit is not None and mixture.capacity >= limit):

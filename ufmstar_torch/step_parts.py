@@ -1,4 +1,4 @@
-"""The replaceable parts of a step: what each computes, and the reference implementation of all."""
+"""The replaceable parts of a step: their interfaces, and the reference implementation."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from ufmstar_torch.segment_input import SegmentInput
 
 
 class StepObserver(Protocol):
-    """Follows a step from stage to stage, to time it; it changes no result."""
+    """Receives the end of each stage of a step, to time it; it changes no result."""
 
     def stage(self, name: str) -> None:
-        """A stage has ended: check, segment, correspond, fuse, append, regress or average, in this order.
+        """Called at the end of a stage: check, segment, correspond, fuse, append, regress or average, in this order.
 
-        Work between two kernels belongs to the stage that needs it. segment: SPGF and the floor of its
-        covariances. correspond: the mixture into the camera frame, and the matching. fuse: the disagreement of
-        overlaps, the segments into the first camera's frame, growth, and the fusion. append: the new components, the
-        mixture into the camera frame, and the columns of extensions. regress: the regression. average: the moving
-        average, statistics and the new state. The caller of a step ends "check" itself.
+        Work between two kernels belongs to the later stage. segment: SPGF and the floor of its covariances.
+        correspond: the transformation of the mixture into the camera frame, and the matching. fuse: the disagreement of
+        overlaps, the transformation of the segments into the first camera's frame, growth, and the fusion. append: the
+        new components, the transformation of the mixture into the camera frame, and the columns of extensions. regress:
+        the regression. average: the moving average, statistics and the new state. The caller of the step ends "check".
         """
         ...
 
@@ -37,7 +37,7 @@ SegmentKernel = Callable[[SegmentInput], tuple[GaussianMixture, Tensor]]
 
 @dataclass(frozen=True)
 class Kernels:
-    """The replaceable parts of :func:`step`; all take checked input, as the functions of ``REFERENCE``."""
+    """The replaceable parts of :func:`step`. Signatures as in ``REFERENCE``; all inputs are checked."""
 
     spgf: SegmentKernel  # step 2, without a floor
     floor_covariance: Callable[[Tensor, Tensor], Tensor]

@@ -1,4 +1,4 @@
-"""Warnings about a stream whose input looks mistaken: each once, to the logger ``ufmstar_torch``."""
+"""Warnings about implausible input of a stream: each once, to the logger ``ufmstar_torch``."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import FrameInput, doubtful_centre
 from ufmstar_torch.output import FrameStatistics
 
-# Frames and components before views are judged, and the share of components seen in one view alone from which
-# on it is. On rendered tours, at 1/10 of their frames too, right input stays below .7; poses in millimetres reach .99.
+# Least frames and components before a warning about views, and the largest share of components seen in only one view.
+# On rendered tours, also at 1/10 of their frames, correct input stays below .7; poses in millimetres reach .99.
 _FRAMES, _COMPONENTS, _ALONE = 8, 20, 0.9
-# Frames, each moved by a share of the depth, in which less than one anchor a frame was used.
+# Anchors: least frames in which the camera moved by this share of the depth; warn below one used anchor per such frame.
 _MOVED_FRAMES, _MOVED = 10, 0.01
-# Share of the pixels outside the accepted ranges, and the standard deviation of most pixels in their depths.
+# Largest share of pixels outside the accepted ranges, and largest standard deviation of most pixels over their depth.
 _OUTSIDE, _WIDE = 0.1, 10.0
-# A focal length per image size, over that of the frame before. A step over the largest one of the ``_FRAMES`` or more
-# before it, which also leads so many depths away. Relative change of most depths while the pose stays: .07 to .5 within
-# 8 frames of the moving cameras of recordings.
+# Largest ratio of the focal lengths (over the image size) of successive frames. Largest step over the largest previous
+# step, and over the mean depth, after ``_FRAMES`` steps. Largest median relative change of the depth under one pose:
+# moving cameras of recordings show .07 to .5 within 8 frames.
 _ZOOM, _JUMP, _AWAY, _CHANGE = 1.2, 10.0, 2.0, 0.1
-# Frames in a row that lie so many times nearer to the frame before the last one than to the last one.
+# Alternating poses: successive frames that lie this many times nearer to the frame before the last than to the last.
 _ALTERNATING, _NEARER = 6, 5.0
-# Of a batch whose streams are the frames of one video: streams, calls that continue the last one, and the distance
-# between successive frames over the step of the first stream. 1/B where frames are even.
+# A batch that holds successive frames of one video: least streams, successive calls, and the largest distance between
+# successive frames over the step of the first stream (1/B for a uniform motion).
 _BATCH, _CONTINUED, _SUCCESSIVE = 3, 3, 0.5
-# Of the depth maps every so many rows are looked at.
+# Stride of the depth maps' rows in these checks.
 _ROWS = 8
-# On an accelerator reading the counts waits for it: every so many frames, and not while a graph is recorded.
+# On an accelerator, reading the counts synchronises: only every so many frames, and not while a graph is recorded.
 EVERY = 64
 LOGGER = logging.getLogger("ufmstar_torch")
 _CAUSES = (
@@ -45,27 +45,27 @@ _CAUSES = (
 
 @dataclass
 class _Track:
-    """The frames of a stream without a fault so far."""
+    """Statistics of a stream's frames without a fault."""
 
-    first: list[list[float]]  # pose,
-    T: list[list[float]]  # and the last one
+    first: list[list[float]]  # first pose
+    T: list[list[float]]  # last pose
     focal: tuple[float, float]  # last fx / W and fy / H
     total: float  # sum of the last depth map's rows
-    anchored_at: list[float]  # position in the last frame with anchors that moved, and how many did,
-    moving: int = 0
-    used: int = 0  # with how many anchors
-    steps: int = 0  # poses that differ from the one before,
-    largest: float = 0.0  # by at most [m]
-    before: list[float] | None = None  # position before the last one,
-    alternating: int = 0  # and how many of the last frames were beside the one before
-    same: int = 0  # the last of them, with one depth map
-    still: int = 0  # last frames with one pose,
-    depth: Tensor | None = None  # and the depth map of the first of them
+    anchored_at: list[float]  # camera position in the last of the ``moving`` frames
+    moving: int = 0  # frames with anchors in which the camera had moved
+    used: int = 0  # anchors used in these frames
+    steps: int = 0  # changes of the pose
+    largest: float = 0.0  # longest step [m]
+    before: list[float] | None = None  # position before the last one
+    alternating: int = 0  # successive frames that returned to the position before the last
+    same: int = 0  # successive changes of the pose with an unchanged depth map
+    still: int = 0  # successive frames with an unchanged pose
+    depth: Tensor | None = None  # depth map at the first of the ``still`` frames
 
     def follow(
         self, T: list[list[float]], focal: tuple[float, float], depth: Tensor, total: float
     ) -> Iterator[tuple[str, str]]:
-        """Take in a frame; kinds and texts of warnings."""
+        """Update the statistics with a frame; yields kinds and texts of warnings."""
         step = math.dist(_position(T), _position(self.T))
         if max(max(new / old, old / new) for new, old in zip(focal, self.focal, strict=True)) > _ZOOM:
             each = " and ".join(f"{fx:.2f} of the width, {fy:.2f} of the height" for fx, fy in (self.focal, focal))
@@ -108,21 +108,21 @@ class _Track:
                 yield "pose", text + " in the median: is it updated?"
 
     def anchored(self, used: int, depth: float) -> str:
-        """Count the anchors used in a frame of this mean depth [m]; a warning where moving frames have hardly any."""
+        """Count the anchors used in a frame of this mean depth [m]; returns a warning if moving frames have too few."""
         if math.dist(position := _position(self.T), self.anchored_at) < _MOVED * depth:
             return ""
         self.anchored_at, self.moving, self.used = position, self.moving + 1, self.used + used
         if self.moving < _MOVED_FRAMES or self.used >= self.moving:
             return ""
         return (
-            f"{self.used} anchors were used in {self.moving} frames of a moving camera, so the error on which all "
-            "views agree is not measured. An anchor has a pixel (u, v) of the image, a depth [m] and a variance [m^2]. "
+            f"{self.used} anchors were used in {self.moving} frames of a moving camera, so the error that all views "
+            "share is not measured. An anchor has a pixel (u, v) of the image, a depth [m] and a variance [m^2]. "
             + _CAUSES
         )
 
 
 def _mean(depth: Tensor, total: float) -> float:
-    """[m] of the pixels with a depth, whose sum is ``total``; infinite without any."""
+    """Mean depth [m] of the pixels with a depth, whose sum is ``total``; infinite if there are none."""
     return total / count if (count := int((depth > 0).sum())) else math.inf
 
 
@@ -131,7 +131,7 @@ def _position(T: list[list[float]]) -> list[float]:
 
 
 class StreamWarnings:
-    """Looks at every frame and its counts, and warns of input that looks mistaken."""
+    """Checks every frame and its counts, and warns of implausible input."""
 
     _tracks: dict[int, _Track]
 
@@ -139,19 +139,19 @@ class StreamWarnings:
         self.reset()
 
     def reset(self, streams: Sequence[int] | None = None) -> None:
-        """Forget all warnings; with ``streams`` only what these streams showed."""
+        """Clear the statistics and the set of logged warnings; with ``streams``, only the statistics of these."""
         if streams is not None:
             self._tracks = {b: track for b, track in self._tracks.items() if b not in streams}
             return
         self._calls = self._continued = 0
-        self._named = set[tuple[int, str]]()
+        self._logged = set[tuple[int, str]]()
         self._tracks = {}
 
     def after_frame(
         self, frame: FrameInput, statistics: FrameStatistics, frames: Tensor, config: UfMStarConfig
     ) -> None:
-        """Warn of pixels that are not used, of components that no second view sees, and of cameras, poses, depth and
-        anchors that do not go together; ``frames`` [B] counts those used."""
+        """Warn of unused pixels, of components that only one view sees, and of inconsistent cameras, poses, depth and
+        anchors; ``frames`` [B] is the number of frames used."""
         device = frame.depth.device.type
         self._calls += 1
         if device == "meta" or (device != "cpu" and (self._calls % EVERY or torch.cuda.is_current_stream_capturing())):
@@ -162,9 +162,9 @@ class StreamWarnings:
             *_alone(statistics, frames),
             *self._tracked(frame, statistics),
         ):
-            if (b, kind) not in self._named:
-                self._named.add((b, kind))
-                LOGGER.warning("stream %d: %s (said once)", b, text)
+            if (b, kind) not in self._logged:
+                self._logged.add((b, kind))
+                LOGGER.warning("stream %d: %s (logged once)", b, text)
 
     def _tracked(self, frame: FrameInput, statistics: FrameStatistics) -> Iterator[tuple[int, str, str]]:
         rows = frame.depth[:, ::_ROWS]
@@ -187,7 +187,7 @@ class StreamWarnings:
                 yield b, "anchors", text
 
     def _one_video(self, poses: list[list[list[float]]]) -> Iterator[tuple[int, str, str]]:
-        """A warning where batch after batch the first stream goes on where the last one was."""
+        """A warning if the first stream of each batch continues the last stream of the previous batch."""
         if len(poses) < _BATCH or len(self._tracks) < len(poses):
             return
         before = [_position(self._tracks[b].T) for b in range(len(poses))]
@@ -197,7 +197,7 @@ class StreamWarnings:
         self._continued = self._continued + 1 if continues else max(self._continued - 1, 0)
         if self._continued == _CONTINUED:
             text = f"the {len(poses)} streams of a batch look like successive frames of one video. Views are compared "
-            yield 0, "batch", text + "within a stream alone: give one frame at a time"
+            yield 0, "batch", text + "within a stream only: pass one frame at a time"
 
 
 def _left_out(
@@ -225,7 +225,7 @@ def _left_out(
 
 
 def _spreads(frame: FrameInput) -> Iterator[tuple[int, str, str]]:
-    """Warnings of variances that are no variance in m^2, or 0 everywhere between the members of an ensemble."""
+    """Warnings about variances that cannot be in m^2, and about E = 0 at every pixel."""
     pixels = frame.valid.sum((1, 2))
     for name, variance in (("aleatoric", frame.aleatoric), ("epistemic", frame.epistemic)):
         if variance is None:
@@ -240,13 +240,13 @@ def _spreads(frame: FrameInput) -> Iterator[tuple[int, str, str]]:
     if frame.epistemic is None:
         return
     spread = (frame.valid & (frame.epistemic.detach() > 0)).any(2).any(1) | (pixels == 0)
-    for b in (b for b, some in enumerate(spread.tolist()) if not some):
+    for b in (b for b, positive in enumerate(spread.tolist()) if not positive):
         text = "epistemic is 0 at every pixel: are the members of the ensemble copies of one network, or does the "
         yield b, "copies", text + "network have no dropout in eval mode?"
 
 
 def hardly_compared(alone: int, components: int, frames: int) -> str:
-    """A warning where one frame alone has seen nearly all of so many components after so many frames; else ""."""
+    """A warning if, after ``frames`` frames, nearly all components were seen in only one view (``alone``); else ""."""
     if frames < _FRAMES or components < _COMPONENTS or alone <= _ALONE * components:
         return ""
     text = (

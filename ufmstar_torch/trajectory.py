@@ -1,4 +1,4 @@
-"""A camera's poses over time, and the pose between two of them."""
+"""A camera's poses over time, and their interpolation."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# An image this close to a sample takes its pose as it is, whatever the gap around it [s]: timestamps are
-# printed with four to six decimals, and at 1 m/s the camera moves 1 mm in that time.
+# [s] An image this close to a sample has the sample's pose, whatever the gap around it: timestamps are printed with
+# four to six decimals, and at 1 m/s the camera moves 1 mm in that time.
 SAME_TIME = 1e-3
-# An image between samples that are too far apart, or outside the trajectory, takes a sample this close as it is [s]:
-# a camera at 1 m/s is 5 mm away from it.
+# [s] An image between samples that are too far apart, or outside the trajectory, has the pose of a sample this close:
+# at 1 m/s the camera moves 5 mm in that time.
 _NEAREST = 5e-3
 
 
@@ -18,8 +18,7 @@ _NEAREST = 5e-3
 class Trajectory:
     """Camera-to-world poses, in order."""
 
-    # [N] float64, strictly increasing [s] (or frame numbers, if the file has those), or None where pose i belongs to
-    # frame i.
+    # [N] float64, strictly increasing [s] (or frame numbers, if the file has those). None: pose i is that of frame i.
     timestamps: np.ndarray | None
     T_world_cam: np.ndarray  # [N, 4, 4] float64; a pose that was not finite in the file is all NaN
 
@@ -30,12 +29,12 @@ class Trajectory:
 def interpolate_pose(trajectory: Trajectory, time: float, max_gap: float = 0.1) -> np.ndarray | None:
     """The camera-to-world pose [4, 4] at ``time`` [s], between the samples before and after it.
 
-    The position is interpolated linearly, the rotation along the shortest arc (slerp). A sample within 1 ms is taken as
-    it is; and where the samples before and after lie more than ``max_gap`` [s] apart, or one of them is missing at the
-    end of the trajectory, one within 5 ms. NaN where a sample that is needed is not finite.
+    The position is interpolated linearly, the rotation along the shortest arc (slerp). A sample within 1 ms is returned
+    unchanged. If the samples before and after lie more than ``max_gap`` [s] apart, or at an end of the trajectory, a
+    sample within 5 ms is returned. The pose is NaN if a sample that it needs is not finite.
 
     Returns:
-        The pose; None where there is none.
+        The pose; None if there is no sample close enough.
 
     Raises:
         ValueError: the trajectory has no timestamps.
@@ -63,8 +62,8 @@ def interpolate_pose(trajectory: Trajectory, time: float, max_gap: float = 0.1) 
 
 
 def _part_of_turn(R: np.ndarray, share: float) -> np.ndarray:
-    """A share of a rotation [3, 3] about its own axis. Its quaternion is the eigenvector of the largest eigenvalue of a
-    symmetric matrix (Bar-Itzhack 2000), which also holds at half a turn; rotated about the axis by Rodrigues."""
+    """A rotation [3, 3] about the axis of R by a share of its angle (Rodrigues' formula). R's quaternion is the
+    eigenvector of the largest eigenvalue of a symmetric matrix (Bar-Itzhack 2000), also for an angle of pi."""
     skew = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     matrix = np.zeros((4, 4))
     matrix[:3, :3] = R + R.T - np.trace(R) * np.eye(3)

@@ -33,23 +33,23 @@ from ufmstar_torch.warm_up import warm_up
 
 
 class UfMStar(StatefulModule):
-    """Uncertainty from Motion*: feed it one predicted depth map per image, read a variance per pixel.
+    """Uncertainty from Motion*: computes a variance per pixel from one predicted depth map per image.
 
-    The state (the mixture of every stream) lives in buffers: ``.to()``, ``deepcopy`` and ``state_dict``
-    carry it, and a run continued from a saved state equals an uninterrupted one to the last bit. The
-    state is float32 or float64 (``.half()`` leaves it alone); poses and the fusion are float64 throughout,
-    also under autocast. A frame that raises leaves the state as it was. Nothing is learned: gradients flow to
-    ``aleatoric`` and ``epistemic`` through ``variance``, and to nothing else.
+    The state (the mixture of every stream) consists of buffers: ``.to()``, ``deepcopy`` and ``state_dict`` include it,
+    and a run continued from a saved state equals an uninterrupted one to the last bit. The state is float32 or float64,
+    also after ``.half()``; poses and the fusion are float64, also under autocast. A frame that raises does not change
+    the state. There are no learnable parameters: gradients flow from ``variance`` to ``aleatoric`` and ``epistemic``
+    only.
 
     Args:
         config: None = ``UfMStarConfig()``, which differs from the paper's settings as listed in
             :meth:`UfMStarConfig.paper`.
-        extensions: further ones beside those of the config's sections, as a
+        extensions: extensions in addition to those of the config's sections, for example a
             :class:`~ufmstar_torch.recalibrate.Recalibration` of V.
         dtype: of the state, torch.float32 or torch.float64.
-        device: of the state until ``.to()``; it follows the first frame otherwise.
+        device: of the state until ``.to()``; None = that of the first frame.
 
-    Attribute ``observer``: follows the stages of every step, to time them (``step_parts.StepObserver``), or None.
+    Attribute ``observer``: receives the stages of every step, to time them (``step_parts.StepObserver``), or None.
 
     Example::
 
@@ -62,7 +62,7 @@ class UfMStar(StatefulModule):
     STATE = NAMES
     config: UfMStarConfig
     observer: StepObserver | None = None
-    _kept_step: tuple[tuple[str, str], Step, CheckKernel] | None = None
+    _cached_step: tuple[tuple[str, str], Step, CheckKernel] | None = None
 
     def __init__(
         self,
@@ -100,32 +100,32 @@ class UfMStar(StatefulModule):
         """Process one predicted depth map per stream and return its variance.
 
         Args:
-            depth: [B, H, W] or [B, 1, H, W] metric depth along the optical axis [m], any floating dtype; this
-                and the others are tensors or NumPy arrays. Accepted is [1e-6 m, 1e6 m], and at most
-                ``config.segment.max_depth``: state the network's largest depth there. Pixels beyond
-                (``statistics.beyond``) or otherwise outside (``out_of_range``) are not valid, nor NaN or infinite ones.
+            depth: [B, H, W] or [B, 1, H, W] metric depth along the optical axis [m], any floating dtype; all arguments
+                are tensors or NumPy arrays. The accepted range is [1e-6 m, 1e6 m], and at most
+                ``config.segment.max_depth``: set it to the network's largest depth. Pixels beyond it
+                (``statistics.beyond``) or otherwise outside (``out_of_range``), NaN and infinity are not valid.
             pose: [B, 4, 4] or [4, 4] camera-to-world (T_world_cam) [m], or without its last row; coordinates up to
-                1e9 m. Rotations off by at most ``config.rotation_tolerance`` are projected onto SO(3) and reported.
+                1e9 m. Rotations within ``config.rotation_tolerance`` are projected onto SO(3).
             intrinsics: [B, 3, 3] or [3, 3], or fx, fy, cx, cy, in pixels of this depth map (not of the image:
                 ``resize_intrinsics``), first pixel's centre at (0, 0); a focal length of 0.01 to 1e7 px, and the
                 principal point on the map.
-            aleatoric: like ``depth``, the network's own variance A [m^2]; pixels where it does not lie in [0, 1e12] are
-                left out and counted.
+            aleatoric: like ``depth``, the network's variance A [m^2]; pixels outside [0, 1e12] are not valid.
             epistemic: likewise E [m^2].
             valid: like ``depth``, bool, True = use.
             features: [B, F, H, W] with F = ``config.features``, averaged per component and regressed; of at most 1e12.
-            **inputs: what an extension takes per frame, by the name of its section in the config; None = nothing.
+            **inputs: inputs of extensions, by the name of the extension's section in the config; None = no input.
 
         Raises:
             TypeError: wrong kind of argument or dtype.
-            ValueError: wrong shape or device; another number of streams than before (:meth:`reset` first); a pose that
-                is not rigid, bad intrinsics (counted with ``on_bad_frame="skip"``); input of an extension that is off.
+            ValueError: wrong shape or device; another number of streams than before (call :meth:`reset` first); a pose
+                that is not rigid or invalid intrinsics (with ``on_bad_frame="skip"``: counted instead); input of an
+                extension that is off.
         """
         depth = as_tensor("depth", depth)
         a, e = (None if v is None else as_tensor(n, v) for n, v in (("aleatoric", aleatoric), ("epistemic", epistemic)))
         frame = self._checked(depth, pose, intrinsics, a, e, valid, features)
         out, maps = self._observe(frame, inputs)
-        as_given: dict[str, Any] = {"epistemic": e} if self.config.aleatoric_in_h else {"aleatoric": a, "epistemic": e}
+        originals: dict[str, Any] = {"epistemic": e} if self.config.aleatoric_in_h else {"aleatoric": a, "epistemic": e}
 
         def shaped(value: Tensor) -> Tensor:
             return value if value.shape == depth.shape else value.reshape(depth.shape)
@@ -133,7 +133,7 @@ class UfMStar(StatefulModule):
         maps = {name: None if value is None else shaped(value) for name, value in maps.items()}
         return UfMStarOutput(
             depth=depth,
-            **maps | as_given,
+            **maps | originals,
             features=out.features[..., : self.config.features],
             measured=shaped(out.measured),
             valid=shaped(frame.valid),
@@ -160,15 +160,15 @@ class UfMStar(StatefulModule):
         average: bool = False,
         **inputs: Any,
     ) -> MeanUncertainty:
-        """Averages per image for active learning (section "Compute- and memory efficiency"), of V, M, A, E and B:
-        :meth:`forward`, but only a sample of pixels is regressed. First views have nothing to be compared with
-        (``measured`` near 0): their mean is that of ``config.unmeasured``. Extensions that need whole maps do nothing.
+        """Averages of V, M, A, E and B per image for active learning (section "Compute- and memory efficiency"). Like
+        :meth:`forward`, but regresses only a sample of pixels. For a first view (``measured`` near 0),
+        ``config.unmeasured`` determines the mean. Extensions that need whole maps do nothing.
 
         Args:
-            pixels: size of the sample per image; or
-            fraction: the same as a share of all pixels, in (0, 1]. Neither: 1000 pixels.
-            seed: of the sample, which depends on nothing else but the image's size and its valid pixels.
-            average: apply the moving average, as :meth:`forward` does; else the mean is that of this frame's V alone.
+            pixels: size of the sample per image; None, without ``fraction``: 1000.
+            fraction: size of the sample as a share of all pixels, in (0, 1]; excludes ``pixels``.
+            seed: of the sample, which otherwise depends only on the image's size and its valid pixels.
+            average: apply the moving average, as :meth:`forward` does; else the mean is over this frame's V only.
 
         Raises:
             ValueError: both ``pixels`` and ``fraction``, or one out of range; and as :meth:`forward`.
@@ -182,29 +182,29 @@ class UfMStar(StatefulModule):
     def warm_up(
         self, size: tuple[int, int], *, streams: int = 1, progress: Callable[[int, int], object] | None = None
     ) -> None:
-        """Compile all kernels, or load them from disk, by running two synthetic frames in a module of its own.
+        """Compile all kernels, or load them from disk, by running two synthetic frames in a separate module.
 
         Args:
             size: (H, W) of the depth maps [px], positive.
             streams: B.
-            progress: is called with the number of stages done and of all.
+            progress: called with the number of completed stages and of all stages.
         """
         twin = UfMStar(self.config, dtype=self.mean.dtype, device=self.mean.device)
         warm_up(twin, size, streams, progress)
 
     def query(self, points: Array, frame: str = "world") -> Regression:
-        """The disagreement at any 3D point, from the present mixture, without touching the state.
+        """The disagreement at any 3D point, from the current mixture; the state does not change.
 
         Args:
             points: [B, N, 3] [m].
             frame: "world" (the poses' frame) or "first" (each stream's first camera).
 
         Returns:
-            disagreement [B, N] [m^2] and features [B, N, F]. Where nothing was measured the disagreement is NaN, with
-            ``config.unmeasured = "paper"`` the prior's: a point has no depth of which "relative" could be a share.
+            disagreement [B, N] [m^2] and features [B, N, F]. Where M was not measured, the disagreement is NaN, or the
+            paper's value with ``config.unmeasured = "paper"``; "relative" gives NaN, since a point has no depth.
 
         Raises:
-            ValueError: wrong shape or frame, or no frame has been taken in yet.
+            ValueError: wrong shape or frame, or there was no frame yet.
         """
         if frame not in ("world", "first"):
             raise ValueError(f"frame must be 'world' or 'first', got {frame!r}")
@@ -225,26 +225,26 @@ class UfMStar(StatefulModule):
 
     @property
     def mixture(self) -> GaussianMixture:
-        """M_i, [B, K], in the frame of each stream's first camera (``T_world_first`` takes it to the world)."""
+        """M_i, [B, K], in the frame of each stream's first camera (``T_world_first`` is its pose)."""
         return self.state.mixture
 
     @property
     def state(self) -> UfMStarState:
-        """The state as a step (``ufmstar_torch.step``) takes it."""
+        """The state, as an argument of ``ufmstar_torch.step``."""
         self._settle()
         return self._stored()
 
     def reset(self, streams: Sequence[int] | Tensor | None = None, *, keep_evidence: bool = False) -> None:
-        """Forget everything, or only some streams.
+        """Reset all streams, or some of them.
 
         Args:
-            streams: indices, or a bool mask [B]; None = all, after which another batch size may follow.
-            keep_evidence: keep what extensions have learnt of a stream as a whole, for a robot that starts in the same
-                place again. What belongs to single components goes with them. The batch size stays.
+            streams: indices, or a bool mask [B]; None = all, after which the batch size may change.
+            keep_evidence: keep the extensions' statistics per stream, for a robot that starts again in the same place.
+                Statistics per component are dropped with the components. The batch size stays.
 
         Raises:
             IndexError: an index is out of range.
-            ValueError: a mask of the wrong length; ``keep_evidence`` without an extension that learns.
+            ValueError: a mask of the wrong length; ``keep_evidence`` without an extension that has statistics.
         """
         if keep_evidence and not self._empty.by_stream:
             raise ValueError("keep_evidence needs UfMStarConfig with an extension that learns, got one without")
@@ -259,7 +259,7 @@ class UfMStar(StatefulModule):
             self._store(new.tensors() | (dict(old.by_stream) if keep_evidence else {}))
 
     def takes(self, name: str) -> bool:
-        """True if a frame may bring an input of this name for an extension."""
+        """True if an extension has an input of this name."""
         return any(one.argument == name for one in self._extensions.each)
 
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
@@ -279,9 +279,9 @@ class UfMStar(StatefulModule):
     def _observe(
         self, frame: FrameInput, inputs: Mapping[str, Any], pixels: Tensor | None = None, *, average: bool = True
     ) -> tuple[StepOutput, dict[str, Any]]:
-        """Run the step, and keep its state. Returns its output, and by name V, M, A and E as far as they count [m^2]
-        (None = not) and the maps of extensions, at every pixel [B, H, W], or at ``pixels`` [B, n] of the flattened
-        image. ``inputs``: what a frame brings for extensions."""
+        """Run the step and store the new state. Returns the output, and by name V, M, A and E [m^2] (None = not part of
+        V) and the maps of extensions, at every pixel [B, H, W], or at ``pixels`` [B, n] of the flattened image.
+        ``inputs``: inputs of extensions."""
         of_network = NetworkVariance.of(frame, self.config)
 
         def chosen(value: Tensor) -> Tensor:
@@ -292,7 +292,7 @@ class UfMStar(StatefulModule):
             return extensions.map_variance(self._extensions.map_variance(variance), chosen)
 
         extensions = self._extensions.of_frame(frame, of_network.maps(), inputs, dense=pixels is None)
-        # Normal tensors also under the caller's inference_mode: the state must outlive it.
+        # Outside the caller's inference mode, since the state must outlive it.
         with outliving(), torch.no_grad(), full_precision(frame.depth.device):
             state = self._state_for(frame)
             if self.config.on_bad_frame == "raise":
@@ -307,32 +307,32 @@ class UfMStar(StatefulModule):
             disagreement = extensions.disagreement(out.disagreement, chosen(frame.depth))
         maps = {"disagreement": out.disagreement, **vars(of_network.at(chosen, out.features, self.config))}
         maps |= {**extensions.outputs(), "variance": total(disagreement, out.features)}
-        self._store(state.tensors())  # last, so that an error before it, or a warning that is one, changes nothing
+        self._store(state.tensors())  # last, so that an earlier error changes nothing
         self._warnings.after_frame(frame, out.statistics, state.frames, self.config)
         return out, maps
 
     def _stored(self) -> UfMStarState:
-        buffers = cast("dict[str, Tensor]", self._buffers)  # none is None; without the detour by ``__getattr__``
+        buffers = cast("dict[str, Tensor]", self._buffers)  # no buffer is None; avoids ``__getattr__``
         return self._empty.with_tensors(buffers)
 
     def _kernels(self, device_type: str) -> tuple[Step, CheckKernel]:
-        """The step for a device, the same one as long as the state goes on, and the check."""
+        """The step and the check for a device. The step is cached, since it may hold pending components."""
         key = (self.config.backend, device_type)
-        if self._kept_step is None or self._kept_step[0] != key:
+        if self._cached_step is None or self._cached_step[0] != key:
             self._settle()
-            self._kept_step = key, select_step(*key), select_check(*key)
-        return self._kept_step[1:]
+            self._cached_step = key, select_step(*key), select_check(*key)
+        return self._cached_step[1:]
 
     def _settle(self) -> None:
         """Write the step's pending components into the state before it is saved, copied or moved."""
-        if self._kept_step is not None and isinstance(self._kept_step[1], LateStep):
+        if self._cached_step is not None and isinstance(self._cached_step[1], LateStep):
             with outliving(), torch.no_grad():
-                self._store(self._kept_step[1].settled(self._stored(), self.config).tensors())
+                self._store(self._cached_step[1].settled(self._stored(), self.config).tensors())
 
     def __getstate__(self) -> dict[str, Any]:
-        """A copy starts with a step of its own."""
+        """A copy creates its own step."""
         self._settle()
-        return self.__dict__ | {"_kept_step": None}
+        return self.__dict__ | {"_cached_step": None}
 
     def _state_for(self, frame: FrameInput) -> UfMStarState:
         state = self._stored()

@@ -1,11 +1,11 @@
-"""Finds the pixels where M was not measured, and sets M there (``config.unmeasured``), before and after step 5.
+"""Detects the pixels where M was not measured, and sets their M (``config.unmeasured``), before and after step 5.
 
-A surface seen from one view has m = 0 because nothing was compared, and where no component is near M is the prior's
-mean. Both read as certain in the paper. The share of a pixel's M that rests on surfaces seen from two views or more,
+A surface seen from one view has m = 0 because nothing was compared. Far from all components, M is the prior's mean. In
+the paper both count as certain. The share of a pixel's M that rests on surfaces seen from two or more views,
 
     s(x) = sum of w_k(x) over the components with a count above 1,
 
-is regressed as one more feature. A pixel counts as measured where s is at least one half.
+is regressed as an additional feature. A pixel counts as measured where s is at least one half.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ HALF = 0.5
 
 
 def before_regression(mixture: GaussianMixture) -> GaussianMixture:
-    """The mixture [B, K] with one more feature, 1 where a component was seen from two views or more and else 0."""
+    """The mixture [B, K] with an additional feature, 1 for components seen from two or more views, else 0."""
     compared = (mixture.count > 1).to(mixture.features.dtype)
     return mixture.replace(features=torch.cat([mixture.features, compared[..., None]], dim=-1))
 
 
 def after_regression(result: Regression, depth: Tensor | None, config: UfMStarConfig) -> tuple[Regression, Tensor]:
-    """Separate the share s from the regressed features, and fill in what was not measured.
+    """Separate the share s from the regressed features, and set M where it was not measured.
 
     Args:
         result: of the mixture of :func:`before_regression`.
-        depth: of the same pixels [m]; None = points without a depth, for which "relative" reads as "nan".
+        depth: of the same pixels [m]; None = points without a depth, for which "relative" acts as "nan".
         config: of UfM*.
 
     Returns:

@@ -19,15 +19,15 @@ _TOTAL = 3 * 7  # stages of a step, for two frames and an image average
 
 
 class _Stages:
-    """Reports the stages of the frames (``ufmstar_torch.step_parts.StepObserver``), at whose first a stage compiles, as
-    steps of ``total``; ``progress`` as of :func:`warm_up`."""
+    """Reports the stages of a step (``ufmstar_torch.step_parts.StepObserver``) to ``progress``, as in
+    :func:`warm_up`, with their ``total`` number."""
 
     def __init__(self, progress: Callable[[int, int], object] | None, total: int) -> None:
         self._progress, self._total, self._done = progress, total, -1
         self.stage("")
 
     def stage(self, name: str) -> None:
-        """One more step is done, at most ``total``, whatever a step counts as a stage."""
+        """Report another completed stage, at most ``total``."""
         self._done += 1
         if self._progress is not None:
             self._progress(min(self._done, self._total), self._total)
@@ -40,12 +40,12 @@ def warm_up(
     progress: Callable[[int, int], object] | None = None,
     also: Sequence[Callable[[], object]] = (),
 ) -> None:
-    """Take a module through two frames of ``size`` (H, W) and an image average; see ``UfMStar.warm_up``.
+    """Run a module on two frames of ``size`` (H, W) and an image average; see ``UfMStar.warm_up``.
 
     Args:
-        module: a ``UfMStar`` without frames so far; it is changed.
-        size, streams, progress: see there.
-        also: functions of modules, which call further kernels that the caller will need.
+        module: a ``UfMStar`` before its first frame; its state changes.
+        size, streams, progress: see ``UfMStar.warm_up``.
+        also: functions that call further kernels to compile.
 
     Raises:
         ValueError: a size or number of streams that is not positive.
@@ -68,7 +68,7 @@ def warm_up(
         warnings.simplefilter("ignore", UserWarning)  # a small image has no segment
         stages = _Stages(progress, _TOTAL + len(also))
         module.observer = stages
-        for _ in range(2):  # the fusion meets a mixture from the second on
+        for _ in range(2):  # the fusion needs a mixture, from the second frame on
             module(depth, pose, K, aleatoric, features=features, **({} if anchors is None else {"anchors": anchors}))
         module.mean_uncertainty(depth, pose, K, aleatoric, features=features, pixels=1)
         if config.anchors is not None:
@@ -80,8 +80,8 @@ def warm_up(
 
 @contextmanager
 def _no_collection() -> Iterator[None]:
-    """Collect no garbage, which takes a tenth of a compilation's time; then all of it, or a later frame would wait half
-    a second for that."""
+    """Disable garbage collection, which takes a tenth of a compilation's time; collect afterwards, because a collection
+    during a later frame would take half a second."""
     enabled = gc.isenabled()
     gc.disable()
     try:

@@ -1,4 +1,4 @@
-"""Anchors, an extension that is off by default: sparse depths that show the error on which all views agree."""
+"""Anchors, an extension that is off by default: sparse depths reveal errors that all views share."""
 
 from typing import TYPE_CHECKING
 

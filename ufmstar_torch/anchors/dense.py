@@ -1,13 +1,14 @@
-"""Dense anchors from the images themselves: in every cell of the image one pixel, measured against earlier keyframes.
+"""Dense anchors from images: one pixel in every cell of the image is matched with earlier keyframes.
 
-Where :class:`~ufmstar_torch.anchors.tracker.LandmarkTracker` follows corners, this searches along epipolar lines: edges
-give depths too, on most surfaces, and what has little parallax is kept with a large variance. Cells in which that finds
-nothing are searched again by windows of twice the width, which surfaces without fine texture need. Inverse depth is
-what is measured, rho = 1/depth with a standard deviation sigma: an anchor has the depth 1/rho and the variance
-sigma^2 depth^4. Some corners are followed too. They measure how far poses and images disagree, which a search along
-lines of these poses cannot, and are anchors where no other lies near.
+Instead of tracking corners (:class:`~ufmstar_torch.anchors.tracker.LandmarkTracker`), this searches along epipolar
+lines. Therefore edges yield depths too, and most surfaces have them. Pixels with little parallax get a large variance.
+Cells without a match are searched again with windows of twice the width, for surfaces without fine texture. The search
+measures inverse depth, rho = 1/depth with a standard deviation sigma: an anchor has the depth 1/rho and the variance
+sigma^2 depth^4. Some corners are tracked, too. They measure how far poses and images disagree, which a search along the
+lines of these poses cannot, and become anchors where no other is near.
 
-Needs OpenCV and numba, on the CPU. One a camera; what it keeps is of fixed size: the keyframes and some numbers.
+Needs OpenCV and numba, on the CPU. Each camera needs its own object. Its state has a fixed size: keyframes, landmarks
+and some numbers.
 """
 
 from __future__ import annotations
@@ -33,19 +34,19 @@ from ufmstar_torch.optional import optional
 if TYPE_CHECKING:
     from ufmstar_torch.kernels.dense_cpu import Search, Views
 
-# Baselines of the keyframes that a frame is compared with, as shares of the median depth.
+# Baselines of the keyframes with which a frame is compared, as shares of the median depth.
 _BASELINES = (0.04, 0.1, 0.22, 0.45)
 # Range of the first search of inverse depth, over 1/median depth.
 _NEAREST, _FARTHEST = 6.0, -0.03
-# Anchors on which running estimates of noise are based.
+# Least number of anchors for an update of the running estimates.
 _ENOUGH = 10
-# Frames in a row that contradict their poses, after which keyframes and landmarks are forgotten: the poses have jumped.
+# Successive frames contradicting their poses after which keyframes and landmarks are deleted: the poses have jumped.
 _JUMPED = 3
-# Standard deviation of an inverse depth, as a share, by what no image shows: the scale of the poses.
+# Standard deviation of an inverse depth, as a share of it, by the scale of the poses, which no image determines.
 _SCALE = 0.005
-# Variance of a match of the wide windows, over that which its residual states; on tours, 2 to 4.
+# Variance of a match of the wide windows over that computed from its residual; 2 to 4 on tours.
 _COARSE_NOISE = 4.0
-_CORNERS = "corners_"  # before the names of the tracker's state
+_CORNERS = "corners_"  # prefix of the names of the tracker's state
 
 
 @dataclass(frozen=True)
@@ -53,21 +54,21 @@ class DenseConfig(Checked):
     """Settings of the search for dense anchors, and of their acceptance.
 
     Attributes:
-        width: largest width of the image that is searched [px]; larger images are reduced to it.
-        keyframes: how many are kept.
-        landmarks: how many are remembered.
-        corners: corners that are followed.
-        corner_distance: of a corner that is an anchor from all dense ones, as a share of the width.
-        corner_sigma: its largest standard deviation, and the largest one that the distance of corners from their
-            epipolar lines makes over their baseline, as shares of its depth. Where errors of the refined poses make a
-            larger one at the median depth, nothing is searched.
-        start_depth: median depth of the scene before one is known [m]; right to a factor of 5.
-        least_score: of a match, zero-mean normalised cross-correlation (ZNCC).
-        rival: a match is unique where the best other one has this many times its 1 - ZNCC at least.
-        sigmas: standard deviations by which measurements may differ, and half width of the search in them.
-        match_noise: variance of a match, over that which its residual would make of independent pixels.
-        min_share: least share of the pixels with two matches or more on which all of them agree. Where fewer do, poses
-            and images contradict each other, and none is used.
+        width: largest width of the searched image [px]; larger images are reduced to it.
+        keyframes: number of stored keyframes.
+        landmarks: number of stored landmarks.
+        corners: number of tracked corners.
+        corner_distance: least distance of a corner from all dense anchors to become an anchor, as a share of the width.
+        corner_sigma: largest standard deviation of a corner's depth, as a share of it; also the limit of that by the
+            distance of corners from their epipolar lines over their baseline. Where errors of the refined poses exceed
+            this limit at the median depth, no pixel is searched.
+        start_depth: initial median depth of the scene, right to a factor of 5 [m].
+        least_score: least zero-mean normalised cross-correlation (ZNCC) of a match.
+        rival: least ratio of 1 - ZNCC of the second-best match to that of a unique match.
+        sigmas: largest difference of consistent measurements, and half width of the search, in standard deviations.
+        match_noise: variance of a match over that computed from its residual for independent pixels.
+        min_share: least share of the pixels with two or more matches whose matches all agree. Where it is smaller,
+            poses and images contradict each other, and no match is used.
         memory: share of the running estimates that remains after a frame.
 
     Raises:
@@ -104,7 +105,7 @@ class Depths(NamedTuple):
 
 
 class DenseEvidence(SavedState):
-    """Measures the depth of a pixel in every cell of the image.
+    """Measures the depth of one pixel in every cell of the image.
 
     Args:
         config: see :class:`DenseConfig`; None = its defaults.
@@ -150,12 +151,12 @@ class DenseEvidence(SavedState):
         self._depth, self._contradicted, self._baseline = self.config.start_depth, 0, 0.0
 
     def state(self) -> dict[str, Tensor]:
-        """All that is remembered, for :meth:`load_state`; images are shared and must not be written to."""
+        """The state, for :meth:`load_state`. Images are shared and must not be written to."""
         corners = {_CORNERS + name: value for name, value in self._tracker.state().items()}
         return super().state() | self._keyframes.state() | self._memory.state() | self._errors.state() | corners
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue where :meth:`state` was taken; ValueError: another number of keyframes or landmarks."""
+        """Restore a result of :meth:`state`; ValueError: another number of keyframes or landmarks."""
         super().load_state(state)
         for part in (self._keyframes, self._memory, self._errors):
             part.load_state(state)
@@ -173,12 +174,12 @@ class DenseEvidence(SavedState):
             K: [3, 3] of the image [px]; the same for all images.
 
         Returns:
-            The depths measured in it; none before there is parallax. ``tracked`` counts the pixels that were searched.
+            The measured depths; none before there is parallax. ``tracked`` is the number of searched pixels.
 
         Raises:
             TypeError: ``image`` is no array.
             ValueError: wrong shape or dtype, a pose that is not finite, another size or camera than before (call
-                :meth:`reset` first); everything is as it was then.
+                :meth:`reset` first); the state stays unchanged.
             ModuleNotFoundError: OpenCV is not installed.
         """
         gray, T, K = checked(image, T_world_cam, K)
@@ -202,7 +203,7 @@ class DenseEvidence(SavedState):
         return result
 
     def _forget(self) -> None:
-        """Forget keyframes and landmarks: those of other poses."""
+        """Delete keyframes and landmarks, which belong to other poses."""
         self._contradicted = 0
         self._keyframes.reset()
         self._memory.forget()
@@ -210,24 +211,24 @@ class DenseEvidence(SavedState):
     def _measured(
         self, small: NDArray[np.uint8], scale: NDArray, T: NDArray, K: NDArray, corners: Landmarks
     ) -> Landmarks:
-        """The depths of a reduced image, and corners where none is."""
+        """Measure the depths in a reduced image, and add corners where there are none."""
         from ufmstar_torch.kernels.anchor_check_cpu import check_anchors  # kernels compile when they are first needed
 
         cell, K = _cell(small.shape[1]), self._errors.camera(K)
         trusted = not corners.contradicted
-        sure = self._tracker.refined_variance * self._depth**2 <= self.config.corner_sigma**2
-        compared = self._compared(T, K, small.shape[1]) if trusted and sure else None
+        precise = self._tracker.refined_variance * self._depth**2 <= self.config.corner_sigma**2
+        compared = self._compared(T, K, small.shape[1]) if trusted and precise else None
         found, searched, trusted = self._in_cells(small, T, K, cell, compared, trusted)
         self._contradicted = 0 if trusted else self._contradicted + 1
         if compared is not None and trusted:
             coarse = self._coarse(small, found.pixel, compared[0], cell)
             found = Depths(*(np.concatenate(pair) for pair in zip(found, coarse, strict=True)))
         shared = self._tracker.shared(max(self._baseline, self._tracker.baseline))
-        stated = found.variance + self._memory.apart * np.square(found.rho) + shared
-        surface, alone = check_anchors(small, found.pixel, found.rho, stated, cell)
+        total = found.variance + self._memory.apart * np.square(found.rho) + shared
+        surface, outlier_variance = check_anchors(small, found.pixel, found.rho, total, cell)
         far = self._apart(corners, surface, small.shape[1]) if trusted else np.zeros(0, np.int64)
         depth = np.concatenate([1 / found.rho, corners.depth[far]])
-        variance = np.concatenate([(stated + alone) * depth[: len(stated)] ** 4, corners.variance[far]])
+        variance = np.concatenate([(total + outlier_variance) * depth[: len(total)] ** 4, corners.variance[far]])
         position = (np.concatenate([surface, corners.pixel[far]]) - scale[:2, 2]) / scale.diagonal()[:2]
         none = corners.none if corners.contradicted else Landmarks.none
         judged = corners.pose_error, shared, corners.contradicted, self._memory.apart, corners.lag
@@ -242,61 +243,65 @@ class DenseEvidence(SavedState):
         compared: tuple[Views, NDArray] | None,
         trusted: bool,
     ) -> tuple[Depths, int, bool]:
-        """Landmarks that the image shows, measured again where the camera has moved, and new ones in the cells between
-        them; how many pixels were tried; False where the views contradict each other. The running estimates follow."""
+        """Measure visible landmarks again where the camera has moved, and new pixels in the cells without a landmark.
+
+        Also updates the running estimates.
+
+        Returns:
+            The depths; the number of searched pixels; False if the views contradict each other.
+        """
         sighted = self._memory.sighted(small, T, K, cell)
-        sighted_count = len(sighted.slot)
+        n = len(sighted.slot)
         pixel = np.concatenate([sighted.pixel, _pixels(small, cell, sighted.pixel)])
         rho, variance = np.zeros(len(pixel)), np.ones(len(pixel))
-        agreed, lasts = np.zeros((2, len(pixel)), np.bool_)
-        expected = np.concatenate([np.flatnonzero(sighted.due), np.arange(sighted_count, len(pixel))])
+        measured, storable = np.zeros((2, len(pixel)), np.bool_)
+        searched = np.concatenate([np.flatnonzero(sighted.due), np.arange(n, len(pixel))])
         if compared is not None:
-            found, fit, lasting, trusted = self._searched(small, pixel[expected], *compared, K, cell)
-            at = expected[found]
-            lasts[at] = lasting
-            agreed[at], rho[at], variance[at] = True, fit.rho, fit.variance + np.square(_SCALE * fit.rho)
-        agreed &= (rho > np.sqrt(variance)) & trusted
-        both, fine = self._memory.compare(
-            sighted, rho[:sighted_count], variance[:sighted_count], agreed[:sighted_count]
-        )
-        again, new = (
-            np.flatnonzero(agreed[:sighted_count] & fine),
-            np.flatnonzero(agreed[sighted_count:]) + sighted_count,
-        )
-        self._memory.write(both.slot[again], small, both.pixel[again], both.rho[again], both.variance[again], T, K)
-        remembered = new[lasts[new]]
-        self._memory.write(None, small, pixel[remembered], rho[remembered], variance[remembered], T, K)
-        rho[:sighted_count], variance[:sighted_count] = both.rho, both.variance
-        matched = np.concatenate([np.flatnonzero(fine), new]) if trusted else new
-        if len(matched) >= _ENOUGH:
-            self._depth *= float(np.exp((1 - self.config.memory) * np.log(median(1 / rho[matched]) / self._depth)))
-        tried = sighted_count + (0 if compared is None else len(expected))
-        return Depths(pixel[matched], rho[matched], variance[matched]), tried, trusted
+            found, fit, precise, trusted = self._searched(small, pixel[searched], *compared, K, cell)
+            index = searched[found]
+            storable[index] = precise
+            measured[index], rho[index], variance[index] = True, fit.rho, fit.variance + np.square(_SCALE * fit.rho)
+        measured &= (rho > np.sqrt(variance)) & trusted
+        merged, consistent = self._memory.compare(sighted, rho[:n], variance[:n], measured[:n])
+        updated, new = np.flatnonzero(measured[:n] & consistent), np.flatnonzero(measured[n:]) + n
+        values = merged.pixel[updated], merged.rho[updated], merged.variance[updated]
+        self._memory.write(merged.slot[updated], small, *values, T, K)
+        stored = new[storable[new]]
+        self._memory.write(None, small, pixel[stored], rho[stored], variance[stored], T, K)
+        rho[:n], variance[:n] = merged.rho, merged.variance
+        valid = np.concatenate([np.flatnonzero(consistent), new]) if trusted else new
+        if len(valid) >= _ENOUGH:
+            self._depth *= float(np.exp((1 - self.config.memory) * np.log(median(1 / rho[valid]) / self._depth)))
+        count = n + (0 if compared is None else len(searched))
+        return Depths(pixel[valid], rho[valid], variance[valid]), count, trusted
 
     def _searched(
         self, small: NDArray[np.uint8], pixel: NDArray, views: Views, shares: NDArray, K: NDArray, cell: int
     ) -> tuple[NDArray[np.int64], Fit, NDArray[np.bool_], bool]:
-        """Which pixels [N, 2] were measured, their depths without errors of the poses, which of them are remembered (an
-        uncertain match of one view is not: the next images measure it better), and whether the views agree."""
+        """Match pixels [N, 2] with the keyframes.
+
+        Returns:
+            Indices [n] of the measured pixels; their depths, corrected for errors of the poses; [n] True for depths to
+            store (not an uncertain match of a single view, which the next images measure better); False if the views
+            contradict each other.
+        """
         from ufmstar_torch.kernels.anchor_check_cpu import CERTAIN, confirmed
         from ufmstar_torch.kernels.dense_cpu import measure
 
         self._baseline = float(np.linalg.norm(np.linalg.inv(K) @ views.b[-1]))
-        actual = measure(small, pixel, views, self._search())
-        accepted = confirmed(pixel, actual, cell)
-        agreeing = accepted[actual.agreed + actual.contradicted > 1]
-        trusted, found = (
-            len(agreeing) < _ENOUGH or bool(agreeing.mean() >= self.config.min_share),
-            np.flatnonzero(accepted),
-        )
-        arguments = actual.only(found), shares, views, K, self._depth, trusted
+        matches = measure(small, pixel, views, self._search())
+        accepted = confirmed(pixel, matches, cell)
+        agreeing = accepted[matches.agreed + matches.contradicted > 1]
+        trusted = len(agreeing) < _ENOUGH or bool(agreeing.mean() >= self.config.min_share)
+        found = np.flatnonzero(accepted)
+        arguments = matches.only(found), shares, views, K, self._depth, trusted
         fit = self._errors.corrected(pixel[found], *arguments)
-        lasting = (actual.agreed[found] > 1) | (fit.variance < np.square(CERTAIN * fit.rho))
-        return found, fit, lasting, trusted
+        storable = (matches.agreed[found] > 1) | (fit.variance < np.square(CERTAIN * fit.rho))
+        return found, fit, storable, trusted
 
     def _coarse(self, small: NDArray[np.uint8], occupied: NDArray[np.float64], views: Views, cell: int) -> Depths:
-        """Search the cells without a pixel of ``occupied`` [N, 2] by windows of twice the width: in images of half the
-        size."""
+        """Search the cells without a pixel of ``occupied`` [N, 2] with windows of twice the width, in images of half
+        the size."""
         from ufmstar_torch.kernels.anchor_check_cpu import confirmed
         from ufmstar_torch.kernels.dense_cpu import Views, measure
 
@@ -313,24 +318,25 @@ class DenseEvidence(SavedState):
         return Depths(2 * pixel[fine] + 0.5, found.rho[fine], variance[fine])
 
     def _apart(self, corners: Landmarks, occupied: NDArray[np.float64], width: int) -> NDArray[np.int64]:
-        """Indices of the corners that become anchors: certain ones, away from the ``occupied`` positions [N, 2]."""
+        """Indices of the corners that become anchors: precise ones, away from the ``occupied`` positions [N, 2]."""
         from ufmstar_torch.kernels.anchor_check_cpu import farther
 
-        over = self._tracker.remaining_error / max(self._tracker.baseline, 1e-9) / self._tracker.focal
-        sigma = np.maximum(np.sqrt(corners.variance) / corners.depth, over * np.maximum(corners.depth, self._depth))
-        fine = np.flatnonzero(sigma <= self.config.corner_sigma)
-        return fine[farther(corners.pixel[fine], occupied, self.config.corner_distance * width)]
+        line_error = self._tracker.remaining_error / max(self._tracker.baseline, 1e-9) / self._tracker.focal
+        stated = np.sqrt(corners.variance) / corners.depth
+        sigma = np.maximum(stated, line_error * np.maximum(corners.depth, self._depth))
+        precise = np.flatnonzero(sigma <= self.config.corner_sigma)
+        return precise[farther(corners.pixel[precise], occupied, self.config.corner_distance * width)]
 
     def _search(self) -> Search:
         from ufmstar_torch.kernels.dense_cpu import Search
 
-        config, over = self.config, 1 / self._depth
+        config, rho = self.config, 1 / self._depth
         accepted = config.sigmas, config.least_score, config.rival, config.match_noise
-        return Search(over, _FARTHEST * over, _NEAREST * over, *accepted)
+        return Search(rho, _FARTHEST * rho, _NEAREST * rho, *accepted)
 
     def _compared(self, T: NDArray, K: NDArray, width: int) -> tuple[Views, NDArray[np.int64]] | None:
-        """The keyframes to compare a camera T [4, 4] with, how its pixels get into them, and [V] to which baseline each
-        belongs; None where there is none."""
+        """Choose V keyframes to compare with a camera T [4, 4]. Return them with the mapping of its pixels to theirs,
+        and the indices [V] of their baselines; None if there is no suitable keyframe."""
         from ufmstar_torch.kernels.dense_cpu import Views
 
         chosen = self._keyframes.choose(T, K, self._depth, _BASELINES)
@@ -338,15 +344,15 @@ class DenseEvidence(SavedState):
             return None
         shares, keyframes = (np.array(column) for column in zip(*chosen, strict=True))
         image, pose = self._keyframes.images(keyframes), self._keyframes.poses(keyframes)
-        into = pose[:, :3, :3].transpose(0, 2, 1)
-        H = K @ into @ T[:3, :3] @ np.linalg.inv(K)
+        R_keyframe_world = pose[:, :3, :3].transpose(0, 2, 1)
+        H = K @ R_keyframe_world @ T[:3, :3] @ np.linalg.inv(K)
         b = ((T[:3, 3] - pose[:, :3, 3])[:, None] @ pose[:, :3, :3])[:, 0] @ K.T
         noise = self._errors.positions(K, width, self._depth)[shares]
         return Views(image, np.ascontiguousarray(H), np.ascontiguousarray(b), noise), shares
 
 
 def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """An image no wider than ``width``, and [3, 3] its pixels from those of ``gray``."""
+    """Reduce an image to at most ``width``; return [3, 3] the mapping of the pixels of ``gray`` to its pixels, too."""
     if gray.shape[1] <= width:
         return gray, np.eye(3)
     cv2 = optional("cv2", "landmarks of images need OpenCV", "'ufmstar-torch[eval]'")
@@ -359,19 +365,19 @@ def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], ND
 
 
 def _halved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Means of two by two pixels; an odd last row or column is left out."""
+    """Average blocks of two by two pixels; an odd last row or column is dropped."""
     cv2 = optional("cv2", "landmarks of images need OpenCV", "'ufmstar-torch[eval]'")
     height, width = image.shape[0] // 2, image.shape[1] // 2
     return np.asarray(cv2.resize(image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA))
 
 
 def _cell(width: int) -> int:
-    """Side of a cell [px]: 8 in an image 160 wide, 10 in one of 320."""
+    """Side of a cell [px]: 8 in an image 160 px wide, 10 in one 320 px wide."""
     return max(round(8 * 1.25 ** np.log2(width / 160)), 4)
 
 
 def _pixels(small: NDArray[np.uint8], cell: int, occupied: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[N, 2] the pixel (u, v) of the largest gradient in every cell that has one, and none of those taken [M, 2]."""
+    """[N, 2] the pixel (u, v) of largest gradient in every cell with a gradient and no ``occupied`` pixel [M, 2]."""
     from ufmstar_torch.kernels.dense_cpu import best_pixels
 
     shape = (-(-small.shape[0] // cell), -(-small.shape[1] // cell))

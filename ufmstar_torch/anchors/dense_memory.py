@@ -1,4 +1,4 @@
-"""Landmarks that a camera has measured: remembered, seen again, confirmed or refuted. Of fixed size."""
+"""A memory of fixed size for landmarks that a camera has measured, which later images confirm or refute."""
 
 from __future__ import annotations
 
@@ -11,29 +11,30 @@ from numpy.typing import NDArray
 from ufmstar_torch.anchors.epipolar import median
 from ufmstar_torch.anchors.saved_state import SavedState
 
-# A landmark is measured again where the camera has moved by this share of its depth since; times one more for every
-# confirmation, up to _SELDOM.
-_DUE, _SELDOM = 0.04, 4
-# Confirmed where two measurements differ by at most so many standard deviations, and this share of the inverse depth.
+# A landmark is measured again when the camera has moved by the share _DUE of its depth, times 1 plus the number of
+# confirmations, at most _LONGEST.
+_DUE, _LONGEST = 0.04, 4
+# Two measurements confirm each other if they differ by at most _SIGMAS standard deviations and the share _SHARE of the
+# inverse depth, added in quadrature.
 _SIGMAS, _SHARE = 3.5, 0.01
-# Measurements on which the running estimate of ``apart`` is based, its first value, and steps of its bisection.
+# Running estimate ``apart``: least number of measurements for an update, first value, and steps of the bisection.
 _ENOUGH, _FIRST_APART, _STEPS = 10, 0.01**2, 8
 # The median of the square of a standard normal variable.
 _MEDIAN_SQUARE = 0.4549
-# Failures in a row, beyond the number of confirmations, after which a landmark is forgotten.
+# Failures in a row, beyond the number of confirmations, after which a landmark is deleted.
 _FAILURES = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Sighted:
-    """Landmarks as the present view shows them.
+    """Landmarks in the present view.
 
     Attributes:
         slot: [n] in the memory.
         pixel: [n, 2] (u, v).
         rho: [n] inverse depth [1/m].
         variance: [n] of ``rho`` [1/m^2].
-        due: [n] bool, to be measured again.
+        due: [n] bool, True where they must be measured again.
     """
 
     slot: NDArray[np.int64]
@@ -47,14 +48,14 @@ class Memory(SavedState):
     """At most ``count`` landmarks.
 
     Args:
-        count: of landmarks.
+        count: number of landmarks.
         fading: share of the running estimate that remains after a frame.
 
     Attributes:
-        apart: variance of an inverse depth, as a share of its square, beyond what is stated: by so much do measurements
-            of a landmark from different times differ. It is what the views of one time have in common.
-        confirmed: [count] in how many later views each was confirmed.
-        frame: images so far.
+        apart: variance of an inverse depth, as a share of its square, beyond the stated one, from errors that views of
+            one time share. It is estimated from measurements of the same landmarks at different times.
+        confirmed: [count] number of later views that confirmed each landmark.
+        frame: number of images so far.
     """
 
     HELD: ClassVar = {
@@ -80,7 +81,7 @@ class Memory(SavedState):
 
         n = self._count
         self._point, self._pose = np.zeros((n, 3)), np.tile(np.eye(4), (n, 1, 1))
-        self._sigma = np.zeros(n)  # of the distance from the camera that measured it, as a share
+        self._sigma = np.zeros(n)  # of the distance from the measuring camera, as a share of it
         self._patch = np.zeros((n, SIDE, SIDE), np.float32)
         self._used = np.zeros(n, dtype=np.bool_)
         self.confirmed, self._failed, self._seen = (np.zeros(n, np.int64) for _ in range(3))
@@ -89,7 +90,7 @@ class Memory(SavedState):
     def sighted(
         self, image: NDArray[np.uint8], T_world_cam: NDArray[np.float64], K: NDArray[np.float64], cell: int
     ) -> Sighted:
-        """The landmarks that an image shows, at most one in a cell; those that it should show and does not, fail.
+        """Find the landmarks that an image shows, at most one in a cell, and count failures of those it should show.
 
         Args:
             image: [H, W].
@@ -107,7 +108,7 @@ class Memory(SavedState):
         self._failed[hidden] += 1
         self._forget(hidden)
         slot = np.flatnonzero(shown > 0)
-        # Each cell keeps the point that is confirmed most often; among equal ones, the least uncertain.
+        # Each cell retains the landmark with the most confirmations; among equals, the one with the least uncertainty.
         column, row = (pixel[slot] / cell).astype(np.int64).T
         order = np.lexsort((spread[slot] / depth[slot], -self.confirmed[slot], column, row))
         first = np.diff(row[order] * image.shape[1] + column[order], prepend=-1) > 0
@@ -115,16 +116,16 @@ class Memory(SavedState):
         slot = slot[order[first]]
         pixel, depth, spread = pixel[slot], depth[slot], spread[slot]
         moved = np.linalg.norm(self._pose[slot, :3, 3] - T_world_cam[:3, 3], axis=1)
-        due = moved >= _DUE * depth * np.minimum(1 + self.confirmed[slot], _SELDOM)
+        due = moved >= _DUE * depth * np.minimum(1 + self.confirmed[slot], _LONGEST)
         return Sighted(slot, pixel, 1 / depth, np.square(spread / np.square(depth)), due)
 
     @property
     def empty(self) -> bool:
-        """True where there is no landmark."""
+        """True if there is no landmark."""
         return not self._used.any()
 
     def forget(self) -> None:
-        """Forget all landmarks, and keep the running estimate."""
+        """Delete all landmarks, but retain the running estimate."""
         self._used[:] = False
 
     def _forget(self, slot: NDArray[np.int64]) -> None:
@@ -136,30 +137,30 @@ class Memory(SavedState):
         """Confirm or refute landmarks by new measurements.
 
         Args:
-            sighted: n of them.
-            rho: [n] measured now [1/m].
+            sighted: n landmarks.
+            rho: [n] new measurements [1/m].
             variance: [n] of ``rho`` [1/m^2].
-            measured: [n] which were.
+            measured: [n] bool, True where there is a new measurement.
 
         Returns:
-            The landmarks with both measurements together; [n] which of them are not refuted.
+            The landmarks with old and new measurements merged; [n] True where not refuted.
         """
         spread, square = sighted.variance + variance, np.square(sighted.rho)
         difference = np.square(rho - sighted.rho)
         consistent = difference <= _SIGMAS**2 * (spread + self.apart * square) + _SHARE**2 * square
         if measured.sum() >= _ENOUGH:
-            now = _beyond((difference / square)[measured], (spread / square)[measured])
-            self.apart = self._fading * self.apart + (1 - self._fading) * now
+            measured_variance = _beyond((difference / square)[measured], (spread / square)[measured])
+            self.apart = self._fading * self.apart + (1 - self._fading) * measured_variance
         confirmed, refuted = measured & consistent, measured & ~consistent
         self.confirmed[sighted.slot[confirmed]] += 1
         self._failed[sighted.slot[refuted]] += 2
         self._used[sighted.slot[refuted & (self.confirmed[sighted.slot] == 0)]] = False
         self._forget(sighted.slot[refuted])
         old, new = 1 / sighted.variance, 1 / np.where(confirmed, variance, 1)
-        both = np.where(confirmed, (sighted.rho * old + rho * new) / (old + new), sighted.rho)
-        # Measurements share keyframes and patches: together they are as certain as the better one.
+        merged = np.where(confirmed, (sighted.rho * old + rho * new) / (old + new), sighted.rho)
+        # Measurements share keyframes and patches: merging them does not reduce the smaller variance.
         least = np.where(confirmed, np.minimum(sighted.variance, variance), sighted.variance)
-        return Sighted(sighted.slot, sighted.pixel, both, least, sighted.due), ~refuted
+        return Sighted(sighted.slot, sighted.pixel, merged, least, sighted.due), ~refuted
 
     def write(
         self,
@@ -171,10 +172,10 @@ class Memory(SavedState):
         T_world_cam: NDArray[np.float64],
         K: NDArray[np.float64],
     ) -> None:
-        """Keep landmarks as the present view measured them.
+        """Store landmarks as the present view measured them.
 
         Args:
-            slot: [n] of those that are kept already; None = new ones, in the place of those not seen for longest.
+            slot: [n] of landmarks already stored; None = new ones, which replace those not seen for longest.
             image: [H, W].
             pixel: [n, 2] (u, v).
             rho: [n] > 0 [1/m].
@@ -197,7 +198,7 @@ class Memory(SavedState):
 
 
 def _beyond(square: NDArray[np.float64], variance: NDArray[np.float64]) -> float:
-    """The variance that, added to those stated, makes squared differences of a median as they should have."""
+    """Variance to add to the stated ones so that the normalised squared differences have the median of a normal one."""
     low, high = 1e-7, 0.3**2
     if median(square / (variance + low)) <= _MEDIAN_SQUARE:
         return 0.0

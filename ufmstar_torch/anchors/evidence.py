@@ -1,34 +1,33 @@
 """The network's recent error at anchors, by component and overall.
 
-At an anchor (depth g, variance s^2) the prediction d has the relative error r = (g - d)/d. Were the network's own
-variance A + E all there is, E[r^2] = (A + E + s^2)/d^2. What is left over,
+An anchor with the depth g and the variance s^2 measures the relative error r = (g - d)/d of the predicted depth d. If
+the network's variance A + E covered all of its error, E[r^2] would be (A + E + s^2)/d^2. The excess
 
-    e = r^2 - (s^2 + A + E)/d^2,
+    e = r^2 - (s^2 + A + E)/d^2
 
-is the relative mean square error that the network does not state itself. It may be negative at one anchor; its mean
-over many is unbiased, since expectations are linear. Part of d^2 e is what views disagree about, and M states that
-already: only what is beyond M is added,
+is the relative mean square error that the network does not predict. It may be negative at one anchor. Its mean over
+many anchors is unbiased, since expectations are linear. M already contains a part of d^2 e, the disagreement of views.
+Therefore only the part beyond M is added,
 
     B = max(0, d^2 mean(e) - M),        M + B = max(M, d^2 mean(e)),
 
-with M as it is now at the pixel. So nothing is counted twice: A, E and the anchors' noise are taken off before, M
-after. (M before, anchor by anchor, would leave nothing where M has not been measured yet: a surface seen once has M = 0
-because nothing was compared, and so has a point that no component explains.)
+with the current M of the pixel. Nothing is counted twice: A, E and the anchors' noise are subtracted before the mean, M
+after it. (Subtracting M at each anchor would fail where M is 0 because it is not measured yet: on a surface seen once,
+and at a point that no component explains.)
 
-One anchor must not outweigh all others. Its r is bounded, since its neighbours must support it; its e is not: where the
-network claims a variance of c = (s^2 + A + E)/d^2 far beyond what it errs by, e is -c. An anchor's weight is therefore
+No single anchor may outweigh all others. Its r is bounded, since its neighbours must support it. Its e is not bounded:
+where the claimed variance c = (s^2 + A + E)/d^2 far exceeds the error, e is -c. The weight of an anchor is therefore
 
     w = min(1, l/c)^2,      l = min(4, n - 1) max(.02^2, mean of r^2 at the frame's n - 1 other anchors),
 
-so that w c is at most l, and 0 in the limit; l = 1 where n = 1. The weight follows the claim and not the anchor's own
-r: with a network that is calibrated, w e is 0 on average as e is.
+so that w c is at most l and vanishes for large c; l = 1 where n = 1. The weight depends on c and not on the anchor's r.
+For a calibrated network, the mean of w e is therefore 0, as that of e is.
 
-Sums of w (1, r, e) live beside the mixture, one row a component, and one for the stream as a whole. A component takes
-an anchor by its share in explaining the predicted point, w_k = pi_k N_k / (sum pi N + pi_0). Old evidence fades by a
-factor with every frame that brings new; without new evidence what was learnt stays. Means shrink: the stream's towards
-0, sum/(n + kappa), so that a single anchor does not decide for all; a component's towards the stream's,
-(sum_k + kappa mean)/(n_k + kappa). Where no component explains a point, the stream's mean is the answer: what the
-network has been getting wrong lately, not nothing.
+Sums of w (1, r, e) are stored for every slot of the mixture and for the stream as a whole. An anchor contributes to a
+component by the component's share in explaining the predicted point, w_k = pi_k N_k / (sum pi N + pi_0). A frame with
+new evidence multiplies the old evidence by a factor below 1; other frames leave it unchanged. Means shrink. The
+stream's shrinks towards 0, sum/(n + kappa), so that a single anchor does not decide for all; a component's towards the
+stream's, (sum_k + kappa mean)/(n_k + kappa). A point that no component explains gets the stream's mean.
 """
 
 from __future__ import annotations
@@ -45,20 +44,21 @@ from ufmstar_torch.fixed_order import total
 # Entries of a row of sums.
 COUNT, BIAS, EXCESS = 0, 1, 2
 SUMS = 3
-# A wrong track stands alone: an anchor is used where at least SUPPORT of its NEIGHBOURS nearest ones in the image
-# have a similar ratio g/d. Not a distance from the frame's median: a network may be wrong by another factor on each
-# surface, and a small region that differs from the rest is what anchors are to find.
+# A wrong track differs from its neighbours. An anchor is used if at least SUPPORT of its NEIGHBOURS nearest anchors in
+# the image have a similar ratio g/d. The frame's median is no reference: a network may be wrong by another factor on
+# each surface, and anchors must detect a small region that differs from the rest.
 NEIGHBOURS, SUPPORT = 8, 3
-# [px^2] By which an anchor counts as farther away than the one given before it: more than the rounding of a squared
-# distance in an image, less than can be distinguished.
+# [px^2] Added to the squared distance of each anchor times its index, to break ties. It exceeds the rounding of a
+# squared distance in an image and is too small to change other comparisons.
 TIE = 1e-6
-# "Similar" is within 2.5 sigma of what neighbours differ by; sigma is from the lower quartile of all such differences,
-# .4506 sigma for normal errors; with 30 % wrong tracks half of the pairs are still clean, so it is not blown up.
+# Logarithms of similar ratios g/d differ by at most 2.5 sigma. sigma is estimated from the lower quartile of all such
+# differences of neighbours, .4506 sigma for normal errors. With 30 % wrong tracks, half of the pairs still consist of
+# two right ones.
 SIMILAR_SIGMAS, LOWER_QUARTILE = 2.5, 0.4506
-# Claims of more than so many times the mean square error of the frame's other anchors count less; an anchor with less
-# than COUNTS of its weight is not reported as used.
+# A claimed variance above CLAIM times the mean square error of the frame's other anchors reduces the anchor's weight.
+# Anchors with a weight below COUNTS are not reported as used.
 CLAIM, COUNTS = 4.0, 0.5
-# Least sigma of log g/d: tracked landmarks are right to some 2 %, whatever variance they state.
+# Least sigma of log g/d: tracked landmarks err by about 2 %, whatever variance they state.
 LEAST_SIGMA = 0.02
 
 
@@ -75,7 +75,7 @@ class Evidence:
     overall: Tensor
 
     def padded(self, capacity: int) -> Evidence:
-        """With room for a mixture that has grown."""
+        """Pad the components to ``capacity`` slots, for a mixture that has grown."""
         missing = capacity - self.component.shape[1]
         return Evidence(torch.nn.functional.pad(self.component, (0, 0, 0, max(missing, 0))), self.overall)
 
@@ -83,7 +83,7 @@ class Evidence:
 def inliers(anchors: AnchorInput) -> Tensor:
     """[B, N] True for valid anchors that enough of their neighbours in the image support.
 
-    With too few anchors for that many neighbours, all valid ones are used.
+    A stream with at most ``SUPPORT`` valid anchors uses all of them.
     """
     n = anchors.valid.shape[1]
     few = anchors.valid.sum(1, keepdim=True) <= SUPPORT
@@ -91,18 +91,18 @@ def inliers(anchors: AnchorInput) -> Tensor:
         return anchors.valid
     log_ratio = (anchors.depth / anchors.predicted).log()
     u, v = anchors.pixel.unbind(-1)
-    apart = (u[:, :, None] - u[:, None]).square_().add_((v[:, :, None] - v[:, None]).square_())
-    # The first of equally near neighbours counts: topk's choice between them depends on the padding of a row.
-    apart += TIE * torch.arange(n, dtype=apart.dtype, device=few.device)
-    apart.masked_fill_(~anchors.valid[:, None], torch.inf).diagonal(dim1=1, dim2=2).fill_(torch.inf)
-    distance, neighbour = apart.topk(min(NEIGHBOURS, n - 1), dim=2, largest=False)
-    requested = (distance < torch.inf) & anchors.valid[:, :, None]
-    differ = (log_ratio[:, :, None] - _take(log_ratio, neighbour)).abs()
-    quartile = torch.where(requested, differ, torch.nan).flatten(1).nanquantile(0.25, dim=1).nan_to_num(0.0)
-    noise = anchors.variance / anchors.depth.square()  # of log g: no reason for mistrust
+    distance2 = (u[:, :, None] - u[:, None]).square_().add_((v[:, :, None] - v[:, None]).square_())
+    # The first of equally near neighbours wins; the choice of topk depends on the padding of a row.
+    distance2 += TIE * torch.arange(n, dtype=distance2.dtype, device=few.device)
+    distance2.masked_fill_(~anchors.valid[:, None], torch.inf).diagonal(dim1=1, dim2=2).fill_(torch.inf)
+    distance, neighbour = distance2.topk(min(NEIGHBOURS, n - 1), dim=2, largest=False)
+    paired = (distance < torch.inf) & anchors.valid[:, :, None]
+    difference = (log_ratio[:, :, None] - _take(log_ratio, neighbour)).abs()
+    quartile = torch.where(paired, difference, torch.nan).flatten(1).nanquantile(0.25, dim=1).nan_to_num(0.0)
+    noise = anchors.variance / anchors.depth.square()  # variance of log g
     sigma2 = (quartile / LOWER_QUARTILE).square()[:, None, None] + 2 * LEAST_SIGMA**2
-    similar = differ <= SIMILAR_SIGMAS * (sigma2 + noise[:, :, None] + _take(noise, neighbour)).sqrt()
-    return anchors.valid & (few | ((similar & requested).sum(2) >= SUPPORT))
+    similar = difference <= SIMILAR_SIGMAS * (sigma2 + noise[:, :, None] + _take(noise, neighbour)).sqrt()
+    return anchors.valid & (few | ((similar & paired).sum(2) >= SUPPORT))
 
 
 def _take(value: Tensor, index: Tensor) -> Tensor:
@@ -117,18 +117,18 @@ def observe(
     memory: float,
     supported_by_neighbours: Callable[[AnchorInput], Tensor] = inliers,
 ) -> tuple[Evidence, Tensor]:
-    """Let old evidence fade and add a frame's.
+    """Fade the old evidence and add that of a frame.
 
     Args:
-        evidence: up to the frame before.
+        evidence: of the frames before.
         anchors: of the frame.
-        distribute: sums rows [B, N, 3] at the anchors' points by component, [B, K, 3], each row by the component's
+        distribute: sums rows [B, N, 3] at the anchors' points by component to [B, K, 3], weighted by the component's
             share in explaining the point.
-        memory: in (0, 1], by which the old evidence of a stream is multiplied when there is new.
+        memory: factor in (0, 1] of a stream's old evidence in a frame with new evidence.
         supported_by_neighbours: an implementation of :func:`inliers`.
 
     Returns:
-        The evidence, and [B, N] which anchors were used: supported by their neighbours, with half their weight or more.
+        The evidence, and [B, N] True for used anchors: supported by their neighbours, with a weight of at least .5.
     """
     supported = supported_by_neighbours(anchors)
     r = anchors.depth / anchors.predicted - 1
@@ -146,7 +146,7 @@ def observe(
 
 
 def _weight(r2: Tensor, claim: Tensor, supported: Tensor) -> Tensor:
-    """[B, N] w in [0, 1] from each anchor's r^2, the variance c that is claimed there, and which anchors count."""
+    """[B, N] w in [0, 1] from the r^2 and the claimed variance c of each anchor, and the mask of supported anchors."""
     r2 = torch.where(supported, r2, torch.zeros_like(r2))
     others = (supported.sum(1, keepdim=True) - 1).clamp_min(0)
     mean = (total(r2, 1)[:, None] - r2) / others.clamp_min(1)
@@ -156,11 +156,11 @@ def _weight(r2: Tensor, claim: Tensor, supported: Tensor) -> Tensor:
 
 
 def means(evidence: Evidence, shrinkage: float) -> tuple[Tensor, Tensor]:
-    """Mean errors of each component beyond the stream's, and of the stream.
+    """Compute the mean errors of the stream, and those of each component less the stream's.
 
     Args:
-        evidence: so far.
-        shrinkage: kappa, the number of anchors for which the stream's mean counts in a component's, and 0 in its own.
+        evidence: sums so far.
+        shrinkage: kappa, in anchors: the weight of the stream's mean in a component's mean, and of 0 in the stream's.
 
     Returns:
         [B, K, 2] mean r and e of the components less the stream's; [B, 2] the stream's, 0 before the first anchor.

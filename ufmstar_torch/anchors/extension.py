@@ -1,7 +1,7 @@
 """Anchors as an extension of UfM* (``ufmstar_torch.extension``): columns of step 5's regression, and the term B.
 
-Before the regression a frame's anchors become evidence. Of each component the mean r and e less the stream's are
-regressed beside H; the stream's are added at every pixel.
+Before the regression, a frame's anchors are added to the evidence. The regression of H also regresses the mean r and e
+of the components less the stream's. The stream's means are added at every pixel.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class Learnt:
     """The evidence after a frame's anchors.
 
     Attributes:
-        evidence: this frame's included.
-        used: [B] how many anchors were used.
+        evidence: including this frame.
+        used: [B] number of used anchors.
         beyond: [B, K, 2] mean r and e of the components less the stream's (``evidence.means``).
         stream: [B, 2] the stream's.
     """
@@ -54,13 +54,13 @@ def learn(
     """Add a frame's anchors to the evidence.
 
     Args:
-        evidence: up to the frame before.
+        evidence: of the frames before.
         mixture_cam: M_i in the camera frame, [B, K].
-        frame: the same B streams.
+        frame: of the same B streams.
         anchors: of this frame, or None.
         config: of UfM*.
         distribute: sums values at points by component (:func:`ufmstar_torch.regress.distribute`).
-        supported: which anchors their neighbours support (``evidence.inliers``).
+        supported: masks the anchors that their neighbours support (``evidence.inliers``).
     """
     assert config.anchors is not None
     used = torch.zeros_like(frame.fault)
@@ -72,18 +72,18 @@ def learn(
 
         memory = 0.5 ** (1 / config.anchors.half_life)
         # A faulty frame's anchors are not valid.
-        evidence, each = observe(evidence, anchors, by_component, memory, supported)
-        used = each.sum(1)
+        evidence, mask = observe(evidence, anchors, by_component, memory, supported)
+        used = mask.sum(1)
     return Learnt(evidence, used, *means(evidence, config.anchors.shrinkage))
 
 
 def anchored_term(depth: Tensor, excess: Tensor, disagreement: Tensor) -> tuple[Tensor, Tensor]:
-    """B = max(0, d^2 e - M) [m^2], the mean square error that anchors show beyond M, and M + B; NaN where M is.
+    """B = max(0, d^2 e - M) [m^2], the mean square error that anchors show beyond M, and M + B; NaN where M is NaN.
 
     Args:
         depth: d, any shape [m].
-        excess: e, likewise, the relative mean square error that the network does not state (``evidence``).
-        disagreement: M, likewise [m^2].
+        excess: e, same shape, the relative mean square error that the network does not predict (``evidence``).
+        disagreement: M, same shape [m^2].
     """
     term = depth.square().mul_(excess).sub_(disagreement).clamp_min_(0)
     return term, disagreement + term
@@ -91,12 +91,12 @@ def anchored_term(depth: Tensor, excess: Tensor, disagreement: Tensor) -> tuple[
 
 @dataclass(frozen=True)
 class AnchorKernels:
-    """The replaceable parts.
+    """The implementations of the replaceable parts.
 
     Attributes:
         supported: see ``evidence.inliers``.
-        learn_in_view: :func:`learn` from what the compiled step has in view, into which it writes the columns
-            (``kernels.anchors_cpu.learn_in_view``); None = :func:`learn` serves.
+        learn_in_view: :func:`learn` with the compiled step's components in view, to which it adds the columns
+            (``kernels.anchors_cpu.learn_in_view``); None = use :func:`learn`.
     """
 
     supported: Callable[[AnchorInput], Tensor]
@@ -113,8 +113,8 @@ class AnchorFrame(FrameExtension):
         frame: of B streams.
         anchors: of the frame, checked, or None.
         config: with ``anchors``.
-        kernels: which implementation of each part.
-        warn: takes the anchors of every frame.
+        kernels: implementation of each part.
+        warn: called with the anchors of every frame.
 
     Attributes:
         frame, anchors: as above.
@@ -149,7 +149,7 @@ class AnchorFrame(FrameExtension):
         return Columns(learnt.beyond, learnt.stream, tensors)
 
     def after_regression(self, values: Tensor) -> None:
-        """The residual [..., 2] to expect at each pixel, mean r and mean e."""
+        """Store the expected residual [..., 2] of each pixel, mean r and mean e."""
         self._residual = values
 
     def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
@@ -166,7 +166,7 @@ class AnchorFrame(FrameExtension):
         return state, replace(out, statistics=counts)
 
     def disagreement(self, disagreement: Tensor, depth: Tensor) -> Tensor:
-        """M + B [m^2]; where most anchors were rejected, at least d^2 times the mean of their r^2."""
+        """M + B [m^2]; where most anchors were rejected, B is at least d^2 times the mean of their r^2."""
         self._term, both = anchored_term(depth, self._residual[..., 1], disagreement)
         if self.anchors is None or self.anchors.contradiction is None:
             return both
@@ -180,11 +180,11 @@ class AnchorFrame(FrameExtension):
 
 
 class AnchorExtension(Extension):
-    """The network's error, measured at anchors.
+    """Measures the network's error at anchors.
 
     Args:
         config: with ``anchors``.
-        kernels: makes the kernels for a backend and a device's type.
+        kernels: returns the kernels for a backend and a device type.
     """
 
     argument = "anchors"
@@ -218,7 +218,7 @@ class AnchorExtension(Extension):
         *,
         dense: bool,
     ) -> AnchorFrame:
-        """With the frame's anchors checked.
+        """Check the frame's anchors.
 
         Raises:
             TypeError, ValueError: as :func:`check_anchors`.
@@ -228,15 +228,15 @@ class AnchorExtension(Extension):
         return AnchorFrame(frame, anchors, self._config, kernels, self._warn)
 
     def _warn(self, anchors: AnchorInput) -> None:
-        """Report, once a stream, that most anchors are off by more than a factor of 100; on the CPU only, elsewhere it
-        would have to wait."""
+        """Warn once per stream if most anchors are off by more than a factor of 100. Only on the CPU: elsewhere, the
+        check would synchronise with the device."""
         if anchors.contradiction is None or anchors.rejected is None or not anchors.contradiction.is_cpu:
             return
         for b in set(anchors.contradiction.nonzero().flatten().tolist()) - self._warned:
             self._warned.add(b)
             logging.getLogger("ufmstar_torch").warning(
                 "stream %d: %d of %d anchors are off from the predicted depth by more than a factor of %g; the "
-                "variance is widened. Are depth, poses and anchors in metres, and is it no inverse depth? (said once)",
+                "variance is increased. Check that depth, poses and anchors are in metres (logged once)",
                 *(b, int(anchors.rejected[b]), int(anchors.rejected[b] + anchors.valid[b].sum()), FARTHEST_OFF),
             )
 

@@ -1,4 +1,4 @@
-"""Landmarks of an image, and the interface of their sources (``sources``)."""
+"""Landmarks of an image, and the interface of landmark sources (``sources``)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ REPEATED = "the image is the one before again, with another pose"
 
 
 class OtherCameraError(ValueError):
-    """An image is of another size or camera than those before."""
+    """An image has another size or camera than the images before."""
 
     def __init__(self) -> None:
         super().__init__("image and K must be of the size and camera of the images before: call reset() first")
@@ -27,21 +27,21 @@ class OtherCameraError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Landmarks:
-    """Triangulated corners as the current image sees them.
+    """Landmarks in the current image.
 
     Attributes:
         pixel: [N, 2] position (u, v) [px].
         depth: [N] along the optical axis [m].
         variance: [N] of ``depth`` [m^2].
-        tracked: corners followed into this image, of which these N passed all tests; of a map, its landmarks.
-        none: why there is no landmark, where N = 0.
-        pose_error: standard deviation of tracked corners from their epipolar lines by the given poses [px]; NaN = not
+        tracked: number of corners tracked into this image, of which N passed all tests; for a map, its landmarks.
+        none: why there is no landmark if N = 0.
+        pose_error: standard deviation of tracked corners from the epipolar lines of the input poses [px]; NaN = not
             measured.
-        shared: variance of inverse depths by errors of the poses, the same error for all landmarks of the image
-            [1/m^2]; it is in ``variance`` too. Infinite where the poses contradict not the newest image alone.
+        shared: variance of the inverse-depth error that wrong poses cause in all landmarks of the image [1/m^2];
+            ``variance`` includes it. Infinite where the poses contradict more images than the newest.
         contradicted: the poses contradict the images, and no depth is used.
-        scale: variance of the logarithm of a factor that all depths of the image have in common; in ``variance`` too.
-        lag: by how many images the given poses are late, as far as corners show it; negative = early.
+        scale: variance of the logarithm of a factor that all depths of the image share; ``variance`` includes it.
+        lag: delay of the input poses, estimated from corners [images]; negative = early.
     """
 
     pixel: NDArray[np.float64]
@@ -57,49 +57,49 @@ class Landmarks:
 
     @classmethod
     def skipped(cls, fault: str) -> Landmarks:
-        """None, of an image whose pose or intrinsics have a fault."""
+        """No landmarks: the image was skipped for a ``fault``."""
         return cls(np.zeros((0, 2)), np.zeros(0), np.zeros(0), 0, none=fault)
 
     def anchors(self, K_camera: NDArray[np.float64], intrinsics: Tensor, capacity: int | None = None) -> Anchors:
-        """As UfM* takes them, for one stream whose depth map has its own size and intrinsics.
+        """Convert to the anchors of one stream, in the pixels of its depth map.
 
         Args:
             K_camera: [3, 3] of the images [px].
             intrinsics: [3, 3] or [1, 3, 3] of the depth map [px]: the same camera, resized or cropped.
-            capacity: pad to this number, so that shapes stay the same from frame to frame.
+            capacity: pad to this number, for constant shapes from frame to frame.
 
         Raises:
             ValueError: more landmarks than ``capacity``.
         """
         n = len(self.depth)
-        room = n if capacity is None else capacity
-        if room < n:
+        rows = n if capacity is None else capacity
+        if rows < n:
             raise ValueError(f"capacity must be at least the number of landmarks, {n}, got {capacity}")
 
         def padded(values: NDArray) -> Tensor:
-            full = np.zeros((1, room, *values.shape[1:]))
+            full = np.zeros((1, rows, *values.shape[1:]))
             full[0, :n] = values
             return torch.from_numpy(full).to(intrinsics.device)
 
-        # Made by NumPy: each of torch's operations takes several times as long after a network.
-        valid = torch.from_numpy(np.arange(room)[None] < n).to(intrinsics.device)
+        # NumPy: each torch operation takes several times as long after a network.
+        valid = torch.from_numpy(np.arange(rows)[None] < n).to(intrinsics.device)
         frame = torch.from_numpy(np.array([[self.pose_error], [self.shared], [self.scale]])).to(intrinsics.device)
         result = Anchors(padded(self.pixel), padded(self.depth), padded(self.variance), valid, *frame)
         return result.moved(torch.as_tensor(K_camera), intrinsics.reshape(3, 3))
 
 
 class LandmarkSource(Protocol):
-    """Landmarks of one camera, in the order of its images: a tracker of corners, dense evidence, or a map.
+    """Landmarks of one camera, image by image: a corner tracker, dense evidence, or a map.
 
     Attributes:
-        needs_image: whether :meth:`update` looks at the image, beyond its size.
+        needs_image: whether :meth:`update` reads the image and not only its size.
     """
 
     needs_image: bool
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Plain values on which the landmarks depend, with a name of the kind as "anchors"."""
+        """Plain values on which the landmarks depend; "anchors" names the kind of source."""
         ...
 
     def update(
@@ -108,28 +108,27 @@ class LandmarkSource(Protocol):
         """Process the next image [H, W, 3] RGB, its pose [4, 4] [m] and its intrinsics [3, 3] [px].
 
         Raises:
-            TypeError: ``image`` is no array, where one is needed.
+            TypeError: ``image`` is no array, and the source needs one.
             ValueError: a wrong shape or dtype, a pose that is not finite, another size or camera than before (call
-                :meth:`reset` first); the source is as it was then.
+                :meth:`reset` first); the source stays unchanged.
         """
         ...
 
     def reset(self) -> None:
-        """Forget the images."""
+        """Return to the initial state."""
         ...
 
     def state(self) -> dict[str, Tensor]:
-        """All on which the next landmarks depend, taken before every image: images are shared, not copied, and must
-        not be written to."""
+        """Everything on which the next landmarks depend. Images are shared, not copied, and must not be written to."""
         ...
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue where :meth:`state` was taken; ValueError: it is of another source."""
+        """Restore a result of :meth:`state`; ValueError: it belongs to another source."""
         ...
 
 
 def checked(image: NDArray | None, T_world_cam: NDArray, K: NDArray) -> tuple[NDArray[np.uint8], NDArray, NDArray]:
-    """Gray image, pose and intrinsics.
+    """Check the arguments of :meth:`LandmarkSource.update`; return a gray image, the pose and the intrinsics.
 
     Raises:
         TypeError, ValueError: as :meth:`LandmarkSource.update`.

@@ -1,4 +1,4 @@
-"""States of what sources of landmarks remember: arrays and numbers, by name."""
+"""Saving and restoring the state of landmark sources: arrays and numbers by name."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-# No coordinate, count or information of a stream exceeds it.
+# Limit of the coordinates, counts and information values of a state.
 LARGEST = 1e12
 
 
 def saved_image(state: Mapping[str, Tensor], name: str) -> NDArray[np.uint8]:
-    """A grey image [H, W] of a saved state; raises ValueError: it is none."""
+    """Read a grey image [H, W] from a saved state; ValueError: another shape or dtype, or no such image."""
     image = state.get(name, torch.empty(0))
     if image.dtype != torch.uint8 or image.dim() != 2:
         raise ValueError(
@@ -28,20 +28,20 @@ class SavedState:
     """Attributes that :meth:`state` copies and :meth:`load_state` restores to the last bit.
 
     Attributes:
-        HELD: name in the state by attribute; each is an array of fixed shape, or a number.
+        HELD: name in the state by attribute. Each attribute is an array of fixed shape, or a number.
     """
 
     HELD: ClassVar[Mapping[str, str]]
 
     def state(self) -> dict[str, Tensor]:
-        """A copy of all that is remembered, for :meth:`load_state`."""
+        """Copy the state, for :meth:`load_state`."""
         return {name: torch.from_numpy(np.array(getattr(self, attribute))) for attribute, name in self.HELD.items()}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue where :meth:`state` was taken.
+        """Restore a result of :meth:`state`.
 
         Raises:
-            ValueError: an array of another shape or dtype, or a value that is impossible; nothing has changed then.
+            ValueError: an array has another shape or dtype, or a value is impossible; the state stays unchanged.
         """
         values: dict[str, Any] = {}
         for attribute, name in self.HELD.items():

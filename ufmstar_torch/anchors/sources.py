@@ -22,21 +22,21 @@ from ufmstar_torch.camera import invert_rigid
 
 CORNERS, DENSE = "corners", "dense"
 FILE_TYPES = (".csv", ".txt", ".npz")
-# Landmarks of one image: as many as a tracker follows, or a few more.
-_MOST = 500
+# Largest number of landmarks in one image; a tracker follows 300.
+_MAX_VISIBLE = 500
 
 
 def landmark_source(value: str | Path | LandmarkSource) -> LandmarkSource:
-    """The source that a word or a file's name stands for, in its initial state.
+    """Create a landmark source in its initial state.
 
     Args:
-        value: "corners": tracked corners; "dense": dense evidence; the name of a file:
-            :meth:`LandmarkMap.read`; a source: itself.
+        value: "corners" for tracked corners, "dense" for dense evidence, or the path of a file for
+            :meth:`LandmarkMap.read`. A source is returned as it is.
 
     Raises:
         FileNotFoundError: no such file.
-        TypeError: neither a word, nor a file's name, nor a source.
-        ValueError: no word of these and no file of landmarks.
+        TypeError: ``value`` is neither a name, nor a path, nor a source.
+        ValueError: ``value`` is neither of the two names nor a file of landmarks.
     """
     if not isinstance(value, str | Path):
         if not callable(getattr(value, "update", None)):
@@ -51,11 +51,11 @@ def landmark_source(value: str | Path | LandmarkSource) -> LandmarkSource:
 
 @dataclass(frozen=True, eq=False)
 class LandmarkMap:
-    """Landmarks at known places of the world: of a SLAM map, of a survey.
+    """Landmarks with known world positions, such as a SLAM map or a survey.
 
     An image's landmarks are those in front of the camera and inside the image (:meth:`Anchors.from_points`), at most
-    500, evenly through the map's order. What hides a landmark is not known: of a large map, give the part that the
-    camera can see.
+    500, evenly spaced in the map's order. Occlusion is not tested: pass only the part of a large map that the camera
+    can see.
 
     Attributes:
         points_world: [P, 3] [m].
@@ -80,13 +80,15 @@ class LandmarkMap:
 
     @classmethod
     def read(cls, path: str | Path) -> LandmarkMap:
-        """From a file: ``.csv`` or ``.txt`` with a line ``x y z sigma`` [m] for each landmark, separated by commas or
-        spaces, ``#`` before a comment, a first line of names allowed; or ``.npz`` with ``points`` [P, 3] and ``sigma``
-        [P] [m]. World axes and scale are those of the poses. A row that is not finite is never used.
+        """Read a file of landmarks.
+
+        A ``.csv`` or ``.txt`` file has a line ``x y z sigma`` [m] for each landmark, separated by commas or spaces;
+        ``#`` starts a comment, and the first line may name the columns. A ``.npz`` file has ``points`` [P, 3] and
+        ``sigma`` [P] [m]. World axes and scale must be those of the poses. Rows that are not finite are ignored.
 
         Raises:
             FileNotFoundError: no such file.
-            ValueError: another format; the message names the file.
+            ValueError: the file has another format; the message names the file.
         """
         path = Path(path)
         if path.suffix.lower() not in FILE_TYPES:
@@ -144,19 +146,19 @@ class LandmarkMap:
         result = self.anchors(torch.from_numpy(T)[None], torch.from_numpy(shifted), size)
         assert result.valid is not None
         visible = np.flatnonzero(result.valid[0].numpy())
-        visible = visible[:: -(-len(visible) // _MOST) or 1]
+        visible = visible[:: -(-len(visible) // _MAX_VISIBLE) or 1]
         pixel, depth, variance = (x[0].numpy()[visible] for x in (result.pixel, result.depth, result.variance))
         return Landmarks(pixel - offset, depth, variance, len(self.sigma), none="no landmark of the map is in view")
 
     def reset(self) -> None:
-        """Nothing: a map remembers no image."""
+        """Do nothing: a map has no state."""
 
     def state(self) -> dict[str, Tensor]:
-        """{}: a map remembers no image."""
+        """{}: a map has no state."""
         return {}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Nothing to restore.
+        """Do nothing: a map has no state.
 
         Raises:
             ValueError: ``state`` is that of another source.
@@ -167,13 +169,13 @@ class LandmarkMap:
 
 def _read_text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     lines = [line.partition("#")[0].replace(",", " ").split() for line in path.read_text(encoding="utf-8").splitlines()]
-    rows = [(number, words) for number, words in enumerate(lines, start=1) if words]
+    rows = [(number, columns) for number, columns in enumerate(lines, start=1) if columns]
     if rows and not _is_number(rows[0][1][0]):
         rows = rows[1:]  # names of the columns
-    for number, words in rows:
-        if len(words) != 4 or not all(map(_is_number, words)):
-            raise ValueError(f"line {number} holds {' '.join(words)!r}")
-    values = np.array([words for _, words in rows], dtype=np.float64).reshape(-1, 4)
+    for number, columns in rows:
+        if len(columns) != 4 or not all(map(_is_number, columns)):
+            raise ValueError(f"line {number} holds {' '.join(columns)!r}")
+    values = np.array([columns for _, columns in rows], dtype=np.float64).reshape(-1, 4)
     return values[:, :3], values[:, 3]
 
 

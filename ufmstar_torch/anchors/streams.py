@@ -1,4 +1,4 @@
-"""The landmarks of several cameras at once, as the anchors of a batch of images."""
+"""Landmarks of several cameras as the anchors of a batch of images."""
 
 from __future__ import annotations
 
@@ -18,41 +18,42 @@ from ufmstar_torch.frame import FRAME_FAULTS, intrinsics_fault, pose_fault
 
 _LOG = logging.getLogger("ufmstar_torch")
 _CAUSES = (
-    "Are poses camera-to-world, of the images' times, and the intrinsics the images'? Does the video stand still? "
-    "(said once)"
+    "Check that the poses are camera-to-world and of the images' times, that the intrinsics are the images', and that "
+    "the video is not frozen (logged once)"
 )
 _TIMES = (
-    "Anchors are corrected for it, UfM*'s comparison of views is not: check the times of poses and images (said once)"
+    "Anchors are corrected for this offset, UfM*'s comparison of views is not: check the times of poses and images "
+    "(logged once)"
 )
-# A file may be named by a str too; type checkers then find no misspelt word.
-Given = Literal["corners", "dense"] | Path | LandmarkSource
-_IN_A_ROW = 8  # images that contradict their poses before the warning; what a blurred one shows lasts for some
-_LATE = 0.5  # images; a larger time offset of the poses is worth a warning
-_PARTS = ("pixel", "depth", "variance", "valid", "pose_error", "shared", "scale")
+# A str may name a file, too. It is not in the type, so that type checkers detect misspelt names of sources.
+SourceLike = Literal["corners", "dense"] | Path | LandmarkSource
+_CONTRADICTIONS = 8  # successive images that contradict their poses before a warning; a blurred one affects several
+_LARGEST_LAG = 0.5  # [images] time offset of the poses up to which there is no warning
+_FIELDS = ("pixel", "depth", "variance", "valid", "pose_error", "shared", "scale")
 
 
 class StreamLandmarks:
     """One source of landmarks for each stream of a batch.
 
     Args:
-        sources: what :func:`landmark_source` takes; a sequence of them, one for each stream.
+        sources: an argument of :func:`landmark_source`, or a list of them, one for each stream.
 
     Attributes:
-        needs_image: whether a source looks at the images.
-        last: the landmarks of the last image of every stream.
+        needs_image: whether a source reads the images.
+        last: landmarks of the last image of every stream.
 
     Raises:
         FileNotFoundError, ValueError: as :func:`landmark_source`.
     """
 
-    def __init__(self, sources: Given | list[Given] | tuple[Given, ...]) -> None:
+    def __init__(self, sources: SourceLike | list[SourceLike] | tuple[SourceLike, ...]) -> None:
         listed = sources if isinstance(sources, list | tuple) else [sources]
-        self._sources = [landmark_source(one) for one in listed]
+        self._sources = [landmark_source(source) for source in listed]
         self._before = self._states()
         self.needs_image = any(source.needs_image for source in self._sources)
         self.last: list[Landmarks] = []
-        self._contradicted = [0] * len(self._sources)  # images in a row; -1 = the warning is out
-        self._late = set[int]()  # streams whose time offset was named
+        self._contradicted = [0] * len(self._sources)  # successive images; -1 = warned
+        self._lag_warned = set[int]()
 
     def update(
         self,
@@ -63,40 +64,40 @@ class StreamLandmarks:
         *,
         skip: bool = True,
     ) -> Anchors:
-        """Anchors of the next image of every stream, in its pixels. Where it raises, no source has changed.
+        """Compute the anchors of the next image of every stream, in its pixels. An error leaves all sources unchanged.
 
         Args:
             image: [B, 3, H, W] RGB, uint8, or floating-point in [0, 1]; None: the sources need none.
             pose: [B, 4, 4] or [4, 4] camera-to-world [m].
             intrinsics: [B, 3, 3] or [3, 3] of ``image`` [px].
-            rotation_tolerance: of poses; None = the sources check them.
-            skip: a stream whose pose or intrinsics have a fault (``frame.FRAME_FAULTS``) skips the image: it has no
-                anchors and its source stays as it is. Otherwise a fault is an error.
+            rotation_tolerance: of the poses; None = the sources check the poses.
+            skip: a stream whose pose or intrinsics have a fault (``frame.FRAME_FAULTS``) skips the image: it gets no
+                anchors, and its source stays unchanged. Without ``skip``, a fault is an error.
 
         Returns:
             [B, N], padded and masked, on the image's device.
 
         Raises:
-            ValueError: another number of streams than sources, an image of another kind, a fault, or as
-                :meth:`LandmarkSource.update`.
+            ValueError: the numbers of streams and sources differ, the image has another dtype or range, there is a
+                fault, or as :meth:`LandmarkSource.update`.
         """
         b = len(self._sources) if image is None else len(image)
         if b != len(self._sources):
             raise ValueError(f"anchors must name a source for each of the {b} streams, got {len(self._sources)}")
-        pictures = None if image is None else _bytes(image).permute(0, 2, 3, 1).contiguous().cpu().numpy()
+        images = None if image is None else _bytes(image).permute(0, 2, 3, 1).contiguous().cpu().numpy()
         T = pose.detach().double().expand(b, 4, 4).cpu().numpy()
         K = intrinsics.detach().double().expand(b, 3, 3).cpu()
         before, faults = self._states(), [0] * b
         if rotation_tolerance is not None:
-            size = (torch.inf, torch.inf) if pictures is None else pictures.shape[1:3]
+            size = (torch.inf, torch.inf) if images is None else images.shape[1:3]
             faults = _faults(torch.from_numpy(T), K, size, rotation_tolerance)
-        if not skip and (bad := [f"stream {i}: {FRAME_FAULTS[fault]}" for i, fault in enumerate(faults) if fault]):
-            raise ValueError("; ".join(bad))
+        if not skip and (faulty := [f"stream {i}: {FRAME_FAULTS[fault]}" for i, fault in enumerate(faults) if fault]):
+            raise ValueError("; ".join(faulty))
         try:
             result = [
                 Landmarks.skipped(FRAME_FAULTS[fault])
                 if fault
-                else source.update(None if pictures is None else pictures[i], T[i], K[i].numpy())
+                else source.update(None if images is None else images[i], T[i], K[i].numpy())
                 for i, (source, fault) in enumerate(zip(self._sources, faults, strict=True))
             ]
         except BaseException:
@@ -104,42 +105,42 @@ class StreamLandmarks:
             raise
         self._before, self.last = before, result
         for i, landmarks in enumerate(result):
-            if abs(landmarks.lag) > _LATE and i not in self._late:
-                self._late.add(i)
-                way = f"{abs(landmarks.lag):.1f} images {'late' if landmarks.lag > 0 else 'early'}"
-                _LOG.warning("stream %d: the poses seem %s. %s", i, way, _TIMES)
+            if abs(landmarks.lag) > _LARGEST_LAG and i not in self._lag_warned:
+                self._lag_warned.add(i)
+                offset = f"{abs(landmarks.lag):.1f} images {'late' if landmarks.lag > 0 else 'early'}"
+                _LOG.warning("stream %d: the poses seem %s. %s", i, offset, _TIMES)
             if self._contradicted[i] < 0:
                 continue
             self._contradicted[i] = (
                 self._contradicted[i] + 1 if landmarks.contradicted or landmarks.none == REPEATED else 0
             )
-            if self._contradicted[i] == _IN_A_ROW:
+            if self._contradicted[i] == _CONTRADICTIONS:
                 self._contradicted[i] = -1
                 _LOG.warning("stream %d: %s; no depth is used. %s", i, landmarks.none, _CAUSES)
-        room = max(len(landmarks.depth) for landmarks in result)
-        each = [landmarks.anchors(K[i].numpy(), K[i], room) for i, landmarks in enumerate(result)]
-        parts = (torch.cat([getattr(one, name) for one in each]) for name in _PARTS)
-        return Anchors(*parts).to(pose.device if image is None else image.device)
+        capacity = max(len(landmarks.depth) for landmarks in result)
+        by_stream = [landmarks.anchors(K[i].numpy(), K[i], capacity) for i, landmarks in enumerate(result)]
+        fields = (torch.cat([getattr(anchors, name) for anchors in by_stream]) for name in _FIELDS)
+        return Anchors(*fields).to(pose.device if image is None else image.device)
 
     def undo(self, streams: Sequence[int] | None = None) -> None:
-        """Forget the last image of these streams (None: of all): it was not used."""
+        """Restore the state before the last image of these streams (None = of all)."""
         self._restore(self._before, range(len(self._sources)) if streams is None else streams)
 
     def reset(self, streams: Sequence[int] | None = None) -> None:
-        """Forget all images of these streams (None: of all)."""
+        """Reset the sources of these streams (None = of all)."""
         for i in range(len(self._sources)) if streams is None else streams:
             self._sources[i].reset()
 
     def state(self) -> dict[str, Tensor]:
-        """All on which the next anchors depend, as "STREAM.NAME"."""
+        """State of all sources, by names "STREAM.NAME"."""
         states = enumerate(self._states())
         return {f"{i}.{name}": value for i, state in states for name, value in state.items()}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue where :meth:`state` was taken.
+        """Restore a result of :meth:`state`.
 
         Raises:
-            ValueError: it is of other sources; they are as they were then.
+            ValueError: the state belongs to other sources; the sources stay unchanged.
         """
         before, parts = self._states(), [dict[str, Tensor]() for _ in self._sources]
         for key, value in state.items():
@@ -166,15 +167,15 @@ class StreamLandmarks:
 
 def _faults(pose: Tensor, K: Tensor, size: tuple[float, ...], tolerance: float) -> list[int]:
     """Indices into ``FRAME_FAULTS`` of poses [B, 4, 4] and intrinsics [B, 3, 3] of images of a size (H, W)."""
-    of_pose = pose_fault(pose, rotation_deviation(pose[:, :3, :3]), tolerance)
-    return torch.where(of_pose > 0, of_pose, intrinsics_fault(K, size)).tolist()
+    pose_faults = pose_fault(pose, rotation_deviation(pose[:, :3, :3]), tolerance)
+    return torch.where(pose_faults > 0, pose_faults, intrinsics_fault(K, size)).tolist()
 
 
 def _bytes(image: Tensor) -> Tensor:
     """[B, 3, H, W] as uint8.
 
     Raises:
-        ValueError: neither uint8 nor floating-point in [0, 1], so that the range is not known.
+        ValueError: the image is neither uint8 nor floating-point in [0, 1].
     """
     if image.dtype == torch.uint8:
         return image

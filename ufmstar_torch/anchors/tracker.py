@@ -1,8 +1,7 @@
-"""Anchors from the images themselves: corners tracked over a few frames, which refine the poses (``bundle``) and are
-triangulated with them.
+"""Anchors from images: corners tracked over a few frames refine the poses (``bundle``) and are triangulated with them.
 
-Needs OpenCV (``opencv-python-headless``), on the CPU; nothing else of the package does. One tracker a camera. What it
-keeps is of fixed size: a window of views, and the positions of at most ``max_points`` corners in them.
+Needs OpenCV (``opencv-python-headless``), on the CPU. Each camera needs its own tracker. Its state has a fixed size: a
+window of views, and the positions of at most ``max_points`` corners in them.
 """
 
 from __future__ import annotations
@@ -26,33 +25,33 @@ from ufmstar_torch.checked import Checked, number
 if TYPE_CHECKING:
     from ufmstar_torch.kernels.triangulate_cpu import Triangulated
 
-# Tracks by which a frame's poses are judged.
+# Least number of tracks for a comparison with the poses.
 _ENOUGH = 5
 # Errors of a tracked position add up from view to view: the variance of a track of v views is _DRIFT (v - 1) times that
-# of independent positions. On four rendered tours the squared errors grow with v like this, and of the size.
+# of independent positions. The squared errors on four rendered tours confirm both the growth with v and the factor.
 _DRIFT = 0.6
-# Share of the running estimate of the residuals' variance that remains after a frame; views of the tracks that it is
-# from.
+# Share of the running estimate of the residuals' variance that remains after a frame; least number of views of the
+# tracks for that estimate.
 _MEMORY, _LONG = 0.8, 4
 # Why an image has no landmark.
 _NO_TRACK, _NO_DEPTH = "no corner followed from the frame before", "no parallax, or no track that fits the poses"
-# Entries of two poses that differ by no more are of one pose [1, m].
+# Largest difference of the entries of equal poses [1, m].
 _SAME = 1e-6
-# Depths of a scene, over the median: where the poses allow a corner's point to be. Half of the corners lie nearer than
-# the median, which says little while it is not known well; of an image without motion, as of one that is frozen, all
-# would be farther.
+# Range of a scene's depths over the median, in which corners' points must lie. The upper limit is far above the median,
+# which is inaccurate at first. In an image without motion the limit is the median: all points of a frozen image would
+# lie beyond it, but only half of a scene's points do.
 _NEAR, _FAR, _MEDIAN_DEPTH = 1 / 50, 10.0, 1.0
-# Share of the running comparison with the poses that remains after a frame; the motion of a corner that shows a depth,
-# and of an image that stands still [px].
-_FOLLOWS, _MOVES, _STILL = 0.6, 1.0, 0.2
-# Least baseline of the corners, a median, over the depth of the scene: refined poses of a camera that stands or only
-# turns are as far apart as the given ones may err.
+# Share of the running distance from the epipolar lines that remains after a frame; least motion of a corner that
+# determines a depth, and median motion below which an image stands still [px].
+_FADE, _MOVES, _STILL = 0.6, 1.0, 0.2
+# Least median baseline of the corners over the depth of the scene. Refined poses of a camera that stands or only turns
+# still differ by their errors.
 _PARALLAX = 0.005
-# Least share of the corners whose parallax is clear. Where fewer have it, theirs is mostly their error, and they seem
-# too near: by a factor of 7 with a share of .05, of 1.2 with .3 (a camera that turns, on tours); where the camera moves
-# it is more than half.
+# Least share of the corners with clear parallax. Where the share is smaller, the parallax is mostly error, and corners
+# seem too near: by a factor of 7 with a share of .05, of 1.2 with .3 (a turning camera, on tours). Where the camera
+# moves, the share exceeds one half.
 _CLEAR_SHARE = 1 / 3
-# Cells of the image, in a row, that count alike in what corners show of the poses.
+# Cells of the image per axis; corners of each cell have the same total weight in the comparison with the poses.
 _CELLS = 6
 # The median of the absolute value of a standard normal variable.
 _MEDIAN = 0.6745
@@ -64,23 +63,23 @@ class TrackerConfig(Checked):
 
     Attributes:
         max_points: corners followed at a time.
-        window: views kept, and used for triangulation.
-        min_views: of a corner, before it is triangulated.
-        spacing: least distance between two corners [px] in an image 640 wide; it follows the width.
-        back_tolerance: a corner tracked forward and back must return this near to where it was [px].
-        pixel_noise: standard deviation of a tracked position [px], poses' errors included, until the residuals of the
-            tracks tell it.
-        max_error: largest root mean square reprojection error of a track [px]. Poses err too; a track that fits
-            worse than the others gets a variance by as much larger.
-        max_relative_sigma: largest standard deviation of the depth, as a share of it, that independent errors of
-            ``pixel_noise`` would make: less parallax is no anchor. Not less than needed: what is far away has little
-            parallax, and to leave it out would hide the error there.
-        min_share: least share of the triangulated tracks that fit, 0 to 1. Where fewer do, poses and image contradict
-            each other, and those that fit do so by chance: none is used.
-        max_pose_error: largest distance of tracked corners from the epipolar lines of the refined poses, a standard
-            deviation, as a share of the image's width: beyond, poses and images contradict each other, and no depth is
+        window: number of stored views, which are used for triangulation.
+        min_views: least number of views of a triangulated corner.
+        spacing: least distance between two corners in an image 640 px wide [px]; proportional to the width.
+        back_tolerance: largest distance of a corner tracked forward and back from its start [px].
+        pixel_noise: standard deviation of a tracked position, including errors of the poses, until it is estimated from
+            the residuals of the tracks [px].
+        max_error: largest root mean square reprojection error of a track [px]. A track that fits worse than the others
+            gets a larger variance.
+        max_relative_sigma: largest standard deviation of the depth, as a share of it, by independent errors of
+            ``pixel_noise``: tracks with less parallax yield no anchor. A low limit excludes distant points, which have
+            little parallax, and hides errors there.
+        min_share: least share of the triangulated tracks that fit, 0 to 1. Where fewer fit, poses and image contradict
+            each other; the tracks that fit do so by chance, and none is used.
+        max_pose_error: largest standard deviation of tracked corners from the epipolar lines of the refined poses, as a
+            share of the image's width. Where it is larger, poses and images contradict each other, and no depth is
             used.
-        start_depth: median depth of the scene before one is known [m]; right to a factor of 5.
+        start_depth: initial median depth of the scene, right to a factor of 5 [m].
 
     Raises:
         ValueError: an impossible value.
@@ -105,13 +104,13 @@ class TrackerConfig(Checked):
 
 
 class LandmarkTracker(SavedState):
-    """Follows corners from image to image and triangulates them.
+    """Tracks corners from image to image and triangulates them.
 
     Args:
         config: see :class:`TrackerConfig`; None = its defaults.
 
     Attributes:
-        baseline: of the corners of the last image, the median over their first views [m].
+        baseline: median baseline of the last image's corners to their first views [m].
 
     Example::
 
@@ -126,16 +125,16 @@ class LandmarkTracker(SavedState):
         "_K": "K",
         "_pixel": "pixel",
         "_seen": "seen",
-        "_given": "given_poses",
+        "_input_poses": "given_poses",
         "_poses": "poses",
         "_number": "number",
         "_view": "view",
         "_noise": "noise",
-        "_off": "off",
-        "_now": "off_now",
+        "_line_error": "off",
+        "_newest_line_error": "off_now",
         "baseline": "baseline",
         "_depth": "depth",
-        "_judged": "depths_judged",
+        "_depth_count": "depths_judged",
     }
 
     def __init__(self, config: TrackerConfig | None = None) -> None:
@@ -154,25 +153,24 @@ class LandmarkTracker(SavedState):
         self._gray, self._K = np.zeros((0, 0), np.uint8), np.eye(3)  # of the last image
         self._pixel = np.zeros((n, w, 2))
         self._seen = np.zeros((n, w), dtype=bool)
-        self._given, self._poses = np.tile(np.eye(4), (2, w, 1, 1))  # as given, and refined
-        self._number = np.full(w, -1)  # of the views, counted from the first image
+        self._input_poses, self._poses = np.tile(np.eye(4), (2, w, 1, 1))  # of the input, and refined
+        self._number = np.full(w, -1)  # index of each view's image
         self._view = -1
         self._refinement.reset()
         self._noise = self.config.pixel_noise**2
-        # Standard deviation of corners from their epipolar lines [px], lately and in the newest image; negative = not
+        # Standard deviation of corners from their epipolar lines [px], running and in the newest image; negative = not
         # measured.
-        self._off = self._now = -1.0
+        self._line_error = self._newest_line_error = -1.0
         self.baseline, self._depth = 0.0, self.config.start_depth  # of the views, and of the scene [m]
-        self._judged = 0  # images that showed the scene's depth
-        self._point = np.full((n, 3), np.nan)  # of the corners in the newest image [m]; the window decides it
+        self._depth_count = 0  # images from which the scene's depth was estimated
+        self._point = np.full((n, 3), np.nan)  # of the newest image's corners [m]; derived from the window
 
     def state(self) -> dict[str, Tensor]:
-        """All that is remembered, for :meth:`load_state`: the window, and the last image in gray, which is shared and
-        must not be written to."""
+        """The state, for :meth:`load_state`. The last gray image is shared and must not be written to."""
         return {"gray": torch.from_numpy(self._gray)} | super().state() | self._refinement.state()
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue where :meth:`state` was taken; ValueError: another ``max_points`` or ``window``."""
+        """Restore a result of :meth:`state`; ValueError: another ``max_points`` or ``window``."""
         gray = saved_image(state, "gray")
         super().load_state(state)
         self._refinement.load_state(state)
@@ -190,12 +188,12 @@ class LandmarkTracker(SavedState):
             K: [3, 3] of the image [px]; the same for all images.
 
         Returns:
-            The landmarks that it shows; none before there is parallax.
+            The image's landmarks; none before there is parallax.
 
         Raises:
             TypeError: ``image`` is no array.
             ValueError: wrong shape or dtype, a pose that is not finite, another size or camera than before (call
-                :meth:`reset` first); the tracker is as it was then.
+                :meth:`reset` first); the tracker stays unchanged.
             ModuleNotFoundError: OpenCV is not installed.
         """
         gray, T, K = checked(image, T_world_cam, K)
@@ -209,10 +207,10 @@ class LandmarkTracker(SavedState):
             position, alive = np.zeros((self.config.max_points, 2)), np.zeros(self.config.max_points, dtype=bool)
         last, self._view = self._view, (self._view + 1) % self.config.window
         self._number[self._view] = self._number[last] + 1
-        self._seen[~alive] = False  # a lost corner's slot is free
+        self._seen[~alive] = False  # free the slots of lost corners
         self._seen[:, self._view] = alive
         self._pixel[:, self._view] = position
-        self._given[self._view] = self._poses[self._view] = T
+        self._input_poses[self._view] = self._poses[self._view] = T
         tracked = int(alive.sum())
         self._gray, self._K = gray, K
         self._refine()
@@ -221,8 +219,9 @@ class LandmarkTracker(SavedState):
         return self._landmarks(tracked)
 
     def repeats(self, gray: NDArray[np.uint8], T_world_cam: NDArray[np.float64]) -> bool:
-        """True if a gray image is the last one again, pixel by pixel, with another pose: a frozen or doubled image."""
-        return np.array_equal(gray, self._gray) and not np.allclose(T_world_cam, self._given[self._view], atol=_SAME)
+        """True if a gray image equals the last one but has another pose: a frozen or duplicated image."""
+        last = self._input_poses[self._view]
+        return np.array_equal(gray, self._gray) and not np.allclose(T_world_cam, last, atol=_SAME)
 
     @property
     def pose(self) -> NDArray[np.float64]:
@@ -231,17 +230,17 @@ class LandmarkTracker(SavedState):
 
     @property
     def jumped(self) -> bool:
-        """True where the last pose begins another trajectory: what was seen before is of no use."""
+        """True if the last pose starts another trajectory: earlier images are of no use."""
         return self._refinement.jumped
 
     @property
     def refined(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Numbers [W] of the images in the window, the first one 0, and their refined poses [W, 4, 4]."""
+        """Indices [W] of the images in the window, from 0, -1 = none, and their refined poses [W, 4, 4]."""
         return self._number, self._poses
 
     @property
     def depth(self) -> float:
-        """Median depth of the scene [m], as the corners show it."""
+        """Median depth of the scene, estimated from the corners [m]."""
         return self._depth
 
     @property
@@ -251,50 +250,51 @@ class LandmarkTracker(SavedState):
 
     @property
     def pose_error(self) -> float:
-        """Standard deviation of corners from their epipolar lines by the given poses [px]; NaN = not measured."""
-        return (self._off**2 + self._refinement.pose_variance) ** 0.5 if self._off >= 0 else float("nan")
+        """Standard deviation of corners from the epipolar lines of the input poses [px]; NaN = not measured."""
+        return (self._line_error**2 + self._refinement.pose_variance) ** 0.5 if self._line_error >= 0 else float("nan")
 
     @property
     def lag(self) -> float:
-        """By how many images the given poses are late; negative = early, 0 = not shown."""
+        """Delay of the input poses [images]; negative = early, 0 = not significant."""
         return self._refinement.offset.lag
 
     @property
     def remaining_error(self) -> float:
-        """That by the refined poses, with the errors that successive given poses share [px]; 0 = not measured."""
-        return (max(self._off, 0.0) ** 2 + self._refinement.correlated) ** 0.5
+        """Standard deviation of corners from the epipolar lines of the refined poses, with the errors that successive
+        input poses share [px]; 0 = not measured."""
+        return (max(self._line_error, 0.0) ** 2 + self._refinement.correlated) ** 0.5
 
     @property
     def refined_variance(self) -> float:
-        """Variance of inverse depths by the errors that remain in the refined poses [1/m^2]; 0 = not refined."""
+        """Variance of inverse depths by the errors of the refined poses [1/m^2]; 0 = not refined."""
         return self._refinement.shared
 
     @property
     def pose_variance(self) -> float:
         """Variance that errors of the poses add to a tracked position [px^2]."""
-        off = max(self._off, 0.0) ** 2 - self.config.pixel_noise**2
-        return max(off, 0.0) + self._refinement.correlated
+        excess = max(self._line_error, 0.0) ** 2 - self.config.pixel_noise**2
+        return max(excess, 0.0) + self._refinement.correlated
 
     @property
     def contradicted(self) -> bool:
-        """True where the poses contradict the images, lately or the newest one alone."""
-        return max(self.remaining_error, self._now) > self._limit
+        """True if the poses contradict the recent images or the newest one."""
+        return max(self.remaining_error, self._newest_line_error) > self._limit
 
     @property
     def _limit(self) -> float:
-        """Largest error of positions by the poses [px]."""
+        """Largest standard deviation of corners from their epipolar lines [px]."""
         return self.config.max_pose_error * self._gray.shape[1]
 
     def _refine(self) -> None:
         """Refine the window's poses by its corners."""
         order = (self._view + 1 + np.arange(self.config.window)) % self.config.window
-        views = self._pixel[:, order], self._seen[:, order], self._given[order]
+        views = self._pixel[:, order], self._seen[:, order], self._input_poses[order]
         self._poses[order] = self._refinement.refine(*views, self._K, self._depth)
         if self.jumped:
             self._seen[:, order[:-1]] = False
 
     def _compare_with_poses(self) -> None:
-        """Follow how far corners lie from where the poses allow them to be, each in the first view that has it."""
+        """Update the distance of corners from their epipolar lines, each in its first view, and the scene's depth."""
         order = (self._view + 1 + np.arange(self.config.window)) % self.config.window
         seen = self._seen[:, order]
         chosen = np.flatnonzero(seen[:, -1] & seen[:, :-1].any(1))
@@ -306,18 +306,18 @@ class LandmarkTracker(SavedState):
         far = self._depth * (_MEDIAN_DEPTH if median(motion) < _STILL else _FAR)
         distance, rho, baseline = off_lines(*views, self._K, _NEAR * self._depth, far)
         cell = (views[0] * _CELLS / self._gray.shape[::-1]).astype(np.int64).clip(0, _CELLS - 1) @ [1, _CELLS]
-        weight = 1 / np.bincount(cell)[cell]  # by area: a thing that moves by itself may have most of the corners
-        self._now = weighted_median(distance, weight) / _MEDIAN
-        self._off = self._now if self._off < 0 else _FOLLOWS * self._off + (1 - _FOLLOWS) * self._now
+        weight = 1 / np.bincount(cell)[cell]  # by area: a moving object may have most of the corners
+        newest = self._newest_line_error = weighted_median(distance, weight) / _MEDIAN
+        self._line_error = newest if self._line_error < 0 else _FADE * self._line_error + (1 - _FADE) * newest
         self.baseline = median(baseline)
-        shows = (rho > 0) & (motion > _MOVES)
-        if shows.sum() >= _ENOUGH:
-            self._judged += 1
-            share = max(1 - _MEMORY, 1 / self._judged)
-            self._depth *= (1 / weighted_median(rho[shows], weight[shows]) / self._depth) ** share
+        determines_depth = (rho > 0) & (motion > _MOVES)
+        if determines_depth.sum() >= _ENOUGH:
+            self._depth_count += 1
+            share = max(1 - _MEMORY, 1 / self._depth_count)
+            self._depth *= (1 / weighted_median(rho[determines_depth], weight[determines_depth]) / self._depth) ** share
 
     def _followed(self, gray: NDArray[np.uint8], T: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-        """Positions [N, 2] in the new image and which corners could be followed there and back [N]."""
+        """Positions [N, 2] in the new image, and [N] True for corners that were tracked there and back."""
         position, alive = self._pixel[:, self._view].copy(), self._seen[:, self._view].copy()
         if alive.any():
             start, expected = position[alive], self._expected(alive, T)
@@ -325,8 +325,8 @@ class LandmarkTracker(SavedState):
         return position, alive
 
     def _expected(self, chosen: NDArray[np.bool_], T: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Predict the positions of the chosen corners in the image of a camera T [4, 4]: each moves as its
-        point does. One without a point has the others' median depth; None where too few have one."""
+        """Predict the positions of the chosen corners in the image of a camera T [4, 4] from their points. A corner
+        without a point gets the median depth of the others. None if too few have a point."""
         last, K = self._poses[self._view], self._K
         position, point = self._pixel[chosen, self._view], self._point[chosen]
         depth = (point - last[:3, 3]) @ last[:3, 2]
@@ -334,20 +334,20 @@ class LandmarkTracker(SavedState):
         if finite.sum() < _ENOUGH:
             return None
         rays = np.concatenate([position, np.ones((len(position), 1))], axis=1) @ np.linalg.inv(K).T
-        usual = median(depth[finite])
-        point = np.where(finite[:, None], point, usual * rays @ last[:3, :3].T + last[:3, 3])
+        median_depth = median(depth[finite])
+        point = np.where(finite[:, None], point, median_depth * rays @ last[:3, :3].T + last[:3, 3])
 
-        def seen_by(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+        def project(pose: NDArray[np.float64]) -> NDArray[np.float64]:
             cam = (point - pose[:3, 3]) @ pose[:3, :3]
-            return np.asarray(cam @ K[:2].T / np.maximum(cam[:, 2:], NEAREST * usual))
+            return np.asarray(cam @ K[:2].T / np.maximum(cam[:, 2:], NEAREST * median_depth))
 
-        return np.asarray(position + seen_by(T) - seen_by(last))
+        return np.asarray(position + project(T) - project(last))
 
     def _fill(self, gray: NDArray[np.uint8]) -> None:
-        """New corners in free slots, away from those that are followed."""
+        """Detect new corners for free slots, away from tracked ones."""
         followed = self._seen[:, self._view]
         free = np.flatnonzero(~followed)
-        # Not for a few: a search costs half of following them all.
+        # Not for a few slots: a search takes half as long as tracking all corners.
         if len(free) < max(1, self.config.max_points // 5):
             return
         spacing = self.config.spacing * gray.shape[1] / 640
@@ -372,12 +372,12 @@ class LandmarkTracker(SavedState):
         return chosen, result
 
     def _landmarks(self, tracked: int) -> Landmarks:
-        """Triangulate the newest image's corners from the views in the window."""
+        """Landmarks of the newest image, into which ``tracked`` corners were tracked."""
         config = self.config
         chosen, result = self._triangulated()
         none = _NO_DEPTH if tracked else _NO_TRACK
         if self.contradicted:
-            none = contradiction(max(self.remaining_error, self._now), self._limit)
+            none = contradiction(max(self.remaining_error, self._newest_line_error), self._limit)
         if result is None or self.contradicted or self.baseline < _PARALLAX * self._depth:
             nothing, shared = np.zeros(0), self.shared(self.baseline)
             pixel = np.zeros((0, 2))
@@ -388,17 +388,17 @@ class LandmarkTracker(SavedState):
         depth = (result.point - T[:3, 3]) @ axis
         fits, views = result.error <= config.max_error, self._seen[chosen].sum(1)
         residual = np.square(result.error) * 2 * views / np.maximum(2 * views - 3, 1)
-        long = fits & result.ahead & (views >= _LONG)
-        if long.sum() >= _ENOUGH:
-            self._noise = _MEMORY * self._noise + (1 - _MEMORY) * median(residual[long])
-        # A track that fits worse than the noise allows is as uncertain as it fits.
+        long_tracks = fits & result.ahead & (views >= _LONG)
+        if long_tracks.sum() >= _ENOUGH:
+            self._noise = _MEMORY * self._noise + (1 - _MEMORY) * median(residual[long_tracks])
+        # A residual above the noise increases the variance of the track.
         one_pixel = np.einsum("i,nij,j->n", axis, result.covariance, axis)
         variance = _DRIFT * (views - 1) * np.maximum(residual, self._noise) * one_pixel
         safe = np.maximum(depth, 1e-9)
-        # Two views contradict each other across the epipolar line only; three tell, if enough tracks have them.
-        telling = fits[views > 2] if (views > 2).sum() >= _ENOUGH else fits
-        fine = fits & result.ahead & (depth > 0) & (telling.mean() >= config.min_share)
-        # Hopeless geometry can make the covariance indefinite.
+        # Two views can only disagree across the epipolar line. Tracks of three views decide, if there are enough.
+        decisive = fits[views > 2] if (views > 2).sum() >= _ENOUGH else fits
+        fine = fits & result.ahead & (depth > 0) & (decisive.mean() >= config.min_share)
+        # Degenerate geometry can make the covariance indefinite.
         independent = np.maximum(residual, config.pixel_noise**2) * one_pixel
         fine &= (variance >= 0) & (independent <= np.square(config.max_relative_sigma * safe))
         fine &= fine.mean() >= _CLEAR_SHARE
@@ -408,13 +408,15 @@ class LandmarkTracker(SavedState):
         return Landmarks(pixel, depth[fine], variance, tracked, none, self.pose_error, shared, lag=self.lag)
 
     def shared(self, baseline: float) -> float:
-        """Variance of inverse depths by errors of the poses over a baseline [m], alike for all points [1/m^2]; infinite
-        where the poses contradict more images than the newest: what earlier ones taught may be as wrong."""
+        """Variance of the inverse-depth error that wrong poses cause in all points over a baseline [m] [1/m^2].
+
+        It is infinite if the poses contradict more images than the newest: earlier estimates may be as wrong.
+        """
         if self.remaining_error > self._limit:
             return float("inf")
         return self.pose_variance / max(self._K[0, 0] * baseline, 1e-9) ** 2 if self.pose_variance else 0.0
 
 
 def contradiction(error: float, limit: float) -> str:
-    """The warning that no depth is used, where corners lie ``error`` px from their epipolar lines."""
+    """Reason that no depth is used, where corners lie ``error`` px from their epipolar lines."""
     return f"poses contradict the images: corners lie {error:.1f} px from their epipolar lines, at most {limit:.1f}"

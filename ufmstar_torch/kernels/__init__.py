@@ -1,1 +1,1 @@
-"""The steps of the algorithm again, faster: same signatures as the torch reference (see ``ufmstar_torch.backend``)."""
+"""Faster implementations of the algorithm's steps, with the signatures of the torch reference (see ``select``)."""

@@ -1,7 +1,7 @@
 """Checks each anchor against its neighbours: which side of a depth edge it lies on, and whether it is an outlier.
 
-A pixel of large gradient lies on an edge of a thing. The patch is matched as a whole, but the pixel shows one surface
-or the other. Of the anchors around it, some have its depth: on their side of the edge is its surface.
+A pixel of large gradient often lies on the edge of an object. The patch around it is matched as a whole, but the pixel
+shows one of two surfaces. Neighbouring anchors of the same depth show on which side of the edge that surface lies.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 from ufmstar_torch.kernels.compile_cpu import reordered
 from ufmstar_torch.kernels.dense_cpu import Measured
 
-# Two anchors are alike within so many standard deviations of their difference, or this share of the inverse depth.
+# Two anchors agree within so many standard deviations of their difference, or within this share of the inverse depth.
 _SIGMAS, _SHARE = 3.0, 0.05
-# Share of wrong anchors in a frame; they are those that differ from most of the anchors around them: each one's part of
-# that share goes with the eighth power of the share of others around it, counted with one more that is alike.
+# Share of wrong anchors in a frame. The probability that an anchor is wrong is proportional to the eighth power of the
+# share of its neighbours that disagree, counted with one virtual neighbour that agrees.
 _WRONG, _POWER = 0.026, 8
-# Least number of neighbours that support a single match, their least share, and the largest standard deviation of one
-# that does, as a share. A match beyond it needs no support.
+# A single match needs this number and this share of agreeing neighbours whose standard deviation is below this share of
+# their inverse depth. A match with a larger standard deviation needs none.
 _LEAST, _MOST, CERTAIN = 3, 0.9, 0.2
-# A side is that of the surface where the mean directions of those alike and of the others differ by this much along the
-# gradient (2 = opposite); the pixel then moves to it by 1 px, or by 2 px where they differ by _FAR.
+# The side of the surface is certain where the mean directions to agreeing and to other neighbours differ by this much
+# along the gradient (2 = opposite); the pixel then moves to it by 1 px, or by 2 px where they differ by _FAR.
 _APART, _FAR = 0.25, 1.0
-# Half width of the window of the gradient [px]; cells around an anchor's own that are asked.
+# Half width of the window of the gradient [px]; neighbours lie within this number of cells from an anchor's cell.
 _HALF, _CELLS = 2, 2
 
 
@@ -34,41 +34,41 @@ def check_anchors(
     variance: NDArray[np.float64],
     cell: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Positions of the surfaces of anchors, and bounds of their errors.
+    """Move anchors onto their surfaces, and estimate the errors of outliers.
 
     Args:
         image: [H, W] uint8.
         pixel: [N, 2] (u, v), 3 px from the border or more.
         rho: [N] [1/m].
         variance: [N] of it [1/m^2].
-        cell: side of a cell [px]; of two anchors in a cell, the second one counts for others.
+        cell: side of a cell [px]; in a cell with two anchors, only the second is a neighbour of others.
 
     Returns:
-        [N, 2] pixels on the surface, and [N] the square of the error of ``rho`` to expect [1/m^2]: the probability that
-        the anchor is wrong times the root mean squared difference from the others around it; 0 without others.
+        [N, 2] pixels on the surface, and [N] the expected squared error of ``rho`` [1/m^2]: the square of the product
+        of the probability that the anchor is wrong and its RMS difference from disagreeing neighbours; 0 without any.
     """
     shape = (image.shape[0] // cell + 1, image.shape[1] // cell + 1)
-    moved, alone, lies_in = pixel.copy(), np.zeros(len(pixel)), np.full(shape, -1, np.int64)
-    _check_anchors(image, pixel, rho, variance, cell, lies_in, moved, alone)
-    return moved, alone
+    moved, squared_error, in_cell = pixel.copy(), np.zeros(len(pixel)), np.full(shape, -1, np.int64)
+    _check_anchors(image, pixel, rho, variance, cell, in_cell, moved, squared_error)
+    return moved, squared_error
 
 
 def confirmed(pixel: NDArray[np.float64], measured: Measured, cell: int) -> NDArray[np.bool_]:
-    """Which measurements hold: those on which two views agree, those of one view that nearly all others around them
-    support, and those of one view that state a large error themselves. A single match may be wrong; but wrong ones
-    beside each other have different depths, and where there is little parallax no match is far off. Without the last
-    kind, the first views of a place would measure its near surfaces alone.
+    """The mask of reliable measurements: two views agree, or nearly all neighbours agree with a single view, or a
+    single view states a large error. A single match may be wrong, but neighbouring wrong matches have different depths,
+    and with little parallax no match is far off. Without the last kind, the first views of a scene would measure only
+    near surfaces.
 
     Args:
         pixel: [N, 2] (u, v).
         measured: N pixels.
-        cell: side of a cell [px]; of two in a cell, the second one counts for others.
+        cell: side of a cell [px]; in a cell with two, only the second is a neighbour of others.
     """
-    found = np.flatnonzero((measured.agreed > 0) & (measured.contradicted == 0))
-    fine = (measured.agreed > 1) & (measured.contradicted == 0)
-    lies_in = np.full((pixel.max(0, initial=0) // cell + 1).astype(np.int64)[::-1], -1)
-    _confirm(pixel, measured.rho, measured.variance, found, cell, lies_in, fine)
-    return fine
+    candidates = np.flatnonzero((measured.agreed > 0) & (measured.contradicted == 0))
+    reliable = (measured.agreed > 1) & (measured.contradicted == 0)
+    in_cell = np.full((pixel.max(0, initial=0) // cell + 1).astype(np.int64)[::-1], -1)
+    _confirm(pixel, measured.rho, measured.variance, candidates, cell, in_cell, reliable)
+    return reliable
 
 
 def farther(pixel: NDArray[np.float64], occupied: NDArray[np.float64], distance: float) -> NDArray[np.bool_]:
@@ -89,68 +89,68 @@ def _farther(pixel, occupied, square, far):
 
 
 @reordered
-def _confirm(pixel, rho, variance, found, cell, lies_in, fine):
-    for n in found:
-        lies_in[int(pixel[n, 1]) // cell, int(pixel[n, 0]) // cell] = n
-    for n in found:
-        if fine[n]:
+def _confirm(pixel, rho, variance, candidates, cell, in_cell, reliable):
+    for n in candidates:
+        in_cell[int(pixel[n, 1]) // cell, int(pixel[n, 0]) // cell] = n
+    for n in candidates:
+        if reliable[n]:
             continue
         row, column = int(pixel[n, 1]) // cell, int(pixel[n, 0]) // cell
         agreeing = count = 0
-        for j in range(max(row - _CELLS, 0), min(row + _CELLS + 1, lies_in.shape[0])):
-            for i in range(max(column - _CELLS, 0), min(column + _CELLS + 1, lies_in.shape[1])):
-                m = lies_in[j, i]
+        for j in range(max(row - _CELLS, 0), min(row + _CELLS + 1, in_cell.shape[0])):
+            for i in range(max(column - _CELLS, 0), min(column + _CELLS + 1, in_cell.shape[1])):
+                m = in_cell[j, i]
                 if m < 0 or m == n:
                     continue
                 count += 1
                 limit = max(_SIGMAS**2 * (variance[n] + variance[m]), (_SHARE * rho[n]) ** 2)
                 if (rho[m] - rho[n]) ** 2 < limit and variance[m] < (CERTAIN * rho[m]) ** 2:
                     agreeing += 1
-        fine[n] = agreeing >= _LEAST and agreeing >= _MOST * count
-        fine[n] |= variance[n] >= (CERTAIN * rho[n]) ** 2
+        reliable[n] = agreeing >= _LEAST and agreeing >= _MOST * count
+        reliable[n] |= variance[n] >= (CERTAIN * rho[n]) ** 2
 
 
 @reordered
-def _check_anchors(image, pixel, rho, variance, cell, lies_in, moved, alone):
+def _check_anchors(image, pixel, rho, variance, cell, in_cell, moved, squared_error):
     differs = np.zeros(len(pixel))
     for n in range(len(pixel)):
-        lies_in[int(pixel[n, 1]) // cell, int(pixel[n, 0]) // cell] = n
+        in_cell[int(pixel[n, 1]) // cell, int(pixel[n, 0]) // cell] = n
     for n in range(len(pixel)):
         u, v = pixel[n, 0], pixel[n, 1]
-        alike_u = alike_v = other_u = other_v = 0.0
-        count_alike = count_other = 0
+        agreeing_u = agreeing_v = other_u = other_v = 0.0
+        count_agreeing = count_other = 0
         row, column = int(v) // cell, int(u) // cell
-        for j in range(max(row - _CELLS, 0), min(row + _CELLS + 1, lies_in.shape[0])):
-            for i in range(max(column - _CELLS, 0), min(column + _CELLS + 1, lies_in.shape[1])):
-                m = lies_in[j, i]
+        for j in range(max(row - _CELLS, 0), min(row + _CELLS + 1, in_cell.shape[0])):
+            for i in range(max(column - _CELLS, 0), min(column + _CELLS + 1, in_cell.shape[1])):
+                m = in_cell[j, i]
                 if m < 0 or m == n:
                     continue
                 du, dv, difference = pixel[m, 0] - u, pixel[m, 1] - v, (rho[m] - rho[n]) ** 2
                 over = 1 / max(np.sqrt(du * du + dv * dv), 1.0)
                 if difference < max(_SIGMAS**2 * (variance[n] + variance[m]), (_SHARE * rho[n]) ** 2):
-                    count_alike += 1
-                    alike_u += du * over
-                    alike_v += dv * over
+                    count_agreeing += 1
+                    agreeing_u += du * over
+                    agreeing_v += dv * over
                 else:
                     count_other += 1
                     other_u += du * over
                     other_v += dv * over
-                    alone[n] += difference
+                    squared_error[n] += difference
         if count_other == 0:
             continue
-        alone[n] /= count_other
-        differs[n] = (count_other / (count_alike + count_other + 1)) ** _POWER
-        if count_alike == 0:
+        squared_error[n] /= count_other
+        differs[n] = (count_other / (count_agreeing + count_other + 1)) ** _POWER
+        if count_agreeing == 0:
             continue
         eu, ev = _gradient(image, int(u + 0.5), int(v + 0.5))
-        apart = (alike_u * eu + alike_v * ev) / count_alike - (other_u * eu + other_v * ev) / count_other
+        apart = (agreeing_u * eu + agreeing_v * ev) / count_agreeing - (other_u * eu + other_v * ev) / count_other
         if abs(apart) >= _APART:
-            into = np.sign(apart) * (2.0 if abs(apart) >= _FAR else 1.0)
-            moved[n, 0] += into * eu
-            moved[n, 1] += into * ev
-    usual = max(differs.sum() / max(len(differs), 1), _WRONG)
+            step = np.sign(apart) * (2.0 if abs(apart) >= _FAR else 1.0)
+            moved[n, 0] += step * eu
+            moved[n, 1] += step * ev
+    mean_differs = max(differs.sum() / max(len(differs), 1), _WRONG)
     for n in range(len(pixel)):
-        alone[n] *= (_WRONG * differs[n] / usual) ** 2
+        squared_error[n] *= (_WRONG * differs[n] / mean_differs) ** 2
 
 
 @reordered

@@ -1,8 +1,8 @@
-"""A frame's anchors on the CPU (numba): which of them their neighbours support, and what they teach.
+"""A frame's anchors on the CPU (numba): the inlier test, and the update of the evidence.
 
 Neighbours, and the components near an anchor, are searched in a grid over the image: time and memory grow with the
-number of anchors. Shares are summed cell by cell, in each in the order of the anchors: padding and other streams change
-no bit.
+number of anchors. Shares are summed cell by cell, and within a cell in the order of the anchors, so that padding and
+other streams change no bit.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from ufmstar_torch.kernels.regress_vectors_cpu import TERMS, add_shares
 from ufmstar_torch.kernels.rigid_cpu import padded
 from ufmstar_torch.kernels.threads_cpu import each
 
-_SOME = 16  # anchors of a cell, on average, where components are searched
-_NOTHING = 1e-30  # of a mean: less is 0 and not a number too small for single precision
+_PER_CELL = 16  # mean number of anchors in a cell of the search for components
+_NEGLIGIBLE = 1e-30  # smaller means become 0, before single precision loses them
 
 
 def inliers(anchors: AnchorInput) -> Tensor:
-    """As :func:`ufmstar_torch.anchors.evidence.inliers`, for CPU tensors; the same anchors."""
+    """As :func:`ufmstar_torch.anchors.evidence.inliers`, for CPU tensors; the same result."""
     out = np.empty(anchors.valid.shape, np.bool_)
     fields = (anchors.pixel, anchors.predicted, anchors.depth, anchors.variance, anchors.valid)
     each(_inliers, list(zip(*map(array, fields), out, strict=True)))
@@ -41,7 +41,7 @@ def inliers(anchors: AnchorInput) -> Tensor:
 
 @kernel
 def _inliers(pixel, predicted, depth, variance, valid, out):
-    """One stream, N anchors, into ``out`` [N]."""
+    """Write ``out`` [N] for the N anchors of one stream."""
     supported(pixel, predicted, depth, variance, valid, out)
 
 
@@ -54,13 +54,13 @@ def learn_in_view(
     anchors: AnchorInput | None,
     config: UfMStarConfig,
 ) -> Learnt:
-    """As :func:`ufmstar_torch.anchors.extension.learn` with the exact sum, of what is in view (``regress_cpu.look``);
-    shares are right to twice the error of the regression's.
+    """As :func:`ufmstar_torch.anchors.extension.learn` with the exact sum over the components in view
+    (``regress_cpu.views_of``); the error of the shares is at most twice the regression's.
 
     Args:
-        evidence: of the mixture's slots, or of fewer.
-        capacity: of the mixture, whose first slots hold each stream's ``seen`` components.
-        seen, views: of their last three features the first two are written: what was learnt of the components.
+        evidence: of the mixture's first slots; later slots have none.
+        capacity: slots of the mixture; the first ones hold each stream's ``seen`` components.
+        seen, views: the first two of the last three features receive what was learnt of the components.
         frame, anchors, config: as there.
     """
     b, before, overall_before = len(views), array(evidence.component), array(evidence.overall)
@@ -76,7 +76,7 @@ def learn_in_view(
     settings = frame.size[1], 0.5 ** (1 / config.anchors.half_life), config.anchors.shrinkage
     arrays = zip(views, features, *fields, array(frame.intrinsics), before, overall_before, strict=True)
     out = zip(component, overall, used, beyond, stream, strict=True)
-    each(_learn, [(*arguments, *settings, *into) for arguments, into in zip(arrays, out, strict=True)])
+    each(_learn, [(*arguments, *settings, *outputs) for arguments, outputs in zip(arrays, out, strict=True)])
     learnt = Evidence(torch.from_numpy(component), torch.from_numpy(overall))
     return Learnt(learnt, torch.from_numpy(used[:, 0]), torch.from_numpy(beyond), torch.from_numpy(stream))
 
@@ -86,7 +86,7 @@ def _learn(
     view, features, index, pixel, predicted, depth, variance, network_variance, valid, K, before, overall_before,
     width, memory, shrinkage, component, overall, used, beyond, stream,
 ):  # fmt: skip
-    """One stream: N anchors, K components, of which only ``view`` can explain a point."""
+    """One stream of N anchors and K components; only the components of ``view`` can explain a point."""
     chosen = np.empty(valid.size, np.bool_)
     rows, sums = np.empty((valid.size, 3)), np.zeros((component.shape[0], 3))
     supported(pixel, predicted, depth, variance, valid, chosen)
@@ -94,7 +94,7 @@ def _learn(
     if valid.size > 0:
         _distribute(index, predicted, chosen, rows, K, width, view, sums)
     fade = memory if used[0] > 0 else 1.0
-    for c in range(3):  # rounded as the state keeps it
+    for c in range(3):  # rounded to the state's dtype
         overall[c] = fade * overall_before[c] + _folded(rows[:, c])
     for c in range(2):
         stream[c] = np.float64(overall[c + 1]) / (np.float64(overall[0]) + shrinkage)
@@ -105,7 +105,7 @@ def _learn(
         n = np.float64(component[k, 0])
         for c in range(2):
             value = (np.float64(component[k, c + 1]) - n * stream[c]) / (n + shrinkage)
-            beyond[k, c] = value if abs(value) > _NOTHING else 0.0
+            beyond[k, c] = value if abs(value) > _NEGLIGIBLE else 0.0
     last = features.shape[1] - 1
     for k in range(features.shape[0]):
         features[k, last - 2], features[k, last - 1] = beyond[k, 0], beyond[k, 1]
@@ -144,7 +144,7 @@ def _rows(predicted, depth, variance, network_variance, supported, rows):
 
 @part
 def _folded(values):
-    """The sum in the order of ``fixed_order.total``: halves of a length rounded up to a power of two meet."""
+    """The sum in the order of ``fixed_order.total``: of two halves, for a length rounded up to a power of two."""
     n = values.size
     if n == 0:
         return 0.0
@@ -161,9 +161,9 @@ def _folded(values):
 
 @part
 def _distribute(index, predicted, chosen, rows, K, width, view, sums):
-    """Add the rows [N, 3] of the chosen anchors to the components [K, 3] that explain their points, by their shares.
+    """Add the rows [N, 3] of the chosen anchors to the components [K, 3] in proportion to their densities there.
 
-    A cell of anchors leaves out the components that the regression leaves out of a tile.
+    Components are culled for a cell of anchors as the regression culls them for a tile.
     """
     visible, fields, packed, _, settings = view
     points, pixel = np.empty((chosen.size, 3)), np.empty((chosen.size, 2))
@@ -171,10 +171,10 @@ def _distribute(index, predicted, chosen, rows, K, width, view, sums):
         u, v, z = np.float64(index[i] % width), np.float64(index[i] // width), predicted[i]
         pixel[i, 0], pixel[i, 1] = u, v
         points[i, 0], points[i, 1], points[i, 2] = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z
-    start, order = grid(pixel, chosen, _SOME)[4:]
-    room = packed.shape[1]
-    retained, work = np.empty(visible.size, np.int64), np.empty(8 + room, packed.dtype)
-    near, density, added = np.empty((FIELDS, room)), np.empty(room), np.empty((3, room))
+    start, order = grid(pixel, chosen, _PER_CELL)[4:]
+    capacity = packed.shape[1]
+    retained, work = np.empty(visible.size, np.int64), np.empty(8 + capacity, packed.dtype)
+    near, density, added = np.empty((FIELDS, capacity)), np.empty(capacity), np.empty((3, capacity))
     point, row = np.empty(3), np.empty(4)
     row[3] = settings[0]
     for cell in range(start.size - 1):
@@ -186,7 +186,7 @@ def _distribute(index, predicted, chosen, rows, K, width, view, sums):
         for i in range(count):
             for field in range(FIELDS):
                 near[field, i] = fields[retained[i], field]
-        for i in range(count, n):  # nowhere
+        for i in range(count, n):  # components of density 0
             for field in range(FIELDS - 1):
                 near[field, i] = 0.0
             near[FIELDS - 1, i] = -np.inf
@@ -197,7 +197,7 @@ def _distribute(index, predicted, chosen, rows, K, width, view, sums):
             p = order[position]
             for axis in range(3):
                 point[axis], row[axis] = points[p, axis], rows[p, axis]
-            add_shares(near, room, n, point, row, density, added)
+            add_shares(near, capacity, n, point, row, density, added)
         for i in range(count):
             for axis in range(3):
                 sums[visible[retained[i]], axis] += added[axis, i]
@@ -205,7 +205,7 @@ def _distribute(index, predicted, chosen, rows, K, width, view, sums):
 
 @leaf
 def _box(points, order, first, last):
-    """The least and the greatest corner of the points in those places of an order."""
+    """The least and the greatest corner of the points ``order[first:last]``."""
     a = b = c = np.inf
     d = e = f = -np.inf
     for position in range(first, last):

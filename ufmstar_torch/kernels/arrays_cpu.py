@@ -1,4 +1,4 @@
-"""Tensors as the arrays that compiled code takes."""
+"""Tensors as arrays for compiled code."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ _HALVES = (torch.float16, torch.bfloat16)
 def array(value: Tensor) -> NDArray[Any]:
     """A contiguous array on the CPU that shares the tensor's memory where it can; half and bfloat16 become float32.
 
-    A call of torch takes microseconds, several times as many after a network has emptied the caches: none is made that
-    changes nothing.
+    A call of torch takes microseconds, and several times longer after a network has evicted the CPU's caches: calls
+    without effect are skipped.
     """
     if value.requires_grad:
         value = value.detach()

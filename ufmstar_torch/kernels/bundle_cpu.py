@@ -1,6 +1,6 @@
 """Normal equations of a bundle adjustment, inverse depths eliminated, for ``anchors.bundle``; on the CPU (numba).
 
-View W is the newest. A track whose ray there is n lies in view k at
+View W is the newest. A track with the ray n in view W lies in view k at
 
     q = Exp(-w_k) R_k^T (rho (C_W + s_W - C_k - s_k) + R_W Exp(w_W) n),
 
@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.kernels.compile_cpu import reordered
 
-# Numbers of a pose's error: a rotation about the camera's axes [rad] and a shift along the world's [m].
+# Parameters of a pose's error: a rotation about the camera's axes [rad] and a shift along the world's [m].
 POSE = 6
-# Inverse depths lie between these multiples of that of the scene.
+# Limits of inverse depths, as multiples of the scene's.
 FAR, NEAR = 0.02, 20.0
-# A point this near to a view's image plane, over its distance from the newest view, is not used.
+# Least depth of a point in a view, over its depth in the newest view; nearer points are not used.
 _AHEAD = 1e-3
 
 
@@ -26,10 +26,10 @@ def inverse_depths(
     ray: NDArray[np.float64], precision: NDArray[np.float64], T_world_cam: NDArray[np.float64],
     prior: float, student: float, steps: int,
 ) -> NDArray[np.float64]:  # fmt: skip
-    """[N] inverse depths by Gauss-Newton steps with poses that are held fixed; arguments as :func:`equations`."""
+    """[N] inverse depths by Gauss-Newton steps with fixed poses; arguments as :func:`equations`."""
     rho = np.full(len(ray), prior)
-    into, moved = _between(T_world_cam)
-    _inverse_depths(ray, precision, into, moved, prior, student, steps, rho)
+    rotation, translation = _between(T_world_cam)
+    _inverse_depths(ray, precision, rotation, translation, prior, student, steps, rho)
     return rho
 
 
@@ -44,7 +44,7 @@ def equations(
         precision: [N, W-1] of a position in the earlier views; 0 where a view does not show the track.
         T_world_cam: [W, 4, 4] camera-to-world [m].
         rho: [N] inverse depths in the newest view [1/m].
-        prior: mean of ``rho`` before the images, of which its standard deviation is twice as much [1/m].
+        prior: prior mean of ``rho`` [1/m]; its prior standard deviation is twice as large.
         student: degrees of freedom of the positions' distribution.
 
     Returns:
@@ -54,9 +54,9 @@ def equations(
     n, views = precision.shape
     size = POSE * (views + 1)
     A, b, h, v = np.zeros((size, size)), np.zeros(size), np.zeros((n, size)), np.zeros(n)
-    into, moved = _between(T_world_cam)
+    rotation, translation = _between(T_world_cam)
     to_view = np.ascontiguousarray(T_world_cam[:, :3, :3].transpose(0, 2, 1))
-    _equations(ray, precision, into, moved, to_view, rho, prior, student, A, b, h, v)
+    _equations(ray, precision, rotation, translation, to_view, rho, prior, student, A, b, h, v)
     return A, b, h, v
 
 
@@ -70,8 +70,8 @@ def moved(T_world_cam: NDArray[np.float64], error: NDArray[np.float64]) -> NDArr
 def _between(T_world_cam: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """R_k^T R_W [W-1, 3, 3] and R_k^T (C_W - C_k) [W-1, 3]."""
     R, C = T_world_cam[:, :3, :3], T_world_cam[:, :3, 3]
-    into = R[:-1].transpose(0, 2, 1)
-    return np.ascontiguousarray(into @ R[-1]), ((C[-1] - C[:-1])[:, None] @ R[:-1])[:, 0]
+    inverse = R[:-1].transpose(0, 2, 1)
+    return np.ascontiguousarray(inverse @ R[-1]), ((C[-1] - C[:-1])[:, None] @ R[:-1])[:, 0]
 
 
 @reordered
@@ -91,7 +91,7 @@ def _move(error, poses):
 
 
 @reordered
-def _inverse_depths(ray, precision, into, moved, prior, student, steps, rho):
+def _inverse_depths(ray, precision, rotation, translation, prior, student, steps, rho):
     for n in range(len(ray)):
         x, y = ray[n, -1, 0], ray[n, -1, 1]
         for _ in range(steps):
@@ -100,7 +100,7 @@ def _inverse_depths(ray, precision, into, moved, prior, student, steps, rho):
             for k in range(precision.shape[1]):
                 if precision[n, k] == 0:
                     continue
-                R, t = into[k], moved[k]
+                R, t = rotation[k], translation[k]
                 z = R[2, 0] * x + R[2, 1] * y + R[2, 2] + rho[n] * t[2]
                 if z < _AHEAD:
                     continue
@@ -116,18 +116,18 @@ def _inverse_depths(ray, precision, into, moved, prior, student, steps, rho):
 
 
 @reordered
-def _equations(ray, precision, into, moved, to_view, rho, prior, student, A, b, h, v):
+def _equations(ray, precision, rotation, translation, to_view, rho, prior, student, A, b, h, v):
     views = precision.shape[1]
     last = POSE * views
-    # By the newest pose and by view k's: rows u and v.
-    by_newest, other, weighted = np.empty((2, POSE)), np.empty((2, POSE)), np.empty(h.shape)
+    # Derivatives of u and v (rows) by the newest pose and by view k's.
+    J, J_k, weighted = np.empty((2, POSE)), np.empty((2, POSE)), np.empty(h.shape)
     for n in range(len(ray)):
         x, y = ray[n, -1, 0], ray[n, -1, 1]
         row = h[n]
         total = 0.25 / (prior * prior)
         above = total * (prior - rho[n])
         for k in range(views):
-            R, t, to = into[k], moved[k], to_view[k]
+            R, t, to = rotation[k], translation[k], to_view[k]
             z = R[2, 0] * x + R[2, 1] * y + R[2, 2] + rho[n] * t[2]
             if precision[n, k] == 0 or z < _AHEAD:
                 continue
@@ -140,34 +140,30 @@ def _equations(ray, precision, into, moved, to_view, rho, prior, student, A, b, 
             for i in range(2):
                 at = u if i == 0 else w
                 r0, r1, r2 = R[i, 0] - at * R[2, 0], R[i, 1] - at * R[2, 1], R[i, 2] - at * R[2, 2]
-                # R [n]x with n = (x, y, 1), negative: the change by w of the newest view.
-                by_newest[i, 0], by_newest[i, 1], by_newest[i, 2] = (
-                    (r2 * y - r1) * over,
-                    (r0 - r2 * x) * over,
-                    (r1 * x - r0 * y) * over,
-                )
+                # -R [n]x with n = (x, y, 1): the derivative by w of the newest view.
+                J[i, 0], J[i, 1], J[i, 2] = (r2 * y - r1) * over, (r0 - r2 * x) * over, (r1 * x - r0 * y) * over
                 for c in range(3):
-                    by_newest[i, 3 + c] = rho[n] * (to[i, c] - at * to[2, c]) * over
-                    other[i, 3 + c] = -by_newest[i, 3 + c]
-            # [q]x: the change by w_k.
-            other[0, 0], other[0, 1], other[0, 2] = u * w, -(1 + u * u), w
-            other[1, 0], other[1, 1], other[1, 2] = 1 + w * w, -u * w, -u
+                    J[i, 3 + c] = rho[n] * (to[i, c] - at * to[2, c]) * over
+                    J_k[i, 3 + c] = -J[i, 3 + c]
+            # [q]x: the derivative by w_k.
+            J_k[0, 0], J_k[0, 1], J_k[0, 2] = u * w, -(1 + u * u), w
+            J_k[1, 0], J_k[1, 1], J_k[1, 2] = 1 + w * w, -u * w, -u
             du, dv = (t[0] - u * t[2]) * over, (t[1] - w * t[2]) * over
             total += p * (du * du + dv * dv)
             above += p * (du * right + dv * down)
             first = POSE * k
             for c in range(POSE):
-                by_own, by_own_v = p * by_newest[0, c], p * by_newest[1, c]
-                by, by_v = p * other[0, c], p * other[1, c]
-                row[last + c] += by_own * du + by_own_v * dv
-                row[first + c] += by * du + by_v * dv
-                b[last + c] += by_own * right + by_own_v * down
-                b[first + c] += by * right + by_v * down
+                newest_u, newest_v = p * J[0, c], p * J[1, c]
+                k_u, k_v = p * J_k[0, c], p * J_k[1, c]
+                row[last + c] += newest_u * du + newest_v * dv
+                row[first + c] += k_u * du + k_v * dv
+                b[last + c] += newest_u * right + newest_v * down
+                b[first + c] += k_u * right + k_v * down
                 for d in range(POSE):
-                    A[last + c, first + d] += by_own * other[0, d] + by_own_v * other[1, d]
+                    A[last + c, first + d] += newest_u * J_k[0, d] + newest_v * J_k[1, d]
                 for d in range(c + 1):
-                    A[last + c, last + d] += by_own * by_newest[0, d] + by_own_v * by_newest[1, d]
-                    A[first + c, first + d] += by * other[0, d] + by_v * other[1, d]
+                    A[last + c, last + d] += newest_u * J[0, d] + newest_v * J[1, d]
+                    A[first + c, first + d] += k_u * J_k[0, d] + k_v * J_k[1, d]
         v[n] = above / total
         weighted[n] = row
         row /= total

@@ -1,4 +1,4 @@
-"""From pixels to the posterior's nodes and back, on the CPU (numba)."""
+"""Means of pixels in the posterior's cells, and interpolation from nodes to pixels, on the CPU (numba)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ufmstar_torch.kernels.field_cpu import Floats, fast
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.read import LARGEST
 
-# An anchor's stated depth or variance may be NaN.
+# Kernels whose sums may be reordered, for values with NaN.
 with_nan = cached(fastmath={"contract", "reassoc", "nsz", "arcp"})
 
 
@@ -32,22 +32,22 @@ def _add_up(logs, valid, total, count):
     for row in range(rows):
         for i in range(row * height // rows, ((row + 1) * height + rows - 1) // rows):
             for c in range(cols):
-                inside, used = 0.0, 0
+                cell_sum, used = 0.0, 0
                 for j in range(c * width // cols, ((c + 1) * width + cols - 1) // cols):
                     if valid[i, j]:
-                        inside += logs[i, j]
+                        cell_sum += logs[i, j]
                         used += 1
-                total[row, c] += inside
+                total[row, c] += cell_sum
                 count[row, c] += used
 
 
 def features(logs: Floats, u: Floats, v: Floats) -> Floats:
-    """[N, 4] of log d - m_0 [N] at u and v [N] from 0 to 1, as in ``ufmstar_torch.posterior.grid``."""
+    """[N, 4] features of log d - m_0 [N] at u and v [N] from 0 to 1, as in ``ufmstar_torch.posterior.grid``."""
     return np.stack([np.ones_like(logs), logs, 2 * u - 1, 2 * v - 1], 1)
 
 
 def ranges(depth: NDArray[Any], valid: NDArray[np.bool_], index: NDArray[np.int64]) -> Floats:
-    """[N] largest less smallest log d of the valid pixels among a valid one and its neighbours."""
+    """[N] largest less smallest log d of the valid pixels among a valid pixel and its eight neighbours."""
     out = np.empty(len(index))
     _highest_over_lowest(depth, valid, index, out)
     return np.log(out)
@@ -67,7 +67,7 @@ def _highest_over_lowest(depth, valid, index, out):
 
 
 def local_variance(f: Floats) -> Floats:
-    """[R, C] variance of f [R, C] among each value and its eight neighbours; beyond the edge they are repeated."""
+    """[R, C] variance of f [R, C] over each value and its eight neighbours; border values are repeated outside."""
     out = np.empty_like(f)
     _vary(f, out)
     return out
@@ -78,12 +78,12 @@ def _vary(f, out):
     rows, cols = f.shape
     for i in range(rows):
         for j in range(cols):
-            total = squares = 0.0  # of differences from the one in the middle: less is lost in rounding
+            total = squares = 0.0  # of differences from the centre, to lose less in rounding
             for r in range(i - 1, i + 2):
                 for c in range(j - 1, j + 2):
-                    left = f[min(max(r, 0), rows - 1), min(max(c, 0), cols - 1)] - f[i, j]
-                    total += left
-                    squares += left * left
+                    difference = f[min(max(r, 0), rows - 1), min(max(c, 0), cols - 1)] - f[i, j]
+                    total += difference
+                    squares += difference * difference
             out[i, j] = squares / 9 - (total / 9) ** 2
 
 
@@ -111,36 +111,36 @@ def read(
 
 @with_nan
 def _pixels(depth, valid, logs, claimed, left, right, across, base, slopes, limits, y, spread, inlier, outlier):
-    """y [H, W], the variances of d e^y over e^2y, and p at every pixel; NaN where not valid.
+    """Write y [H, W], the variances of d e^y over e^2y, and p at every pixel; y and p are NaN where not valid.
 
-    ``left`` and ``right`` [R, 6, W] are the nodes before and after each column, ``across`` by how much the one after it
-    counts. The four weights s/(1 + D^2) have the quotients of s times the other three denominators.
+    ``left`` and ``right`` [R, 6, W] are the nodes before and after each column, ``across`` the weight of the one after.
+    The ratios of the four weights s/(1 + D^2) are those of s times the other three denominators.
     """
     height, rows = len(logs), len(left)
-    contrast, largest = limits
+    contrast2, largest = limits
     by_depth, by_row = slopes
     for i in range(height):
         v = (i + 0.5) / height
-        at = min(max(v * rows - 0.5, 0.0), rows - 1.0)
-        top = min(int(at), max(rows - 2, 0))
-        below, low = at - top, min(top + 1, rows - 1)
-        n0, n1, n2, n3 = left[top], right[top], left[low], right[low]
+        position = min(max(v * rows - 0.5, 0.0), rows - 1.0)
+        top = min(int(position), max(rows - 2, 0))
+        fv, bottom = position - top, min(top + 1, rows - 1)
+        n0, n1, n2, n3 = left[top], right[top], left[bottom], right[bottom]
         depths, used, gs, Vs = depth[i], valid[i], logs[i], claimed[i]
-        ys, out, inside, other = y[i], spread[i], inlier[i], outlier[i]
+        ys, variances, inliers, outliers = y[i], spread[i], inlier[i], outlier[i]
         for j in range(len(across)):
-            g, d, V, right_share = np.float64(gs[j]), np.float64(depths[j]), np.float64(Vs[j]), across[j]
+            g, d, V, fu = np.float64(gs[j]), np.float64(depths[j]), np.float64(Vs[j]), across[j]
             a0, a1, a2, a3 = g - n0[0, j], g - n1[0, j], g - n2[0, j], g - n3[0, j]
-            q0, q1, q2, q3 = contrast + a0 * a0, contrast + a1 * a1, contrast + a2 * a2, contrast + a3 * a3
-            w0, w1 = (1 - below) * (1 - right_share) * q1 * (q2 * q3), (1 - below) * right_share * q0 * (q2 * q3)
-            w2, w3 = below * (1 - right_share) * q3 * (q0 * q1), below * right_share * q2 * (q0 * q1)
+            q0, q1, q2, q3 = contrast2 + a0 * a0, contrast2 + a1 * a1, contrast2 + a2 * a2, contrast2 + a3 * a3
+            w0, w1 = (1 - fv) * (1 - fu) * q1 * (q2 * q3), (1 - fv) * fu * q0 * (q2 * q3)
+            w2, w3 = fv * (1 - fu) * q3 * (q0 * q1), fv * fu * q2 * (q0 * q1)
             share = 1 / (w0 + w1 + w2 + w3)
             offset = w0 * n0[1, j] + w1 * n1[1, j] + w2 * n2[1, j] + w3 * n3[1, j]
             variance = w0 * n0[2, j] + w1 * n1[2, j] + w2 * n2[2, j] + w3 * n3[2, j]
-            here = w0 * n0[3, j] + w1 * n1[3, j] + w2 * n2[3, j] + w3 * n3[3, j]
+            inlier_variance = w0 * n0[3, j] + w1 * n1[3, j] + w2 * n2[3, j] + w3 * n3[3, j]
             p = w0 * n0[4, j] + w1 * n1[4, j] + w2 * n2[4, j] + w3 * n3[4, j]
             unseen = w0 * n0[5, j] + w1 * n1[5, j] + w2 * n2[5, j] + w3 * n3[5, j]
             value = base[j] + by_depth * g + by_row * (2 * v - 1) + offset * share
             ys[j] = min(max(value, -largest), largest) if used[j] else np.nan
-            other[j] = p * share if used[j] else np.nan
-            out[j] = max(variance * d * d, unseen * (V if V == V else 0.0)) * share
-            inside[j] = here * d * d * share
+            outliers[j] = p * share if used[j] else np.nan
+            variances[j] = max(variance * d * d, unseen * (V if V == V else 0.0)) * share
+            inliers[j] = inlier_variance * d * d * share

@@ -22,7 +22,7 @@ from ufmstar_torch.kernels.arrays_cpu import array
 _Matrix = list[list[float]]
 _EYE3, _EYE4 = np.eye(3).tolist(), np.eye(4).tolist()
 _AXES = range(3)
-_ROUNDING = 4e-16  # of R^T R: a further step changes nothing
+_ROUNDING = 4e-16  # deviation of R^T R below which a further step changes nothing
 
 
 def check_values(
@@ -39,7 +39,7 @@ def check_values(
 ) -> FrameInput:
     """As :func:`ufmstar_torch.frame.check_values`, for the CPU. Depth that is valid everywhere is not copied."""
     b, height, width = depth.shape
-    poses, cameras = (_matrices(has_depth, b) for has_depth in (pose, intrinsics))
+    poses, cameras = (_matrices(matrix, b) for matrix in (pose, intrinsics))
     checked = [_camera(T, K, height, width, rotation_tolerance) for T, K in zip(poses, cameras, strict=True)]
     T_safe, K_safe, faults, deviations = zip(*checked, strict=True)
     z, wanted = array(depth), None if mask is None else array(mask)
@@ -72,16 +72,16 @@ def check_values(
     )
 
 
-def _matrices(cameras: Tensor, streams: int) -> list[_Matrix]:
-    """A camera of each stream, of [B, n, n], [1, n, n] or [n, n], in plain numbers."""
-    matrices = cameras.tolist() if cameras.dim() == 3 else [cameras.tolist()]
+def _matrices(tensor: Tensor, streams: int) -> list[_Matrix]:
+    """One matrix for each stream as lists of numbers, from [B, n, n], [1, n, n] or [n, n]."""
+    matrices = tensor.tolist() if tensor.dim() == 3 else [tensor.tolist()]
     return matrices if len(matrices) == streams else matrices * streams
 
 
 def _restrict(use: NDArray[np.bool_], values: NDArray[Any], least: float, most: float) -> None:
-    """Leave those pixels [B, H, W] out of ``use`` whose values do not lie in [least, most]; NaN fails every comparison.
+    """Clear ``use`` [B, H, W] where values are outside [least, most] or NaN.
 
-    The extremes alone, which need no memory, decide where all values do.
+    Where all values are inside, the extremes show it without memory for masks.
     """
     if not (values.min() >= least and values.max() <= most):
         use &= values >= least
@@ -89,8 +89,8 @@ def _restrict(use: NDArray[np.bool_], values: NDArray[Any], least: float, most: 
 
 
 def _camera(T: _Matrix, K: _Matrix, height: int, width: int, tolerance: float) -> tuple[_Matrix, _Matrix, int, float]:
-    """The pose with its nearest rotation and the intrinsics of a stream (an identity and a unit camera where there is a
-    fault), the code of the first fault (``FRAME_FAULTS``), and max |R^T R - I| of the given pose."""
+    """The pose with its nearest rotation and the intrinsics of a stream (identities where there is a fault), the code
+    of the first fault (``FRAME_FAULTS``), and max |R^T R - I| of the pose ``T``."""
     gram = _gram(T)
     deviation = _deviation(gram)
     fault = _pose_fault(T, deviation, tolerance) or _intrinsics_fault(K, height, width)

@@ -1,15 +1,15 @@
 """Compiles code for the CPU (numba): kernels, which Python calls, and their parts, which only kernels call.
 
-A kernel is kept on disk. A part is compiled into the kernels that call it and has no interface of its own; called from
-Python it is a plain function.
+Kernels are cached on disk. A part is compiled into the kernels that call it and has no interface of its own; called
+from Python it is a plain function.
 
-This is the only file that touches numba's private parts (``tests/test_warm_up.py`` fails where numba changes them).
-numba optimises each function on its own, makes machine code of it, and does both again in every function that calls
-it. Here a part is optimised and made machine code only in its kernels; of numba's passes over a function those remain
-that such plain code needs. A first start takes half the time for it.
+This is the only file that uses numba's private interfaces (``tests/test_warm_up.py`` fails where numba changes them).
+numba optimises each function, makes machine code of it, and repeats both in every function that calls it. Here only
+kernels are optimised and made machine code, together with their parts, and only those of numba's passes run that such
+plain code needs. This halves the time of the first start.
 
-A kernel on disk counts as long as its own file and those whose code and constants are compiled into kernels are the
-same: by itself numba looks at the first alone, and would go on with an outdated part. A damaged file, or one that
+A cached kernel is valid while its own file and all files whose code and constants are compiled into kernels are
+unchanged: numba itself compares only the kernel's file and would use an outdated part. A damaged file, or one that
 cannot be written, is reported once (logger ``ufmstar_torch``), and the kernel is compiled in memory.
 """
 
@@ -44,13 +44,13 @@ _PASSES = (
 )
 
 
-# Settings of a caller that change nothing in what it calls.
-_OF_THE_CALLER = ("release_gil", "no_cpython_wrapper", "no_cfunc_wrapper")
+# Flags of a caller that do not change the functions it calls.
+_CALLER_FLAGS = ("release_gil", "no_cpython_wrapper", "no_cfunc_wrapper")
 
 
 class _Flags(compiler.Flags):
-    """Settings of a compilation. numba compares them for every operator, to look up what it has compiled: equal where
-    what is called is the same."""
+    """Flags of a compilation. For every operator, numba looks up compiled code by comparing flags; this comparison
+    leaves out ``_CALLER_FLAGS``."""
 
     __slots__ = ("_compared",)
 
@@ -63,13 +63,13 @@ class _Flags(compiler.Flags):
         return self is other or self._values_of_interest() == other._values_of_interest()
 
     def _values_of_interest(self) -> list[Any]:
-        if not hasattr(self, "_compared"):  # nothing changes any more
-            self._compared = [value for name, value in self.values().items() if name not in _OF_THE_CALLER]
+        if not hasattr(self, "_compared"):  # the flags no longer change
+            self._compared = [value for name, value in self.values().items() if name not in _CALLER_FLAGS]
         return self._compared
 
 
 class _Library(codegen.JITCodeLibrary):
-    """LLVM's code of a kernel with its parts, which is optimised once."""
+    """LLVM's code of a kernel with its parts, optimised once."""
 
     def _optimize_functions(self, ll_module: Any) -> None:
         ll_module.data_layout = self._codegen._data_layout
@@ -80,10 +80,10 @@ class _Library(codegen.JITCodeLibrary):
 
 
 class _PartLibrary(_Library):
-    """LLVM's code of a part, for kernels to link."""
+    """LLVM's code of a part, which kernels link."""
 
     def _optimize_final_module(self) -> None:
-        """The kernel's optimisation is enough."""
+        """Do nothing: the kernel is optimised with its parts."""
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()
@@ -97,7 +97,7 @@ class _PartLibrary(_Library):
         return self
 
     def set_env(self, env_name: str, env: Any) -> None:
-        """A part raises no exception whose values are known at run time only."""
+        """Do nothing: no part raises an exception with values of the run time."""
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
@@ -120,7 +120,7 @@ class _PartLowering(typed_passes.NativeLowering):
 
 
 class _Kernel(compiler.CompilerBase):
-    """The passes over a kernel."""
+    """Compiler passes over a kernel."""
 
     lowering: type[typed_passes.NativeLowering] = _KernelLowering
 
@@ -129,14 +129,14 @@ class _Kernel(compiler.CompilerBase):
 
     def define_pipelines(self) -> list[PassManager]:
         manager = PassManager("ufmstar_torch")
-        for one in (*_PASSES, self.lowering, typed_passes.NoPythonBackend):
-            manager.add_pass(one, one.__name__)
+        for compiler_pass in (*_PASSES, self.lowering, typed_passes.NoPythonBackend):
+            manager.add_pass(compiler_pass, compiler_pass.__name__)
         manager.finalize()
         return [manager]
 
 
 class _Part(_Kernel):
-    """The passes over a part."""
+    """Compiler passes over a part."""
 
     lowering = _PartLowering
 
@@ -153,8 +153,8 @@ def _sources() -> str:
 _SOURCES = _sources()
 
 
-class _KeptFiles(caching.IndexDataCacheFile):
-    """The files of a kernel on disk. Each is a checksum, the stamp of what the kernel depends on, and the content."""
+class _CacheFiles(caching.IndexDataCacheFile):
+    """Cache files of a kernel: each holds a checksum, the stamp of the kernel's dependencies, and the content."""
 
     def _load_index(self) -> dict[Any, str]:
         return self._read(self._index_path) or {}
@@ -169,7 +169,7 @@ class _KeptFiles(caching.IndexDataCacheFile):
         self._write(self._data_path(name), data)
 
     def _read(self, path: str) -> Any:
-        """The content of a file, None where there is none of this stamp."""
+        """The content of a file; None if it is missing, damaged or of another stamp."""
         try:
             data = Path(path).read_bytes()
         except FileNotFoundError:
@@ -192,13 +192,13 @@ class _KeptFiles(caching.IndexDataCacheFile):
 
 
 @functools.cache
-def _report(what: str) -> None:
-    """Log once that a kernel has to be compiled in memory."""
-    logging.getLogger("ufmstar_torch").warning("compiled kernels: %s; compiling in memory", what)
+def _report(reason: str) -> None:
+    """Log once why kernels are compiled in memory."""
+    logging.getLogger("ufmstar_torch").warning("compiled kernels: %s; compiling in memory", reason)
 
 
 def cached(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Compile at the first call, and keep the result on disk; in memory alone where no folder can be written to."""
+    """Compile at the first call and cache the result on disk, or in memory where no folder can be written to."""
 
     def decorated(function: Callable[..., Any]) -> Any:
         settings = {**_OPTIONS, **options, "pipeline_class": _Kernel}
@@ -206,9 +206,9 @@ def cached(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             compiled = njit(cache=True, **settings)(function)
         except RuntimeError:  # numba: "no locator available"
             return njit(**settings)(function)
-        cache = compiled._cache  # no public way to widen what a cached kernel depends on
+        cache = compiled._cache  # numba has no public way to add dependencies of a cached kernel
         stamp = numba.__version__, cache._cache_file._source_stamp, _SOURCES
-        cache._cache_file = _KeptFiles(cache._cache_path, f"{cache._impl.filename_base}.kept", stamp)
+        cache._cache_file = _CacheFiles(cache._cache_path, f"{cache._impl.filename_base}.kept", stamp)
         return compiled
 
     return decorated
@@ -221,14 +221,14 @@ def _inner(**options: Any) -> Any:
 kernel = cached()
 part = _inner()
 
-# A part that allocates nothing; the kernel that calls it holds its arrays. numba counts the references of every view of
-# an array (``table[i]`` as an argument, say) by an atomic operation, which takes as long as some forty others; here
-# it is compiled out, and a function that allocates is refused.
+# A part that allocates nothing; the kernel that calls it holds its arrays. numba counts references to every view of an
+# array (such as ``table[i]`` as an argument) with an atomic operation, which takes as long as some forty others. A leaf
+# counts no references, and numba refuses to compile one that allocates.
 leaf = _inner(_nrt=False)
-# A leaf in which multiply and add are joined where the processor can: one rounding less, not one more.
+# A leaf with fused multiply-add where the processor has it: one rounding less.
 contracted = _inner(_nrt=False, fastmath={"contract"})
 
-# A kernel and a leaf whose sums may be taken in any order, so that they run in vectors.
+# A kernel and a leaf whose sums may be reordered, so that they are vectorised.
 _ANY_ORDER = {"reassoc", "contract", "nsz"}
 reordered = cached(fastmath=_ANY_ORDER)
 reordered_leaf = _inner(_nrt=False, fastmath=_ANY_ORDER)
@@ -236,12 +236,12 @@ reordered_leaf = _inner(_nrt=False, fastmath=_ANY_ORDER)
 
 @intrinsic
 def _empty(typing, shape, dtype):
-    """``np.empty(shape, dtype)``, which itself takes .1 s to compile for every kind of array."""
+    """``np.empty(shape, dtype)``, whose own compilation takes 0.1 s for every type of array."""
     array = types.Array(dtype.dtype, len(shape) if isinstance(shape, types.BaseTuple) else 1, "C")
     return array(shape, dtype), _allocated
 
 
-# As a type checker sees it from a kernel, where the typing context is not an argument.
+# Typed as kernels call it: without the typing context.
 empty: Callable[..., NDArray[Any]] = cast(Any, _empty)
 
 
@@ -251,8 +251,8 @@ def _allocated(context: Any, builder: Any, signature: Any, arguments: Any) -> An
     several = isinstance(shape, types.BaseTuple)
     unpacked = cgutils.unpack_tuple(builder, arguments[0]) if several else [arguments[0]]
     sizes = [
-        context.cast(builder, size, of, types.intp)
-        for size, of in zip(unpacked, shape.types if several else [shape], strict=True)
+        context.cast(builder, size, size_type, types.intp)
+        for size, size_type in zip(unpacked, shape.types if several else [shape], strict=True)
     ]
     itemsize = context.get_constant(types.intp, get_itemsize(context, kind))
     strides = [itemsize]

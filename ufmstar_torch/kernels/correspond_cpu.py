@@ -1,7 +1,7 @@
 """Correspondence by overlap on the CPU (numba), as a list of pairs.
 
-The work is done per segment: the mixture's candidates that overlap with it are few, so hiding is tested
-among those only.
+Segments are processed one by one. Few candidates of the mixture overlap with a segment, and occlusion is tested among
+those only.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def matches(fields, n, fields_c, n_c, K, height, width, thresholds):
 
 @part
 def _limit(eta):
-    """The squared distance from which on the overlap is certainly below eta, with room for rounding."""
+    """The squared distance beyond which the overlap is below eta, with a margin for rounding."""
     return -8 * math.log(eta) * (1 + 1e-9) + 1e-9
 
 
@@ -60,8 +60,8 @@ def _longer(values):
 
 @leaf
 def _overlapping(image_c, i, image, count, eta, limit, members, overlap):
-    """Write those of the first ``count`` whose overlap with projected Gaussian i is at least eta, and it; return how
-    many there are."""
+    """Write those of the first ``count`` whose overlap with projected Gaussian i is at least eta, and their overlaps;
+    return their number."""
     n = 0
     for j in range(count):
         if not _far(image_c, i, image, j, limit):
@@ -86,8 +86,8 @@ def _hidden(image, members, n, a, eta_occl, limit):
 
 @leaf
 def _project(fields, n, K, height, width, near, widening, index, image):
-    """Write the indices of the candidates among n components, and of each u, v, the covariance's xx, xy, yy, and the
-    depth [6, n]; return how many there are."""
+    """Write the indices of the candidates among n components, and their u, v, the covariance's xx, xy, yy and the depth
+    [6, n]; return their number."""
     count = 0
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     for k in range(n):
@@ -95,7 +95,7 @@ def _project(fields, n, K, height, width, near, widening, index, image):
         if not (fields[WEIGHT, k] > 0 and z > near):
             continue
         if abs(fx * x + (cx - 0.5 * width) * z) > (0.5 * width + 1) * z:
-            continue  # a pixel beyond the image at least: no division
+            continue  # outside by a pixel or more: skip the division
         u, v = fx * x / z + cx, fy * y / z + cy
         if not (u >= -0.5 and u < width - 0.5 and v >= -0.5 and v < height - 0.5):
             continue

@@ -2,9 +2,9 @@
 
 On the CPU (numba). A pixel x of the image and an inverse depth rho [1/m] project into a keyframe at
 p(rho) = (H x + rho b)/(.)_z, with H = K R K^-1 and b = K t of the relative pose. The patch around x, warped by dp/dx,
-is compared with windows of the keyframe along the line, a pixel apart; from the best one, Gauss-Newton steps along the
-line refine the position. Windows have an even side: their centres lie between pixels, and a row of eight pixels is
-copied at once; loops run over all pixels of a window, which compilers turn into vectors.
+is compared with windows of the keyframe along the line, a pixel apart. Gauss-Newton steps along the line refine the
+position of the best window. Windows have an even side: their centres lie between pixels, and a row of eight pixels is
+copied at once. Loops run over all pixels of a window, so that they are vectorised.
 ``tests/oracle_dense.py`` is the same in NumPy.
 """
 
@@ -18,41 +18,41 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.kernels.compile_cpu import reordered, reordered_leaf
 
-# [px] Side of the windows that are compared, and where the first of their pixels lies from the centre.
+# [px] Side of the compared windows, and offset of their first pixel from the centre.
 SIDE, FIRST = 8, -3.5
 COUNT = SIDE * SIDE
-# A template is a pixel wider than the window on each side; its pixels from the centre.
+# A template is a pixel wider than the window on each side; offsets of its pixels from the centre.
 WIDE = SIDE + 2
 _RIGHT = np.tile(np.arange(WIDE, dtype=np.float32) + np.float32(FIRST - 1), WIDE)
 _DOWN = np.repeat(np.arange(WIDE, dtype=np.float32) + np.float32(FIRST - 1), WIDE)
-# [gray levels] Least standard deviation of a window that is compared: below it, there is noise and nothing else.
+# [gray levels] Least standard deviation of a compared window: below it there is only noise.
 LEAST_CONTRAST = 2.0
 # [px] Pixels nearer to the border are not measured.
 MARGIN = 6
-# Steps of a search at most, steps of the refinement at most, and how short the last of them is [px].
+# Most steps of a search, most steps of the refinement, and length of a step at which it has converged [px].
 LONGEST, STEPS, CONVERGED = 192, 5, 0.01
-# [px] The refined position lies at most so far from the best window; a rival at least as far as _APART steps.
+# [px] Largest distance of the refined position from the best window; a rival is more than APART steps away.
 FARTHEST, APART = 1.5, 2
 # Largest change of scale between the patch and its image in the keyframe.
 LARGEST_SCALE = 2.0
-# The first view that is searched shows all from infinity to so many times the inverse depth at the start: what lies
-# outside of it might match better.
+# The first searched view shows the line from infinity to this multiple of the starting inverse depth: a better match
+# could lie outside of the image.
 WHOLE = 2.0
-# [px^2] Variance of a match where the residual is none: what interpolation leaves.
+# [px^2] Variance of a match without residual, from interpolation.
 LEAST_MATCH = 0.03**2
-# [px] Across the line, a match shows errors of the poses where its own noise is less than this.
+# [px] A match measures the poses across the line where its noise there is below this.
 SHOWS = 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Keyframes that are searched, the shortest baseline first.
+    """Keyframes to search, the shortest baseline first.
 
     Attributes:
         image: [V, H, W] uint8.
         H: [V, 3, 3] of a pixel at infinity into the view.
         b: [V, 3] [px m].
-        noise: [V] variance of a position by errors of the poses [px^2].
+        noise: [V] variance of a position from errors of the poses [px^2].
     """
 
     image: NDArray[np.uint8]
@@ -62,15 +62,15 @@ class Views:
 
 
 class Search(NamedTuple):
-    """Settings of the search for a depth, and of its acceptance.
+    """Settings of the search for a depth and of its acceptance.
 
     Attributes:
         start: inverse depth at which the first patch is warped [1/m].
         low, high: range of the first search [1/m].
-        sigmas: half width of the searches that follow, and largest difference between views.
-        least_score: of a match, ZNCC.
-        rival: the best match elsewhere on the first line has this many times the best one's 1 - ZNCC, or more.
-        match: variance of a match, over that which its residual would make of independent pixels.
+        sigmas: half width of later searches, and largest difference between views, in standard deviations.
+        least_score: least ZNCC of a match.
+        rival: least ratio of 1 - ZNCC between the best match elsewhere on the first line and the best one.
+        match: factor on the variance that a match's residual would give for independent pixels.
     """
 
     start: float
@@ -88,17 +88,17 @@ class Measured:
 
     Attributes:
         rho: [N] [1/m].
-        variance: [N] of ``rho`` [1/m^2]: the smallest of the views that agree. They share the patch: it does not
-            become less with their number.
-        agreed: [N] views that agree; 0 = not measured.
-        contradicted: [N] views that do not.
-        value: [N, V] inverse depth that each of them shows [1/m], NaN elsewhere, as in all that follow.
-        noise: [N, V] variance of the position along the line by the match alone [px^2].
-        along: [N, V, 2] direction (u, v) in which the point moves along the line.
-        speed: [N, V] how far it moves with the inverse depth [px m].
-        slope: [N, V] by how much an error of the position across the line moves the match along it.
-        across: [N, V] position across the line [px], NaN where the patch does not show it.
-        across_noise: [N, V] its variance by the match alone [px^2].
+        variance: [N] of ``rho`` [1/m^2]: the smallest of the agreeing views. It does not fall with their number,
+            because they share the patch.
+        agreed: [N] number of agreeing views; 0 = not measured.
+        contradicted: [N] number of views that disagree.
+        value: [N, V] inverse depth in each agreeing view [1/m]; NaN in other views, here and below.
+        noise: [N, V] variance of the position along the line from the match alone [px^2].
+        along: [N, V, 2] unit direction (u, v) in which the point moves along the line.
+        speed: [N, V] derivative of the position along the line by the inverse depth [px m].
+        slope: [N, V] shift of the match along the line per unit of error across it.
+        across: [N, V] position across the line [px], NaN where the patch does not determine it.
+        across_noise: [N, V] variance of ``across`` from the match alone [px^2].
     """
 
     rho: NDArray[np.float64]
@@ -114,7 +114,7 @@ class Measured:
     across_noise: NDArray[np.float64]
 
     def only(self, chosen: NDArray[np.int64]) -> Measured:
-        """Some of the pixels."""
+        """The pixels with the indices ``chosen``."""
         return Measured(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
@@ -125,20 +125,20 @@ def measure(image: NDArray[np.uint8], pixel: NDArray[np.float64], views: Views, 
         image: [H, W] uint8.
         pixel: [N, 2] (u, v).
         views: in the same pixels.
-        search: see there.
+        search: settings.
     """
     n, v = len(pixel), len(views.image)
     rho, variance, agreed, contradicted = np.zeros(n), np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.int64)
     each = np.full((n, v, 8), np.nan)
-    into = rho, variance, agreed, contradicted, each
-    _measure(image, pixel, eights(views.image), views.H, views.b, views.noise, search, *into)
+    outputs = rho, variance, agreed, contradicted, each
+    _measure(image, pixel, eights(views.image), views.H, views.b, views.noise, search, *outputs)
     value, noise, _, _, speed, slope, across, across_noise = np.moveaxis(each, 2, 0)
     along = each[:, :, 2:4]
     return Measured(rho, variance, agreed, contradicted, value, noise, along, speed, slope, across, across_noise)
 
 
 def eights(images: NDArray[np.uint8]) -> NDArray[np.uint64]:
-    """View images [V, H, W] as [V, H W - 7] numbers: each holds the eight pixels from its place on."""
+    """View images [V, H, W] as [V, H W - 7] numbers: each holds eight consecutive pixels."""
     views, size = len(images), images[0].size
     return np.ndarray((views, max(size - SIDE + 1, 0)), np.uint64, images, strides=(size, 1))
 
@@ -146,7 +146,7 @@ def eights(images: NDArray[np.uint8]) -> NDArray[np.uint64]:
 @reordered
 def best_pixels(image, cell, pixel, strength):
     """In every cell [C, R] the pixel (u, v) [C, R, 2] of the largest squared gradient, and that gradient [C, R], 0
-    where there is none. Cells are ``cell`` px wide; those whose ``strength`` is negative are left as they are."""
+    where there is none. Cells are ``cell`` px wide; those of negative ``strength`` are skipped."""
     height, width = image.shape
     for j in range(strength.shape[0]):
         for i in range(strength.shape[1]):
@@ -204,7 +204,7 @@ def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, con
                 continue
             # G of the normalised window along and across the line; a pixel's variance from the remaining differences.
             g_ee, g_ep, g_pp = out[1], out[2], out[3]
-            pixel_noise = match * 2 * max(1 - out[5], 0.0) / (COUNT - 4)  # rounding puts a ZNCC above 1
+            pixel_noise = match * 2 * max(1 - out[5], 0.0) / (COUNT - 4)  # rounding can put a ZNCC above 1
             slope = g_ep / g_ee
             schur = g_pp - g_ep * slope
             along = pixel_noise / g_ee + LEAST_MATCH
@@ -225,7 +225,7 @@ def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, con
 
 @reordered_leaf
 def _within(x, y, z, b, rho, width, height):
-    """Whether the view shows a window around the point of an inverse depth."""
+    """True if the view shows a window around the point at inverse depth rho."""
     z += rho * b[2]
     if z <= 1e-6:
         return False
@@ -235,7 +235,7 @@ def _within(x, y, z, b, rho, width, height):
 
 @reordered_leaf
 def _speed(x, y, z, b, rho):
-    """Direction in which a point moves with its inverse depth, and how fast [px m]."""
+    """Derivative of a point's position by its inverse depth: unit direction, and length [px m]."""
     over = 1 / (z + rho * b[2])
     u, v = (x + rho * b[0]) * over, (y + rho * b[1]) * over
     du, dv = (b[0] - u * b[2]) * over, (b[1] - v * b[2]) * over
@@ -245,7 +245,7 @@ def _speed(x, y, z, b, rho):
 
 @reordered_leaf
 def _inverse_depth(x, y, z, b, u, v):
-    """The inverse depth of a position near the line, by the axis along which the line moves faster."""
+    """The inverse depth of a position near the line, from the image axis along which the line is longer."""
     du, dv = b[0] - u * b[2], b[1] - v * b[2]
     return (u * z - x) / du if abs(du) > abs(dv) else (v * z - y) / dv
 
@@ -280,7 +280,7 @@ def sampled(flat, width, height, u, v, a, b, c, d, corner, share, template):
         iu, iv = np.int32(su), np.int32(sv)
         share[0, k], share[1, k] = su - np.float32(iu), sv - np.float32(iv)
         corner[k] = np.uint32(iv * np.int32(width) + iu)
-    for k in range(WIDE * WIDE):  # the four pixels around, as the bytes of a number, which vectors take apart
+    for k in range(WIDE * WIDE):  # the four pixels around, as the bytes of a number, which vector code unpacks
         at = np.uint64(corner[k])
         below = at + np.uint64(width)
         upper, lower = (flat[at + np.uint64(1)] << 8) | flat[at], (flat[below + np.uint64(1)] << 8) | flat[below]
@@ -295,7 +295,8 @@ def sampled(flat, width, height, u, v, a, b, c, d, corner, share, template):
 
 @reordered_leaf
 def normalised(template, patch, along_u, along_v):
-    """The window of a template with mean 0 and length 1; its gradients, of mean 0 [1/px]. False without contrast."""
+    """Write the window of a template with mean 0 and norm 1, and its gradients of mean 0 [1/px]. False without
+    contrast."""
     mean = mean_u = mean_v = squares = np.float32(0)
     half = np.float32(0.5)
     for j in range(SIDE):
@@ -324,16 +325,16 @@ def normalised(template, patch, along_u, along_v):
 
 @reordered_leaf
 def _copied(key, at, width, count, rows):
-    """Copy rows of SIDE pixels of an image (:func:`eights`), the first one from ``at`` on, to ``count`` numbers."""
+    """Copy ``count`` rows of SIDE pixels of an image (:func:`eights`), the first one at index ``at``, to ``rows``."""
     for j in range(count):
         rows[j] = key[np.uint64(at)]
         at += width
 
 
 @reordered_leaf
-def _search(patch, key, width, height, x, y, z, b, low, high, windows, scores, corner):
-    """The best window between two inverse depths; its centre on the line (u, v), its ZNCC, and the ZNCC of its rival,
-    the best one more than APART steps away, in ``corner``. False where there is none."""
+def _search(patch, key, width, height, x, y, z, b, low, high, windows, scores, found):
+    """Write the best window between two inverse depths to ``found``: its centre on the line (u, v), its ZNCC, and the
+    ZNCC of its rival, the best window more than APART steps away. False where no window is inside the image."""
     z_low, z_high = z + low * b[2], z + high * b[2]
     if z_low <= 1e-3 or z_high <= 1e-3:
         return False
@@ -351,7 +352,7 @@ def _search(patch, key, width, height, x, y, z, b, low, high, windows, scores, c
         if left >= 0 and top >= 0 and left + SIDE <= width and top + SIDE <= height:
             _copied(key, top * width + left, width, SIDE, windows[s])
             scores[s] = 0
-    # A loop of its own: a vector of 16 bytes cannot be read until the two numbers just written there are in the cache.
+    # A separate loop: reading a vector of 16 bytes waits until the two numbers just written there are in the cache.
     for s in range(steps + 1):
         if scores[s] == 0:
             scores[s] = zncc(patch, windows[s].view(np.uint8))
@@ -363,7 +364,7 @@ def _search(patch, key, width, height, x, y, z, b, low, high, windows, scores, c
     for s in range(steps + 1):
         if abs(s - at) > APART and scores[s] > rival:
             rival = scores[s]
-    corner[0], corner[1], corner[2], corner[3] = u_low + at * du, v_low + at * dv, best, rival
+    found[0], found[1], found[2], found[3] = u_low + at * du, v_low + at * dv, best, rival
     return True
 
 
@@ -384,23 +385,24 @@ def zncc(patch, window):
 
 @reordered_leaf
 def _refined(patch, along_u, along_v, key, width, height, u, v, eu, ev, rows, out):
-    """Gauss-Newton steps along (eu, ev) from the centre (u, v). ``out``: the way gone [px]; G along, between and across
-    the line [1/px^2]; gradient across times residual [1/px]; ZNCC. False where it leaves the image or the match."""
+    """Gauss-Newton steps along (eu, ev) from the centre (u, v). ``out``: the displacement [px]; G along, between and
+    across the line [1/px^2]; gradient across times residual [1/px]; ZNCC. False where the window leaves the image or
+    the match."""
     cu, cv = np.float32(eu), np.float32(ev)
-    g_ee = g_ep = g_pp = own_e = own_p = np.float32(0)
+    g_ee = g_ep = g_pp = patch_e = patch_p = np.float32(0)
     for k in range(COUNT):
         e, p = cu * along_u[k] + cv * along_v[k], cu * along_v[k] - cv * along_u[k]
         g_ee += e * e
         g_ep += e * p
         g_pp += p * p
-        own_e += e * patch[k]
-        own_p += p * patch[k]
+        patch_e += e * patch[k]
+        patch_p += p * patch[k]
     if g_ee <= 1e-9:
         return False
-    gone, one, copied = 0.0, np.float32(1), -1
-    here, right = rows[0].view(np.uint8), rows[1].view(np.uint8)
+    displacement, one, copied = 0.0, np.float32(1), -1
+    pixels, next_pixels = rows[0].view(np.uint8), rows[1].view(np.uint8)
     for step in range(STEPS + 1):
-        left, top = u + gone * eu + FIRST, v + gone * ev + FIRST
+        left, top = u + displacement * eu + FIRST, v + displacement * ev + FIRST
         iu, iv = int(np.floor(left)), int(np.floor(top))
         if iu < 0 or iv < 0 or iu + SIDE >= width or iv + SIDE >= height:
             return False
@@ -412,8 +414,8 @@ def _refined(patch, along_u, along_v, key, width, height, u, v, eu, ev, rows, ou
         w00, w01, w10, w11 = (one - fv) * (one - fu), (one - fv) * fu, fv * (one - fu), fv * fu
         total = squares = cross = down_u = down_v = np.float32(0)
         for k in range(COUNT):
-            upper = w00 * np.float32(here[k]) + w01 * np.float32(right[k])
-            lower = w10 * np.float32(here[k + SIDE]) + w11 * np.float32(right[k + SIDE])
+            upper = w00 * np.float32(pixels[k]) + w01 * np.float32(next_pixels[k])
+            lower = w10 * np.float32(pixels[k + SIDE]) + w11 * np.float32(next_pixels[k + SIDE])
             value = upper + lower
             total += value
             squares += value * value
@@ -423,15 +425,15 @@ def _refined(patch, along_u, along_v, key, width, height, u, v, eu, ev, rows, ou
         deviation = squares - total * total / np.float32(COUNT)
         if deviation <= COUNT * LEAST_CONTRAST * LEAST_CONTRAST:
             return False
-        # The gradients' mean is 0: that of the values drops out. The patch's own part of them is not residual.
+        # The gradients have mean 0, so that the values' mean drops out. The part of the patch is not residual.
         over = one / np.sqrt(deviation)
         score = cross * over
-        change = -((cu * down_u + cv * down_v) * over - score * own_e) / g_ee
+        change = -((cu * down_u + cv * down_v) * over - score * patch_e) / g_ee
         if step == STEPS or abs(change) < CONVERGED:
             break
-        gone += change
-        if abs(gone) > FARTHEST:
+        displacement += change
+        if abs(displacement) > FARTHEST:
             return False
-    right_p = (cu * down_v - cv * down_u) * over - score * own_p
-    out[0], out[1], out[2], out[3], out[4], out[5] = gone, g_ee, g_ep, g_pp, right_p, score
+    right_p = (cu * down_v - cv * down_u) * over - score * patch_p
+    out[0], out[1], out[2], out[3], out[4], out[5] = displacement, g_ee, g_ep, g_pp, right_p, score
     return True

@@ -1,9 +1,9 @@
-"""The field on the CPU (numba), float64: its precision is eliminated row by row in a window of 32 nodes.
+"""The field on the CPU (numba), float64: a banded Cholesky factorisation in a window of 32 nodes.
 
-On C columns a node is linked to none farther than C places before or behind it, and elimination links only what lies
-between: a window of C + 1 nodes is a full matrix, into which nodes enter and from which they leave in order. The
-covariance within the window follows backwards from the factor (Takahashi's equations), and with it all marginal
-variances. Node i has the place i mod 32, so that every loop runs over rows of one fixed length.
+With C columns, the precision matrix has the bandwidth C, and elimination fills only the band. The window of C + 1 nodes
+is a full matrix, which nodes enter and leave in order. A backward pass over the factor gives the covariance within the
+window (Takahashi's equations), and with it all marginal variances. Node i has the slot i mod 32, so that every loop has
+one fixed length.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from ufmstar_torch.kernels.compile_cpu import cached, kernel, part
 
 WINDOW = 32
-# Right-hand sides: the features and y, and zeros to a multiple of four.
+# Number of right-hand sides: features, y, and zeros up to a multiple of four.
 RIGHT = 8
 _WIDTH = WINDOW + RIGHT
 
-# Kernels (``compile_cpu``) in which sums have any order, and neither infinity nor NaN occurs.
+# Kernels (``compile_cpu``) whose sums may be reordered, for values without infinity and NaN.
 fast = cached(fastmath=True)
 Floats = NDArray[np.float64]
 
@@ -61,33 +61,33 @@ def conditioned(prior: Prior, observed: Observed, weight: Floats) -> Field:
     diagonal, precision, right_side = prior.diagonal.copy(), prior.precision.copy(), np.zeros(F)
     _gather(*observed, weight, prior.mean, diagonal, nodes, precision, right_side)
     solved, variance = solve(diagonal, prior.right, prior.down, nodes, prior.cols)
-    _give_way(nodes, solved, precision, right_side)
+    _subtract_schur(nodes, solved, precision, right_side)
     _invert(precision)
-    _back(precision, right_side, solved, coefficients, offset)
+    _add_observed(precision, right_side, solved, coefficients, offset)
     return Field(coefficients, precision, offset, solved[:, :F], variance)
 
 
 @fast
 def _gather(node, features, value, weight, mean, diagonal, nodes, precision, right_side):
-    """The observations' part of what is prior to begin with: w at the diagonal of their nodes, w x and w (y - x b_0)
-    at their right-hand sides, x w x^T and x w (y - x b_0) at the coefficients'."""
+    """Add the observations to the prior's equations: w to the diagonal of their nodes, w x and w (y - x b_0) to the
+    nodes' right-hand sides, w x x^T and w x (y - x b_0) to the coefficients' precision and right-hand side."""
     F = len(mean)
     for k in range(len(node)):
-        x, row, w, left = features[k], nodes[node[k]], weight[k], value[k]
+        x, row, w, residual = features[k], nodes[node[k]], weight[k], value[k]
         for f in range(F):
-            left -= x[f] * mean[f]
+            residual -= x[f] * mean[f]
         diagonal[node[k]] += w
-        row[F] += w * left
+        row[F] += w * residual
         for f in range(F):
             row[f] += w * x[f]
-            right_side[f] += w * x[f] * left
+            right_side[f] += w * x[f] * residual
             for g in range(F):
                 precision[f, g] += w * x[f] * x[g]
 
 
 @fast
-def _give_way(nodes, solved, precision, right_side):
-    """The Schur complement: what the field explains of the observations is left out of the coefficients' part."""
+def _subtract_schur(nodes, solved, precision, right_side):
+    """Schur complement: subtract what the field explains of the observations from the coefficients' equations."""
     F = len(right_side)
     for i in range(len(nodes)):
         x, y = nodes[i], solved[i]
@@ -100,7 +100,7 @@ def _give_way(nodes, solved, precision, right_side):
 
 @fast
 def _invert(A):
-    """A positive definite matrix [F, F], in place, one pivot after the other (Gauss-Jordan)."""
+    """Invert a positive definite matrix [F, F] in place (Gauss-Jordan)."""
     for k in range(len(A)):
         pivot = 1 / A[k, k]
         A[k, k] = 1.0
@@ -108,15 +108,15 @@ def _invert(A):
             A[k, c] *= pivot
         for r in range(len(A)):
             if r != k:
-                times = A[r, k]
+                factor = A[r, k]
                 A[r, k] = 0.0
                 for c in range(len(A)):
-                    A[r, c] -= times * A[k, c]
+                    A[r, c] -= factor * A[k, c]
 
 
 @fast
-def _back(covariance, right_side, solved, coefficients, offset):
-    """Add the observations' part to the coefficients, and write the mean of the field."""
+def _add_observed(covariance, right_side, solved, coefficients, offset):
+    """Add the observations' effect to the coefficients, and write the mean of the field."""
     F = len(right_side)
     b = np.zeros(F)
     for f in range(F):
@@ -137,17 +137,18 @@ def at(field: Field, node: NDArray[np.int64], features: Floats) -> tuple[Floats,
 
 
 @fast
-def _add_coefficients(features, left, b, covariance, mean, variance):
-    """x . b, and the variance of what is ``left`` of x."""
+def _add_coefficients(features, reduced, b, covariance, mean, variance):
+    """Add x . b to the mean, and r . covariance r to the variance, with r = ``reduced``: x less the field's
+    response."""
     F = len(b)
     for k in range(len(features)):
-        x = left[k]
+        x = reduced[k]
         for f in range(F):
             mean[k] += features[k, f] * b[f]
-            along = 0.0
+            product = 0.0
             for g in range(F):
-                along += covariance[f, g] * x[g]
-            variance[k] += along * x[f]
+                product += covariance[f, g] * x[g]
+            variance[k] += product * x[f]
 
 
 def solve(diagonal: Floats, right: Floats, down: Floats, columns: Floats, cols: int) -> tuple[Floats, Floats]:
@@ -155,13 +156,13 @@ def solve(diagonal: Floats, right: Floats, down: Floats, columns: Floats, cols: 
     n = len(diagonal)
     factor, solved, variance = np.empty((n, _WIDTH)), np.empty((n, RIGHT)), np.empty(n)
     _eliminate(diagonal, right, down, columns, cols, np.zeros((WINDOW, _WIDTH)), factor)
-    _covary(factor, np.zeros((WINDOW, _WIDTH)), np.empty(_WIDTH), solved, variance)
+    _covariances(factor, np.zeros((WINDOW, _WIDTH)), np.empty(_WIDTH), solved, variance)
     return solved, variance
 
 
 @fast
 def _eliminate(diagonal, right, down, columns, cols, window, factor):
-    """Row j of the factor [n, 40] has the entries of the window's nodes at their places, then the right-hand sides."""
+    """Write the factor [n, 40]: row j has the window's nodes at their slots, then the right-hand sides."""
     n = len(diagonal)
     for j in range(-cols, n):
         if j + cols < n:
@@ -173,9 +174,9 @@ def _eliminate(diagonal, right, down, columns, cols, window, factor):
         for c in range(_WIDTH):
             row[c] = window[slot, c] * scale
         for k in range(WINDOW):
-            other, times = window[k], row[k]
-            for c in range(len(row)):  # a constant length would be unrolled, without vectors
-                other[c] -= times * row[c]
+            other, multiple = window[k], row[k]
+            for c in range(len(row)):  # the compiler would unroll a constant length instead of vectorising
+                other[c] -= multiple * row[c]
         for k in range(WINDOW):
             window[k, slot] = 0.0
         for c in range(_WIDTH):
@@ -184,7 +185,7 @@ def _eliminate(diagonal, right, down, columns, cols, window, factor):
 
 @part
 def _enter(window, i, diagonal, right, down, columns, cols):
-    """Node i with its links to those before it, at a place that is 0."""
+    """Enter node i with its links to earlier nodes at a slot that is 0."""
     slot, n = i % WINDOW, len(diagonal)
     total = diagonal[i]
     if (i + 1) % cols:
@@ -205,8 +206,8 @@ def _enter(window, i, diagonal, right, down, columns, cols):
 
 
 @fast
-def _covary(factor, window, out, solved, variance):
-    """Backwards through the factor, of which the diagonal is overwritten."""
+def _covariances(factor, window, out, solved, variance):
+    """Backward pass over the factor, whose diagonal is overwritten: the solutions and marginal variances."""
     for j in range(len(factor) - 1, -1, -1):
         slot, row = j % WINDOW, factor[j]
         scale = 1 / row[slot]
@@ -218,42 +219,42 @@ def _covary(factor, window, out, solved, variance):
             for c in range(_WIDTH):
                 first = one * window[k, c] + two * window[k + 1, c]
                 out[c] += first + three * window[k + 2, c] + four * window[k + 3, c]
-        along = 1.0
+        total = 1.0
         for c in range(WINDOW):
-            along += out[c] * row[c]
+            total += out[c] * row[c]
             window[slot, c] = -scale * out[c]
             window[c, slot] = -scale * out[c]
-        variance[j] = window[slot, slot] = scale * scale * along
+        variance[j] = window[slot, slot] = scale * scale * total
         for c in range(RIGHT):
             solved[j, c] = window[slot, WINDOW + c] = scale * (row[WINDOW + c] - out[WINDOW + c])
 
 
 def distance(source: NDArray[np.bool_], right: Floats, down: Floats, cols: int, limit: float) -> Floats:
     """As :func:`ufmstar_torch.posterior.distance.distance`."""
-    way = np.where(source, 0.0, limit)
-    _sweep(way, right, down, cols)
-    return way
+    length = np.where(source, 0.0, limit)
+    _sweep(length, right, down, cols)
+    return length
 
 
 @kernel
-def _sweep(way, right, down, cols):
-    """Forth and back until nothing gets shorter."""
-    n, shorter = len(way), True
+def _sweep(length, right, down, cols):
+    """Relax the lengths forwards and backwards until none changes."""
+    n, shorter = len(length), True
     while shorter:
         shorter = False
         for i in range(n):
-            best = way[i]
-            if i % cols and way[i - 1] + right[i - 1] < best:
-                best = way[i - 1] + right[i - 1]
-            if i >= cols and way[i - cols] + down[i - cols] < best:
-                best = way[i - cols] + down[i - cols]
-            shorter = shorter or best < way[i]
-            way[i] = best
+            best = length[i]
+            if i % cols and length[i - 1] + right[i - 1] < best:
+                best = length[i - 1] + right[i - 1]
+            if i >= cols and length[i - cols] + down[i - cols] < best:
+                best = length[i - cols] + down[i - cols]
+            shorter = shorter or best < length[i]
+            length[i] = best
         for i in range(n - 1, -1, -1):
-            best = way[i]
-            if (i + 1) % cols and way[i + 1] + right[i] < best:
-                best = way[i + 1] + right[i]
-            if i + cols < n and way[i + cols] + down[i] < best:
-                best = way[i + cols] + down[i]
-            shorter = shorter or best < way[i]
-            way[i] = best
+            best = length[i]
+            if (i + 1) % cols and length[i + 1] + right[i] < best:
+                best = length[i + 1] + right[i]
+            if i + cols < n and length[i + cols] + down[i] < best:
+                best = length[i + cols] + down[i]
+            shorter = shorter or best < length[i]
+            length[i] = best

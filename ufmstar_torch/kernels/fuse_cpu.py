@@ -1,4 +1,4 @@
-"""Fusion on the CPU (numba): the floor of covariances, one pass over the matched pairs, and what is appended."""
+"""Fusion on the CPU (numba): the floor of covariances, one pass over the matched pairs, and new components."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
 
 _SWEEPS = 12  # an upper bound: the loops end when a sweep no longer rotates
 _NEGLIGIBLE = 16 * np.finfo(np.float64).eps
-WORK = (8, 3, 3)  # shape of the scratch memory (float64) of what follows
+WORK = (8, 3, 3)  # shape of the scratch array (float64) of the functions below
 
 
 @leaf
@@ -134,7 +134,7 @@ def floor_covariance(S, floor, work):
     if _exceeds(S, floor):
         return
     M, V, s = work[0], work[1], work[2, 0]
-    for i in range(3):  # a slice assignment would compile for seconds, for the sake of its error message
+    for i in range(3):  # a slice assignment takes seconds to compile, for its error message
         for j in range(3):
             M[i, j] = S[i, j]
     right_singular(M, V, s)  # of a positive semidefinite matrix: its eigenvalues and eigenvectors
@@ -151,8 +151,8 @@ def floor_covariance(S, floor, work):
 
 @kernel
 def lift(mean, covariance, weight, near, focal, widening, epsilon):
-    """Lift the covariances of occupied slots, which are the first ones, to the floor that a segment needs (``step``),
-    in place: the variance across one pixel, and ``epsilon`` times the trace for storage."""
+    """Lift the covariances of the occupied slots, which are the first ones, to the floor of a segment (``step``), in
+    place: the variance across one pixel, and ``epsilon`` times the trace for storage."""
     work = empty(WORK, np.float64)
     for n in range(weight.size):
         if not weight[n] > 0:
@@ -168,8 +168,8 @@ def fuse_pairs(
 ):  # fmt: skip
     """Fuse the pairs [P] of one stream in their order, in place.
 
-    After each pair the values take the precision they are stored in. ``distance`` [P] takes the place of W2^2 where it
-    is not empty; with ``weighted``, pi_c is multiplied by the overlap [P].
+    After each pair the values are rounded to the dtype of the state. A ``distance`` [P] that is not empty replaces
+    W2^2. With ``weighted``, pi_c is multiplied by the overlap [P].
     """
     mean_k, cov_k = work[6, 1], work[7]
     for p in range(pair_c.size):
@@ -198,8 +198,8 @@ def fuse_pairs(
 
 @leaf
 def append(mean, covariance, weight, disagreement, count, features, mean_c, cov_c, weight_c, features_c, new, occupied):
-    """Add the components c where ``new`` [C] from slot ``occupied`` on, in place, as far as there are free ones; return
-    how many slots are in use."""
+    """Append the components c where ``new`` [C] from slot ``occupied`` on, in place, until the slots are full; return
+    the number of slots in use."""
     slot = occupied
     for c in range(weight_c.size):
         if not new[c] or slot == weight.size:

@@ -1,4 +1,4 @@
-"""Compiled CPU kernels for the tensors of an accelerator, on which the work would be a long chain of tiny steps."""
+"""Runs CPU kernels on the tensors of an accelerator, for work that is a long chain of tiny steps there."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ def moved(value: Any, device: torch.device | str) -> Any:
 
 
 def on_host(kernel: Callable[..., Any]) -> Callable[..., Any]:
-    """The kernel for the tensors of a device, for which it waits; the results lie on the first tensor's device."""
+    """Wrap a CPU kernel for tensors of any device: copy them, synchronise, return results on the first tensor's
+    device."""
 
     def call(*arguments: Any) -> Any:
         return moved(kernel(*moved(arguments, "cpu")), _first(arguments).device)

@@ -1,4 +1,4 @@
-"""Landmarks in an image: their patches, and whether another view shows them where they should be."""
+"""Landmarks in an image: their patches, and whether another view shows them at their predicted pixels."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ufmstar_torch.kernels.dense_cpu import (
     zncc,
 )
 
-# Least ZNCC of a landmark's patch with the image that shows it.
+# Least ZNCC of a landmark's patch with an image that shows it.
 SHOWN = 0.8
 
 
@@ -50,21 +50,21 @@ def sight(
     T_world_cam: NDArray[np.float64],
     K: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Finds landmarks in an image.
+    """Predict the pixels of landmarks in an image, and compare their patches there.
 
     Args:
         image: [H, W] uint8.
         point: [N, 3] in the world [m].
         pose: [N, 4, 4] of the cameras that measured them [m].
-        sigma: [N] of the distance from those, as a share.
+        sigma: [N] relative standard deviation of the distance from these cameras.
         patch: [N, SIDE, SIDE], see :func:`patches`.
-        used: [N] which are landmarks.
+        used: [N] mask of the landmarks.
         T_world_cam: [4, 4] of the image [m].
         K: [3, 3] [px].
 
     Returns:
         pixel [N, 2]; depth [N] [m]; its standard deviation [N] [m]; and 1 where the image shows the landmark, -1 where
-        it should and does not, 0 beside the image or where the view differs too much to be compared.
+        it shows something else, 0 outside the image or where the view differs too much for a comparison.
     """
     n = len(point)
     pixel, depth, spread, shown = np.zeros((n, 2)), np.zeros(n), np.zeros(n), np.zeros(n, np.int64)
@@ -80,7 +80,7 @@ def _sight(image, point, pose, sigma, patch, used, P, centre, K_inverse, pixel, 
     flat, template = image.reshape(image.size), np.empty(WIDE * WIDE, np.float32)
     corner, share = np.empty(WIDE * WIDE, np.uint32), np.empty((2, WIDE * WIDE), np.float32)
     window = np.empty(COUNT, np.float32)
-    p, error, rotated, into = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    p, error, rotated, homography = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     for n in np.flatnonzero(used):
         for i in range(3):
             p[i] = 0.0
@@ -92,10 +92,10 @@ def _sight(image, point, pose, sigma, patch, used, P, centre, K_inverse, pixel, 
         p /= z
         if not (MARGIN <= p[0] < width - MARGIN and MARGIN <= p[1] < height - MARGIN):
             continue
-        before = 0.0
+        depth_before = 0.0
         for i in range(3):
-            before += (point[n, i] - pose[n, i, 3]) * pose[n, i, 2]
-        # Size in this image of a pixel of the view that measured it, and of its standard deviation.
+            depth_before += (point[n, i] - pose[n, i, 3]) * pose[n, i, 2]
+        # Derivative by a pixel of the view that measured it, and shift by one standard deviation, in this image.
         for i in range(3):
             error[i] = 0.0
             for j in range(3):
@@ -103,11 +103,11 @@ def _sight(image, point, pose, sigma, patch, used, P, centre, K_inverse, pixel, 
                 rotated[i, j] = P[i, 0] * pose[n, 0, j] + P[i, 1] * pose[n, 1, j] + P[i, 2] * pose[n, 2, j]
         for i in range(3):
             for j in range(3):
-                into[i, j] = 0.0
+                homography[i, j] = 0.0
                 for k in range(3):
-                    into[i, j] += rotated[i, k] * K_inverse[k, j] * (before / z)
-        a, b = into[0, 0] - p[0] * into[2, 0], into[0, 1] - p[0] * into[2, 1]
-        c, d = into[1, 0] - p[1] * into[2, 0], into[1, 1] - p[1] * into[2, 1]
+                    homography[i, j] += rotated[i, k] * K_inverse[k, j] * (depth_before / z)
+        a, b = homography[0, 0] - p[0] * homography[2, 0], homography[0, 1] - p[0] * homography[2, 1]
+        c, d = homography[1, 0] - p[1] * homography[2, 0], homography[1, 1] - p[1] * homography[2, 1]
         determinant = a * d - b * c
         shift_u, shift_v = (error[0] - p[0] * error[2]) / z, (error[1] - p[1] * error[2]) / z
         pixel[n, 0], pixel[n, 1], depth[n], spread[n] = p[0], p[1], z, abs(error[2])

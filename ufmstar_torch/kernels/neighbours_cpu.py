@@ -19,13 +19,13 @@ from ufmstar_torch.anchors.evidence import (
 )
 from ufmstar_torch.kernels.compile_cpu import leaf, part
 
-_FEW = 3  # anchors of a cell, on average
+_PER_CELL = 3  # mean number of anchors in a cell
 
 
 @part
 def grid(pixel, chosen, mean_count):
-    """Cells over the chosen ones of N pixels [N, 2], about so many in each: their first corner and side [px], columns
-    and rows, where each cell starts in the order [cells + 1], and the order."""
+    """Sort the chosen ones of N pixels [N, 2] into cells of about ``mean_count`` each: the grid's first corner and cell
+    side [px], columns and rows, the start of each cell in the order [cells + 1], and the order."""
     low, high, count = np.full(2, np.inf), np.full(2, -np.inf), 0
     for i in range(chosen.size):
         if chosen[i]:
@@ -35,7 +35,7 @@ def grid(pixel, chosen, mean_count):
     if count == 0:
         low[:], high[:] = 0.0, 0.0
     wide, tall, share = high[0] - low[0], high[1] - low[1], mean_count / max(count, 1)
-    # Not smaller than on a line, so that there are no more cells than about anchors, wherever they lie.
+    # The second term limits the number of cells to about that of anchors where they lie on a line.
     side = max(math.sqrt(wide * tall * share), max(wide, tall) * share, 1e-6)
     columns, rows = int(wide / side) + 1, int(tall / side) + 1
     cell, start = np.empty(chosen.size, np.int64), np.zeros(columns * rows + 1, np.int64)
@@ -57,31 +57,31 @@ def grid(pixel, chosen, mean_count):
 @part
 def supported(pixel, predicted, depth, variance, valid, out):
     """Write to ``out`` [N] whether an anchor is valid and supported by its neighbours (``evidence.inliers``)."""
-    cells = grid(pixel, valid, _FEW)
+    cells = grid(pixel, valid, _PER_CELL)
     order = cells[5]
     n = order.size
     for a in range(valid.size):
         out[a] = valid[a]
     if n <= SUPPORT:
         return
-    most = min(NEIGHBOURS, n - 1)
-    # In the order of the grid: pixel, what breaks a tie, log g/d, and the variance of log g.
+    count = min(NEIGHBOURS, n - 1)
+    # In the order of the grid: pixel, tie-breaker, log g/d, and the variance of log g.
     u, v, tie, ratio, noise = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     for i in range(n):
         a = order[i]
         u[i], v[i], tie[i] = pixel[a, 0], pixel[a, 1], TIE * a
         ratio[i], noise[i] = math.log(depth[a] / predicted[a]), variance[a] / (depth[a] * depth[a])
-    neighbour, differ, distance = np.empty((n, most), np.int64), np.empty(n * most), np.empty(most)
+    neighbour, gap, distance = np.empty((n, count), np.int64), np.empty(n * count), np.empty(count)
     for i in range(n):
         _nearest(cells, u, v, tie, i, distance, neighbour[i])
-        for j in range(most):
-            differ[i * most + j] = abs(ratio[i] - ratio[neighbour[i, j]])
-    sigma = _lower_quartile(differ.copy(), differ.size) / LOWER_QUARTILE
+        for j in range(count):
+            gap[i * count + j] = abs(ratio[i] - ratio[neighbour[i, j]])
+    sigma = _lower_quartile(gap.copy(), gap.size) / LOWER_QUARTILE
     for i in range(n):
         support = 0
-        for j in range(most):
+        for j in range(count):
             allowed = sigma * sigma + 2 * LEAST_SIGMA**2 + noise[i] + noise[neighbour[i, j]]
-            support += differ[i * most + j] <= SIMILAR_SIGMAS * math.sqrt(allowed)
+            support += gap[i * count + j] <= SIMILAR_SIGMAS * math.sqrt(allowed)
         out[order[i]] = support >= SUPPORT
 
 
@@ -114,8 +114,9 @@ def _lower_quartile(values, n):
 
 @leaf
 def _nearest(cells, u, v, tie, i, distance, neighbour):
-    """Write the ``distance.size`` anchors nearest to anchor i, in the order of the grid, to ``neighbour``; there are as
-    many others. They are searched in rings of cells around its own, until the rings contain a circle with so many."""
+    """Write the ``distance.size`` anchors nearest to anchor i, as indices in the order of the grid, to ``neighbour``;
+    at least as many others exist. Rings of cells around its cell are searched until they contain a circle with so
+    many."""
     low, side, columns, rows, start = cells[0], cells[1], cells[2], cells[3], cells[4]
     x, y = (u[i] - low[0]) / side, (v[i] - low[1]) / side
     column, row = min(int(x), columns - 1), min(int(y), rows - 1)
@@ -131,11 +132,11 @@ def _nearest(cells, u, v, tie, i, distance, neighbour):
         for y_cell in range(max(row - ring, 0), min(row + ring, rows - 1) + 1):
             for j in range(start[y_cell * columns + left], start[y_cell * columns + right + 1]):
                 du, dv = u[j] - u[i], v[j] - v[i]
-                apart = du * du + dv * dv + tie[j]
-                if j == i or not apart < distance[last]:
+                squared = du * du + dv * dv + tie[j]
+                if j == i or not squared < distance[last]:
                     continue
                 k = last
-                while k > 0 and distance[k - 1] > apart:
+                while k > 0 and distance[k - 1] > squared:
                     distance[k], neighbour[k] = distance[k - 1], neighbour[k - 1]
                     k -= 1
-                distance[k], neighbour[k] = apart, j
+                distance[k], neighbour[k] = squared, j

@@ -1,7 +1,7 @@
 """Errors of the keyframes' poses and of the camera by least squares, for ``anchors.dense_poses``.
 
 On the CPU (numba). A point of the image, the ray n = K^-1 x, lies in a keyframe at q = R n + rho t, up to scale. With
-the errors (w, s) of the keyframe's pose and (f, cx, cy, k) of the camera it moves in the keyframe: q becomes
+the errors (w, s) of the keyframe's pose and (f, cx, cy, k) of the camera, it moves in the keyframe: q becomes
 q + w x q + rho s; f is a share of the focal length, cx and cy are pixels, and k is the coefficient of a radial
 distortion, x (1 + k r^2). ``tests/oracle_dense.py`` has the same by differences, and the equations with the depths.
 """
@@ -19,7 +19,7 @@ from ufmstar_torch.kernels.dense_cpu import Views
 # Rounds of Student-t weights, and their degrees of freedom.
 ROUNDS, STUDENT = 3, 4.0
 
-# Numbers of a pose and of the camera.
+# Parameters of a pose and of the camera.
 POSE, CAMERA = 6, 4
 EACH = POSE + CAMERA
 
@@ -38,8 +38,8 @@ def linearised(
         pixel: [N, 2] (u, v).
         rho: [N] [1/m].
         along: [N, V, 2] unit direction of the line in the view.
-        slope: [N, V] by how much an error across the line moves the match along it.
-        views: V of them.
+        slope: [N, V] shift of the match along the line per unit of error across it.
+        views: V keyframes.
         K: [3, 3] [px].
 
     Returns:
@@ -55,7 +55,7 @@ def linearised(
 @reordered
 def _linearised(pixel, rho, along, slope, H, b, K, K_inverse, on_line, across):
     fx, fy = K[0, 0], K[1, 1]
-    moved = np.empty((2, EACH))
+    change = np.empty((2, EACH))
     for k in range(len(H)):
         R, t = K_inverse @ H[k] @ K, K_inverse @ b[k]
         for n in range(len(pixel)):
@@ -64,24 +64,24 @@ def _linearised(pixel, rho, along, slope, H, b, K, K_inverse, on_line, across):
             over = 1 / z
             p = (R[0, 0] * x + R[0, 1] * y + R[0, 2] + rho[n] * t[0]) * over
             q = (R[1, 0] * x + R[1, 1] * y + R[1, 2] + rho[n] * t[1]) * over
-            moved[0, 0], moved[0, 1], moved[0, 2] = -p * q * fx, (1 + p * p) * fx, -q * fx
-            moved[1, 0], moved[1, 1], moved[1, 2] = -(1 + q * q) * fy, p * q * fy, p * fy
+            change[0, 0], change[0, 1], change[0, 2] = -p * q * fx, (1 + p * p) * fx, -q * fx
+            change[1, 0], change[1, 1], change[1, 2] = -(1 + q * q) * fy, p * q * fy, p * fy
             per = rho[n] * over
-            moved[0, 3], moved[0, 4], moved[0, 5] = per * fx, 0.0, -p * per * fx
-            moved[1, 3], moved[1, 4], moved[1, 5] = 0.0, per * fy, -q * per * fy
-            # In the view, of the ray's x and y.
+            change[0, 3], change[0, 4], change[0, 5] = per * fx, 0.0, -p * per * fx
+            change[1, 3], change[1, 4], change[1, 5] = 0.0, per * fy, -q * per * fy
+            # Derivatives of the position in the view by the ray's x and y.
             ux, uy = (R[0, 0] - p * R[2, 0]) * over * fx, (R[0, 1] - p * R[2, 1]) * over * fx
             vx, vy = (R[1, 0] - q * R[2, 0]) * over * fy, (R[1, 1] - q * R[2, 1]) * over * fy
-            here, there = x * x + y * y, p * p + q * q
-            moved[0, 6], moved[1, 6] = p * fx - x * ux - y * uy, q * fy - x * vx - y * vy
-            moved[0, 7], moved[1, 7] = 1 - ux / fx, -vx / fx
-            moved[0, 8], moved[1, 8] = -uy / fy, 1 - vy / fy
-            moved[0, 9] = there * p * fx - here * (x * ux + y * uy)
-            moved[1, 9] = there * q * fy - here * (x * vx + y * vy)
+            r2, r2_view = x * x + y * y, p * p + q * q
+            change[0, 6], change[1, 6] = p * fx - x * ux - y * uy, q * fy - x * vx - y * vy
+            change[0, 7], change[1, 7] = 1 - ux / fx, -vx / fx
+            change[0, 8], change[1, 8] = -uy / fy, 1 - vy / fy
+            change[0, 9] = r2_view * p * fx - r2 * (x * ux + y * uy)
+            change[1, 9] = r2_view * q * fy - r2 * (x * vx + y * vy)
             eu, ev = along[n, k, 0], along[n, k, 1]
             for c in range(EACH):
-                across[n, k, c] = eu * moved[1, c] - ev * moved[0, c]
-                on_line[n, k, c] = eu * moved[0, c] + ev * moved[1, c] + slope[n, k] * across[n, k, c]
+                across[n, k, c] = eu * change[1, c] - ev * change[0, c]
+                on_line[n, k, c] = eu * change[0, c] + ev * change[1, c] + slope[n, k] * across[n, k, c]
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,9 +89,9 @@ class Shown:
     """Positions of N pixels along and across their lines in V views.
 
     Attributes:
-        change: [N, V, 10] of ``value``, by the errors.
-        value: [N, V] inverse depth, from any origin of each pixel [1/m].
-        variance: [N, V] of it [1/m^2]; infinite where a view shows nothing.
+        change: [N, V, 10] derivative of ``value`` by the errors.
+        value: [N, V] inverse depth, from an arbitrary origin for each pixel [1/m].
+        variance: [N, V] of ``value`` [1/m^2]; infinite where a view measures nothing.
         across_change, across, across_variance: the same of the position across the line [px].
     """
 
@@ -109,11 +109,11 @@ class Solution:
 
     Attributes:
         error: [6 V + 4] of the poses, one after the other, and of the camera.
-        covariance: [6 V + 4, 6 V + 4] of them.
-        rho: [N] inverse depth from its origin [1/m]; 0 where nothing is shown.
-        common: [N] variance of ``rho`` by the errors that remain [1/m^2].
-        residual: [N, V] square of what is left of ``value``, over its variance.
-        across_residual: [N, V] square of what is left of ``across`` [px^2].
+        covariance: [6 V + 4, 6 V + 4] of the errors.
+        rho: [N] inverse depth from its origin [1/m]; 0 where no view measures it.
+        common: [N] variance of ``rho`` from the remaining errors [1/m^2].
+        residual: [N, V] squared residual of ``value``, over its variance.
+        across_residual: [N, V] squared residual of ``across`` [px^2].
     """
 
     error: NDArray[np.float64]
@@ -125,8 +125,8 @@ class Solution:
 
 
 def solved(shown: Shown, precision: NDArray[np.float64], start: NDArray[np.float64]) -> Solution:
-    """The most likely errors given a prior of mean ``start`` [6 V + 4] and precision [6 V + 4, 6 V + 4], the depths
-    eliminated, by ``ROUNDS`` rounds of Student-t weights."""
+    """The most likely errors for a prior of mean ``start`` [6 V + 4] and precision [6 V + 4, 6 V + 4], by ``ROUNDS``
+    rounds of Student-t weights with the depths eliminated."""
     n, v = shown.value.shape
     size = len(start)
     error, covariance, mean_change = np.zeros(size), np.zeros((size, size)), np.zeros((n, size))
@@ -143,13 +143,13 @@ def solved(shown: Shown, precision: NDArray[np.float64], start: NDArray[np.float
 @reordered
 def _solved(
     change, value, weight, across_change, across, across_weight,
-    precision, right, error, covariance, mean_change, rho, residual, across_residual,
+    precision, right_side, error, covariance, mean_change, rho, residual, across_residual,
 ):  # fmt: skip
     count, views, _ = change.shape
-    mean, by = np.zeros(count), np.empty(EACH)
-    for turn in range(ROUNDS):
-        A, r = precision.copy(), right.copy()
-        student = 0.0 if turn == 0 else STUDENT
+    mean, view_error = np.zeros(count), np.empty(EACH)
+    for iteration in range(ROUNDS):
+        A, r = precision.copy(), right_side.copy()
+        student = 0.0 if iteration == 0 else STUDENT
         _equations(
             *(change, value, weight, residual, across_change, across, across_weight, across_residual, student),
             *(A, r, mean_change, mean),
@@ -158,39 +158,28 @@ def _solved(
         error[:] = covariance @ r
         rho[:] = mean - mean_change @ error
         for k in range(views):
-            by[:POSE], by[POSE:] = error[POSE * k : POSE * (k + 1)], error[POSE * views :]
+            view_error[:POSE], view_error[POSE:] = error[POSE * k : POSE * (k + 1)], error[POSE * views :]
             for n in range(count):
-                left, left_across = value[n, k] - rho[n], across[n, k]
+                e, e_across = value[n, k] - rho[n], across[n, k]
                 for c in range(EACH):
-                    left -= change[n, k, c] * by[c]
-                    left_across -= across_change[n, k, c] * by[c]
-                residual[n, k], across_residual[n, k] = left * left * weight[n, k], left_across * left_across
+                    e -= change[n, k, c] * view_error[c]
+                    e_across -= across_change[n, k, c] * view_error[c]
+                residual[n, k], across_residual[n, k] = e * e * weight[n, k], e_across * e_across
 
 
 @reordered
 def _equations(
-    change,
-    value,
-    weight,
-    residual,
-    across_change,
-    across,
-    across_weight,
-    across_residual,
-    student,
-    A,
-    r,
-    mean_change,
-    mean,
-):
-    """Add the pixels to the normal equations A d = r; the means over the views, by their precisions, are written.
-    ``student`` = 0: each counts in full."""
+    change, value, weight, residual, across_change, across, across_weight, across_residual, student,
+    A, r, mean_change, mean,
+):  # fmt: skip
+    """Add the pixels to the normal equations A d = r, and write the precision-weighted means over the views.
+    ``student`` = 0: weights without Student's t."""
     count, views, _ = change.shape
     total, by_view = np.zeros(count), np.zeros((EACH, EACH))
     mean[:] = 0
     mean_change[:] = 0
     for k in range(views):
-        first, camera = POSE * k, POSE * (views - 1)  # added to c: its place among the errors
+        first, camera = POSE * k, POSE * (views - 1)  # added to c: its index among the errors
         by_view[:] = 0
         for n in range(count):
             w, a = weight[n, k], across_weight[n, k]
@@ -202,10 +191,10 @@ def _equations(
             total[n] += w
             mean[n] += w * value[n, k]
             for c in range(EACH):
-                at = c + (first if c < POSE else camera)
+                index = c + (first if c < POSE else camera)
                 by, by_across = w * change[n, k, c], a * across_change[n, k, c]
-                mean_change[n, at] += by
-                r[at] += by * value[n, k] + by_across * across[n, k]
+                mean_change[n, index] += by
+                r[index] += by * value[n, k] + by_across * across[n, k]
                 for d in range(c + 1):  # a lower triangle, which :func:`_inverse` reads
                     by_view[c, d] += by * change[n, k, d] + by_across * across_change[n, k, d]
         for c in range(EACH):
@@ -222,7 +211,7 @@ def _equations(
 
 @reordered
 def _inverse(A, inverse):
-    """The inverse of a symmetric positive definite matrix, whose lower triangle is read and changed, by L L^T."""
+    """Invert a symmetric positive definite matrix by L L^T; its lower triangle is read and overwritten."""
     size = len(A)
     for j in range(size):
         for i in range(j, size):

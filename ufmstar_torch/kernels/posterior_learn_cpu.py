@@ -24,7 +24,7 @@ from ufmstar_torch.posterior.scene import MOST_WRONG
 
 
 def learnt(scene: Scene, field: Field, weight: Floats, left_out: LeftOut, running: Running) -> Floats:
-    """Packed."""
+    """The packed memory after the frame."""
     above, below = running.added(_of_neighbours(scene, left_out, running) | _of_discs(scene, weight, left_out, running))
     first = [running.frames + 1, scene.grid.mean]
     return np.concatenate([first, above, below, field.coefficients, field.covariance.ravel()])
@@ -33,10 +33,10 @@ def learnt(scene: Scene, field: Field, weight: Floats, left_out: LeftOut, runnin
 def _of_neighbours(scene: Scene, left_out: LeftOut, running: Running) -> dict[str, tuple[float, float]]:
     variance = left_out.total
     excess = np.minimum(left_out.residual**2, scene.config.clip * variance) - variance
-    once = 1 / scene.counted(np.ones(len(variance)))
+    per_cell = 1 / scene.counted(np.ones(len(variance)))
     sums = {}
     for name, part in (("roughness", np.full(len(variance), running.ratios["roughness"])), ("noise", scene.stated)):
-        w = once * (part / variance) ** 2
+        w = per_cell * (part / variance) ** 2
         unit = running.ratios[name] / np.maximum(part, 1e-12)
         sums[name] = float((w * (part + excess) * unit).sum()), float(w.sum())
     return sums
@@ -45,16 +45,16 @@ def _of_neighbours(scene: Scene, left_out: LeftOut, running: Running) -> dict[st
 def _of_discs(
     scene: Scene, weight: Floats, left_out: LeftOut, running: Running
 ) -> dict[str, tuple[float, float]]:  # fmt: skip
-    held, config = _discs(scene, running.frames), scene.config
-    rest = ~held
-    held = held & (np.count_nonzero(rest) >= LEAST_REST)
+    held_out, config = _discs(scene, running.frames), scene.config
+    rest = ~held_out
+    held_out = held_out & (np.count_nonzero(rest) >= LEAST_REST)
     field = conditioned(scene.prior, scene.observed, weight * rest)
-    node, x, noise = scene.observed.node[held], scene.observed.features[held], scene.noise[held]
+    node, x, noise = scene.observed.node[held_out], scene.observed.features[held_out], scene.noise[held_out]
     mean, variance = at(field, node, x)
     away, b = away_from(scene, rest)[node], field.coefficients
-    error, offset = scene.observed.value[held] - mean, mean - (x * b).sum(1)
-    believed = np.where(held, scene.believed(), 0.0)
-    area = (believed / np.maximum(scene.counted(believed), 1e-12))[held]
+    error, offset = scene.observed.value[held_out] - mean, mean - (x * b).sum(1)
+    believed = np.where(held_out, scene.believed(), 0.0)
+    area = (believed / np.maximum(scene.counted(believed), 1e-12))[held_out]
     unseen = away * running.ratios["unseen"]
     wide = elsewhere_variance(config, spread_around(scene, rest, b[0])[node], unseen)
     scale, factor = local_scale(scene, left_out, rest)[node], inlier_factor(running, away)
@@ -62,7 +62,7 @@ def _of_discs(
     inlier_variance, more_wrong = scale * inlier_variance, wrong_factor(config, away, scale)
     p = np.minimum(running.ratios["wrong"] * more_wrong, MOST_WRONG)
     z2 = error**2 / inlier_variance - (error + offset) ** 2 / (noise + wide)
-    with np.errstate(over="ignore", divide="ignore"):  # certainly on its own surface, or never on another
+    with np.errstate(over="ignore", divide="ignore"):  # infinite odds of the evidence's surface
         elsewhere = 1 / (1 + np.exp(-np.log(p / (1 - p)) - (np.log(inlier_variance / (noise + wide)) + z2) / 2))
     stated = second_moments(config, inlier_variance, p, offset, wide)[0]
     sums = {
@@ -102,9 +102,9 @@ def _products(product: Floats, expected: Floats, variance: Floats, noise: Floats
 
 
 def _discs(scene: Scene, frames: float) -> NDArray[np.bool_]:
-    at_, discs = (scene.observed.features[:, 2:4] + 1) / 2, scene.config.discs
-    inside = np.zeros(len(at_), np.bool_)
+    position, discs = (scene.observed.features[:, 2:4] + 1) / 2, scene.config.discs
+    inside = np.zeros(len(position), np.bool_)
     for disc in range(discs):
         centre = np.array([((frames * discs + disc + 1) * step) % 1 for step in STEPS])
-        inside |= ((at_ - centre) ** 2).sum(1) < scene.config.radius**2
+        inside |= ((position - centre) ** 2).sum(1) < scene.config.radius**2
     return inside

@@ -17,7 +17,7 @@ from ufmstar_torch.posterior.scene import LEAST_LEFT
 
 
 class AnchorRows(NamedTuple):
-    """The valid ones of one stream."""
+    """The valid anchors of one stream."""
 
     pixel: Floats
     at_pixel: NDArray[np.int64]
@@ -41,8 +41,8 @@ class Running(NamedTuple):
     @classmethod
     def of(cls, packed: Floats, config: PosteriorConfig) -> Running:
         names, (value, weight, least, largest) = _priors(config)
-        (above, below), left = packed[2 : 2 + 2 * RATIOS].reshape(2, RATIOS), packed[2 + 2 * RATIOS :]
-        b, covariance = left[:FEATURES], left[FEATURES:].reshape(FEATURES, FEATURES)
+        (above, below), rest = packed[2 : 2 + 2 * RATIOS].reshape(2, RATIOS), packed[2 + 2 * RATIOS :]
+        b, covariance = rest[:FEATURES], rest[FEATURES:].reshape(FEATURES, FEATURES)
         if packed[0] == 0:
             above, below, covariance = value * weight, weight, np.diag(config.prior_variance)
         values = np.where(below > 0, above / np.maximum(below, 1e-12), value).clip(least, largest)
@@ -51,9 +51,9 @@ class Running(NamedTuple):
 
     def added(self, sums: dict[str, tuple[float, float]]) -> tuple[Floats, Floats]:
         value, weight, least, largest = _priors(self.config)[1]
-        memory, (above, below) = 0.5 ** (1 / self.config.half_life), np.array([sums[name] for name in self.ratios]).T
-        n = memory * self.below + (1 - memory) * weight + below
-        total = memory * self.above + (1 - memory) * weight * value + above
+        fade, (above, below) = 0.5 ** (1 / self.config.half_life), np.array([sums[name] for name in self.ratios]).T
+        n = fade * self.below + (1 - fade) * weight + below
+        total = fade * self.above + (1 - fade) * weight * value + above
         return np.minimum(np.maximum(total, least * n), largest * n), n
 
     def drifted(self, mean: float) -> Floats:
@@ -63,14 +63,14 @@ class Running(NamedTuple):
     def expected(self, mean: float) -> tuple[Floats, Floats]:
         T = np.eye(FEATURES)
         T[0, 1] = mean - self.mean if self.frames else 0.0
-        walked = T @ self.covariance @ T.T
+        transformed = T @ self.covariance @ T.T
         if self.frames:
-            left = (1 - walked.diagonal() / self.config.prior_variance).clip(0, 1)
-            walked = walked + np.diag(self.config.drift**2 * left)
-        return T @ self.coefficients, walked
+            remaining = (1 - transformed.diagonal() / self.config.prior_variance).clip(0, 1)
+            transformed = transformed + np.diag(self.config.drift**2 * remaining)
+        return T @ self.coefficients, transformed
 
 
-@functools.lru_cache(maxsize=4)  # of each posterior, the same for every frame
+@functools.lru_cache(maxsize=4)  # a posterior has the same config in every frame
 def _priors(config: PosteriorConfig) -> tuple[tuple[str, ...], Floats]:
     """Names of the ratios [R], and their values, weights, least and largest values [4, R]."""
     priors = ratios(config)
@@ -166,8 +166,8 @@ def _loosened(scene: Scene, field: Field) -> Prior:
 def _with_weights(scene: Scene, weight: Floats) -> tuple[Field, LeftOut]:
     field = conditioned(scene.prior, scene.observed, weight)
     mean, variance = at(field, scene.observed.node, scene.observed.features)
-    left = np.maximum(1 - weight * variance, LEAST_LEFT)
-    return field, LeftOut((scene.observed.value - mean) / left, variance / left + scene.noise)
+    divisor = np.maximum(1 - weight * variance, LEAST_LEFT)
+    return field, LeftOut((scene.observed.value - mean) / divisor, variance / divisor + scene.noise)
 
 
 def spread_around(scene: Scene, used: NDArray[np.bool_], mean: float) -> Floats:
@@ -187,9 +187,9 @@ def local_scale(scene: Scene, left_out: LeftOut, used: NDArray[np.bool_]) -> Flo
 
 
 def _around(scene: Scene, used: NDArray[np.bool_], width: float, *values: Floats) -> Floats:
-    each = np.where(used, scene.believed() / scene.counted(np.ones(len(scene.noise))), 0.0)
-    grid, rows = scene.grid, (each, *(each * x for x in values))
-    nodes = np.stack([np.bincount(scene.observed.node, x, grid.rows * grid.cols) for x in rows])
+    weight = np.where(used, scene.believed() / scene.counted(np.ones(len(scene.noise))), 0.0)
+    grid, terms = scene.grid, (weight, *(weight * x for x in values))
+    nodes = np.stack([np.bincount(scene.observed.node, x, grid.rows * grid.cols) for x in terms])
     nodes = nodes.reshape(-1, grid.rows, grid.cols)
     sums: Floats = (_window(grid.rows, width) @ nodes @ _window(grid.cols, width)).reshape(len(nodes), -1)
     return sums
@@ -197,8 +197,8 @@ def _around(scene: Scene, used: NDArray[np.bool_], width: float, *values: Floats
 
 @functools.lru_cache(maxsize=8)  # two widths; the sizes of the grid hardly change
 def _window(count: int, width: float) -> Floats:
-    at_ = np.arange(count) / count
-    return np.exp(-(((at_[:, None] - at_) / width) ** 2) / 2)
+    position = np.arange(count) / count
+    return np.exp(-(((position[:, None] - position) / width) ** 2) / 2)
 
 
 def wrong_factor(config: PosteriorConfig, away: Floats, scale: Floats) -> Floats:

@@ -1,7 +1,7 @@
 """Gaussian mixture regression on the CPU (numba): the entry points.
 
-The exact sum is in ``regress_tiles_cpu``: it leaves out components that cannot matter, and states the error. The
-paper's neighbourhood is in ``regress_near_cpu``.
+``regress_tiles_cpu`` has the exact sum, which leaves out components that cannot matter and states the error.
+``regress_near_cpu`` has the paper's neighbourhood.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ class Seen(NamedTuple):
 def views_of(
     seen: Sequence[Seen], depth: Tensor, intrinsics: Tensor, config: UfMStarConfig, *others: torch.dtype
 ) -> list[View]:
-    """The part of each stream's mixture in view, as the exact sum takes it, with the error of the depth's dtype or of a
-    more precise one of the ``others``."""
+    """The components in view of each stream, for the exact sum. The error is that of the most precise dtype among the
+    depth's and the ``others``."""
     epsilon = min(EPSILON[dtype] for dtype in (depth.dtype, *others))
     streams = zip(seen, np.asarray(array(intrinsics), np.float64), array(depth), strict=True)
     prior = config.prior_weight, config.prior_mean
@@ -60,25 +60,25 @@ def regress_maps(
     views: Sequence[View] | None = None,
     shift: NDArray[np.float64] | None = None,
 ) -> Regression:
-    """As :func:`ufmstar_torch.regress.regress_image`, of what each stream's mixture has in view, for a depth that is
-    positive where it is valid, and only there; every feature is a contiguous map.
+    """As :func:`ufmstar_torch.regress.regress_image`, over the components in view, for a depth that is positive exactly
+    where it is valid; every feature is a contiguous map.
 
-    With the exact sum, ``views`` are those of :func:`look`, which None makes, and ``shift`` [B, 2] is added to the two
-    features before the last, of three or more; None = nothing.
+    With the exact sum, ``views`` are those of :func:`views_of` (None: computed here), and ``shift`` [B, 2] is added to
+    the two features before the last, of three or more (None: zero).
     """
     z, K = array(depth), np.asarray(array(intrinsics), np.float64)
     shape, features = z.shape if pixels is None else tuple(pixels.shape), seen[0].features.shape[1]
     out, out_f = (np.full(size, np.nan, z.dtype) for size in (shape, (len(z), features, *shape[1:])))
     shares = 1 if pixels is not None else shares_of_stream(len(z), z[0].size)
-    moved = np.zeros((len(z), 2)) if shift is None else shift
+    shifts = np.zeros((len(z), 2)) if shift is None else shift
     if config.regression != "exact":
-        at = np.arange(z[0].size)[None].repeat(len(z), 0) if pixels is None else array(pixels)
+        index = np.arange(z[0].size)[None].repeat(len(z), 0) if pixels is None else array(pixels)
         settings = (
             config.prior_weight, config.prior_mean, config.neighbourhood_sigmas, config.near_radius, config.far_radius,
         )  # fmt: skip
         calls: list[tuple[Any, ...]] = [
-            (z[b], K[b], at[b], one.components, one.disagreement, one.features, settings, out[b].reshape(-1),
-             out_f[b].reshape(features, at.shape[1]), i, shares)
+            (z[b], K[b], index[b], one.components, one.disagreement, one.features, settings, out[b].reshape(-1),
+             out_f[b].reshape(features, index.shape[1]), i, shares)
             for b, one in enumerate(seen) for i in range(shares)
         ]  # fmt: skip
         each(near, calls)
@@ -87,12 +87,12 @@ def regress_maps(
         views = views_of(seen, depth, intrinsics, config)
     calls = []
     for b, one in enumerate(seen):
-        into = out[b], out_f[b]
+        outputs = out[b], out_f[b]
         view = views[b]
         if pixels is None:
-            calls += [(z[b], K[b], view, one.features, moved[b], *into, i, shares) for i in range(shares)]
+            calls += [(z[b], K[b], view, one.features, shifts[b], *outputs, i, shares) for i in range(shares)]
         else:
-            calls.append((z[b], K[b], pixels[b].contiguous().numpy(), view, one.features, moved[b], *into))
+            calls.append((z[b], K[b], pixels[b].contiguous().numpy(), view, one.features, shifts[b], *outputs))
     each(exact if pixels is None else exact_at, calls)
     return _regression(out, out_f)
 
@@ -104,7 +104,7 @@ def fill_and_smooth(
 
     Args:
         disagreement, measured, depth: at the pixels that are regressed, [B, H, W] or [B, n]; one dtype.
-        memory: likewise, in any dtype; with ``alpha`` = 1 it counts nowhere else than where M has no value.
+        memory: likewise, in any dtype; with ``alpha`` = 1 it counts only where M has no value.
 
     Returns:
         The new memory, the map to show, and the number of pixels of each stream that are not measured.
@@ -127,9 +127,9 @@ def _fill_and_smooth(disagreement, depth, previous, measured, memory, shown, sha
         missing = one - share_measured
         value = _plus(value, (missing if missing > zero else zero) * depth[i] * depth[i], share)
         unmeasured += share_measured < half
-        now, before = memory.dtype.type(np.nan if blank and share_measured < half else value), previous[i]
-        memory[i] = before if now != now else now if before != before else (1 - alpha) * before + alpha * now
-        shown[i] = now if now != now else memory[i]
+        current, last = memory.dtype.type(np.nan if blank and share_measured < half else value), previous[i]
+        memory[i] = last if current != current else current if last != last else (1 - alpha) * last + alpha * current
+        shown[i] = current if current != current else memory[i]
     return unmeasured
 
 

@@ -3,7 +3,8 @@
 A component k adds w_k(x) = pi_k N(x; mu_k, Sigma_k) to the denominator D(x) = pi_0 + sum_k w_k(x) of a point x.
 
 1. Block of 32 x 32 pixels: interval arithmetic over the bounding box of the block's points gives l_k <= w_k(x) <= h_k.
-   Components that every block leaves out, by the box around all points of the image, go at once, which changes no bit.
+   Components that the box around all points of the image excludes are left out first. Every block would exclude them,
+   so that no bit changes.
 2. Tile of 8 x 8 pixels: the same, for the components that the block keeps.
 
 Each level leaves out the components with h_k <= (eps / 2n) max(max_j l_j, pi_0 / 1000), with n components at that
@@ -14,8 +15,8 @@ and mu_0:
     |m_hat - m_hat_culled| <= eps max(m_k, mu_0),
 
 and eps / 1000 max(m_k, mu_0) at a point that no component explains (every w_j <= pi_0 / 1000). The factor 1000 keeps
-the *relative* error small there, where m_hat itself is small. What the arithmetic rounds off comes on top; the bounds
-contain their own rounding. tests/test_regress.py checks the bound.
+the *relative* error small there, where m_hat itself is small. Rounding of the sums adds to it; the bounds contain their
+own rounding. tests/test_regress.py checks the bound.
 """
 
 from __future__ import annotations
@@ -44,13 +45,13 @@ def in_view(components, m, features, K, depth, farthest, prior_weight, prior_mea
     Args:
         components: in the camera's frame by field [13, n and more] (``rigid_cpu``).
         m, features: of the n components [n], [n, F].
-        depth: [H, W], not positive where there is none.
-        farthest: the largest of them.
+        depth: [H, W], not positive where invalid.
+        farthest: the largest depth.
 
     Returns:
         Indices [n], fields [n, 10], the same in the dtype of ``depth`` and by field [10, n and more], the terms of the
-        sum [n, TERMS], and the settings: prior weight and mean, epsilon, log2 of the least threshold,
-        and how many components there are.
+        sum [n, TERMS], and the settings: prior weight and mean, epsilon, log2 of the least threshold, and the number of
+        all components.
     """
     height, width = depth.shape
     n = m.size
@@ -70,7 +71,7 @@ def in_view(components, m, features, K, depth, farthest, prior_weight, prior_mea
     box = min(left, 0.0), min(top, 0.0), 0.0, max(right, 0.0), max(bottom, 0.0), z
     settings = prior_weight, prior_mean, epsilon, math.log2(_PRIOR * prior_weight), n
     work = empty(8 + packed.shape[1], depth.dtype)
-    # Blocks take n components; a few more lower the threshold by more than what rounding can make of two boxes.
+    # Blocks divide their threshold by n. A larger divisor makes this one lower in spite of rounding of the boxes.
     chosen = cull(packed, n, n + n // 64 + 1, box, settings, work, index)
     fields, constants = empty((chosen, FIELDS), np.float64), empty((chosen, TERMS), depth.dtype)
     _terms(components, whitened, index, m, features, fields, constants)
@@ -81,7 +82,7 @@ def in_view(components, m, features, K, depth, farthest, prior_weight, prior_mea
 
 @leaf
 def _pack(components, whitened, index, n, packed):
-    """The fields of the first n chosen components by field, and behind them components that are nowhere.
+    """The fields of the first n chosen components by field, padded with components of density 0.
 
     The fields are mean, whitening and log2 of the peak: 2^(peak - |whitening (x - mean)|^2) is the density.
     """
@@ -110,13 +111,13 @@ def _terms(components, whitened, index, m, features, fields, constants):
 
 @leaf
 def _limit(epsilon, count):
-    """log2 of the share of a lower bound that one component may add at one level, a little less for rounding."""
+    """log2 of the share of a lower bound that one component may add at one level, with a margin for rounding."""
     return math.log2(epsilon / (2 * max(count, 1))) - 0.01
 
 
 @leaf
 def pad(packed, n):
-    """Fill the fields behind n components up to the padded number with those of one that is nowhere."""
+    """Fill the fields after n components up to the padded number with components of density 0."""
     for j in range(n, padded(n)):
         for i in range(FIELDS - 1):
             packed[i, j] = 0
@@ -129,7 +130,7 @@ def whiten(components, n, whitened):
     determinant."""
     for k in range(n):
         xx, yy, zz = components[COVARIANCE, k], components[COVARIANCE + 4, k], components[COVARIANCE + 8, k]
-        least = max(xx, yy, zz) * 1e-14  # fusion keeps pivots far above it
+        least = max(xx, yy, zz) * 1e-14  # the pivots of fused covariances are far above it
         l00 = math.sqrt(max(xx, least))
         l10, l20 = components[COVARIANCE + 3, k] / l00, components[COVARIANCE + 6, k] / l00
         l11 = math.sqrt(max(yy - l10 * l10, least))
@@ -144,10 +145,10 @@ def whiten(components, n, whitened):
 
 @leaf
 def cull(packed, n, level, box, settings, work, retained):
-    """Write those of the n packed components that matter in the box (low, high) to ``retained``; return how many.
+    """Write those of the n packed components that matter in the box (low, high) to ``retained``; return their number.
 
-    ``level`` is how many components the level has, whose share of a threshold each may add.
-    ``work`` is scratch for 8 numbers and one for each component.
+    ``level`` is the number of components of the level, which divides the threshold. ``work`` is scratch for 8 numbers
+    and one for each component.
     """
     real = packed.dtype.type
     epsilon, least = settings[2], settings[3]

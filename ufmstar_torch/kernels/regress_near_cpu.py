@@ -13,12 +13,12 @@ from ufmstar_torch.kernels.rigid_cpu import COVARIANCE
 
 @kernel
 def near(depth, K, pixels, components, m, features, settings, out, out_f, first, shares):
-    """One stream at pixels [n], indices into the flattened image [H, W], of which the share ``first`` is done, into
-    out [n] and out_f [F, n]; NaN where the depth is not positive.
+    """Regress one stream at pixels [n], indices into the flattened image [H, W], into out [n] and out_f [F, n]; NaN
+    where the depth is not positive. Of the pixels, cut into ``shares``, only the share ``first`` is computed.
 
     ``settings``: prior weight and mean, standard deviations of an extent, near and far radius.
     """
-    prior_weight, prior_mean, sigmas, near, far = settings
+    prior_weight, prior_mean, sigmas, near_radius, far_radius = settings
     log_peak, local, extent = _prepared(components, m.size, sigmas)
     gaps, nearest, sums = empty(m.size, np.float64), empty(m.size, np.int64), empty(features.shape[1], np.float64)
     for i in range(first * pixels.size // shares, (first + 1) * pixels.size // shares):
@@ -28,7 +28,21 @@ def near(depth, K, pixels, components, m, features, settings, out, out_f, first,
         if z > 0:
             x, y = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z
             value = _point(
-                x, y, z, log_peak, local, extent, m, features, prior_weight, prior_mean, near, far, gaps, nearest, sums
+                x,
+                y,
+                z,
+                log_peak,
+                local,
+                extent,
+                m,
+                features,
+                prior_weight,
+                prior_mean,
+                near_radius,
+                far_radius,
+                gaps,
+                nearest,
+                sums,
             )
         out[i] = value
         for g in range(sums.size):
@@ -52,17 +66,33 @@ def _prepared(components, n, sigmas):
 
 
 @part
-def _point(x, y, z, log_peak, local, extent, m, features, prior_weight, prior_mean, near, far, gaps, nearest, sums):
-    """The regression at one point; its features are left in ``sums`` [F]."""
+def _point(
+    x,
+    y,
+    z,
+    log_peak,
+    local,
+    extent,
+    m,
+    features,
+    prior_weight,
+    prior_mean,
+    near_radius,
+    far_radius,
+    gaps,
+    nearest,
+    sums,
+):
+    """The regression at one point; writes its features to ``sums`` [F]."""
     count, least = 0, np.inf
     for k in range(m.size):
         gap = abs(z - local[k, 2]) - extent[k, 2]
         gap = max(gap, abs(x - local[k, 0]) - extent[k, 0], abs(y - local[k, 1]) - extent[k, 1])
-        if gap <= far:
+        if gap <= far_radius:
             gaps[count], nearest[count] = gap, k
             count += 1
             least = min(least, gap)
-    radius = near if least <= near else far
+    radius = near_radius if least <= near_radius else far_radius
     evidence, total = prior_weight, prior_weight * prior_mean
     for g in range(sums.size):
         sums[g] = 0.0

@@ -1,13 +1,13 @@
 """The exact sum of the regression at every pixel, or at some, on the CPU (numba).
 
-Tiles of 8 x 8 pixels take the components that ``regress_cull_cpu`` leaves them, which states the error. Points are
-taken relative to an origin in the middle of their tile at the depth of its nearest pixel: a pixel (i, j) from the
-middle, with the ray r from the camera through the middle (r_z = 1), depth z and z_0 of the nearest, lies at z (i /
-f_x, j / f_y, 0) + (z - z_0) r. Whitened offsets of the components from there are taken in double precision, so that
-float32 loses nothing to the distance from the camera, nor to a far outlier in the tile. Densities are powers of two:
-log2(e)/2 is part of the whitening.
+Each tile of 8 x 8 pixels sums the components that ``regress_cull_cpu`` selects, which states the error. Points are
+relative to an origin in the middle of their tile at the depth z_0 of its nearest pixel. A pixel (i, j) from the middle,
+of depth z, lies at z (i / f_x, j / f_y, 0) + (z - z_0) r, with the ray r from the camera through the middle (r_z = 1).
+Whitened offsets from the components to the origin are in double precision, so that float32 loses nothing to the
+distance from the camera, nor to a far outlier in the tile. Densities are powers of two: log2(e)/2 is part of the
+whitening.
 
-A subset of the pixels takes the same way: a block's share of them, up to 64 at a time, is a tile.
+For a subset of the pixels, up to 64 pixels of a block form a tile.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ _EVIDENCE, _TOTAL, _LAST = range(3)  # rows of a tile's sums and averages, as `m
 
 @kernel
 def exact(depth, K, view, features, shift, out, out_f, first, shares):
-    """One stream; of its blocks every ``shares``-th, from ``first`` on.
+    """Regress every ``shares``-th block of one stream, from block ``first`` on.
 
-    depth [H, W], K [3, 3], what is in view (:func:`in_view`) and features [K, F] into out [H, W] and out_f [F, H, W],
-    which are NaN and stay so where the depth is not positive. ``shift`` [2] is added to the two features before the
-    last, of three or more.
+    Reads depth [H, W], K [3, 3], the ``view`` of :func:`in_view` and features [K, F]. Writes out [H, W] and out_f
+    [F, H, W], which are NaN and stay so where the depth is not positive. ``shift`` [2] is added to the two features
+    before the last, of three or more.
     """
     tiles, lists, sums = _scratch(view, out_f.shape[0], shift)
     grid = tiles[0]
@@ -43,7 +43,7 @@ def exact(depth, K, view, features, shift, out, out_f, first, shares):
 
 @kernel
 def exact_at(depth, K, pixels, view, features, shift, out, out_f):
-    """One stream at some pixels [n], indices into the flattened image, into out [n] and out_f [F, n]."""
+    """Regress one stream at pixels [n], indices into the flattened image, into out [n] and out_f [F, n]."""
     height, width = depth.shape
     columns, rows = (width + _BLOCK - 1) // _BLOCK, (height + _BLOCK - 1) // _BLOCK
     begin, order = empty(rows * columns + 2, np.int64), empty(pixels.size, np.int64)
@@ -57,13 +57,13 @@ def _scratch(view, features, shift):
     """Memory for the work on one block, of the n components in view, in the dtype of the maps.
 
     Returns:
-        Scratch of a tile: its pixels' rays less that through the middle [2, 64], the depths of one of them [64], points
-        [16, 192], boxes and origins [16, 9] in float64, whether they have a pixel, what :func:`place_points` adds in
-        holes [16, 64], and its work [10]. Of lists of components: their fields, work of :func:`cull`, and two lists. Of
-        sums at a tile: what they start with [6], offsets and densities of components, the sums [5, 64], averages of the
-        other features, and the values of one of them.
+        Scratch of tiles: rays of the pixels less the ray through the middle [2, 64], depths of one tile [64], points
+        [16, 192], boxes and origins [16, 9] in float64, the mask of tiles with a pixel, the holes of
+        :func:`place_points` [16, 64], and its box [10]. Scratch of lists of components: their fields, work of
+        :func:`cull`, and two lists. Scratch of sums at a tile: initial values [6], offsets and densities of components,
+        the sums [5, 64], averages of the other features, and values of one of them.
     """
-    n, dtype, more = view[2].shape[1], view[2].dtype, features - _mixed(features)  # n is padded
+    n, dtype, others = view[2].shape[1], view[2].dtype, features - _mixed(features)  # n is padded
     tiles = (
         empty((2, PIXELS), dtype), empty(PIXELS, dtype), empty((_TILES, 3 * PIXELS), dtype),
         empty((_TILES, 9), np.float64), empty(_TILES, np.bool_), empty((_TILES, PIXELS), dtype), empty(10, dtype),
@@ -72,12 +72,12 @@ def _scratch(view, features, shift):
     start = empty(6, dtype)
     start[_EVIDENCE], start[_TOTAL], start[_LAST], start[3] = view[4][0], view[4][0] * view[4][1], 0, TINY
     start[4], start[5] = shift[1], shift[0]
-    densities = empty((n if more > 0 else 0, PIXELS), dtype)
+    densities = empty((n if others > 0 else 0, PIXELS), dtype)
     return (
         tiles, lists,
         (
             start, empty((n, 3), dtype), densities, empty((5, PIXELS), dtype),
-            empty((more, PIXELS), dtype), empty(n, dtype),
+            empty((others, PIXELS), dtype), empty(n, dtype),
         ),
     )  # fmt: skip
 
@@ -90,26 +90,26 @@ def _mixed(features):
 
 @leaf
 def _blocks(depth, K, view, features, tiles, lists, sums, out, out_f, first, shares):
-    """The blocks of an image, of which every ``shares``-th is done, from ``first`` on."""
-    z, boxes, seen, (near, work, in_block, in_tile), everyone = tiles[1], tiles[3], tiles[4], lists, view[2]
+    """Regress every ``shares``-th block of an image, from block ``first`` on."""
+    z, boxes, seen, (near, work, in_block, in_tile), packed = tiles[1], tiles[3], tiles[4], lists, view[2]
     rows, columns = (depth.shape[0] + _BLOCK - 1) // _BLOCK, (depth.shape[1] + _BLOCK - 1) // _BLOCK
     half = 0.5 * (TILE - 1)
     for block in range(first, rows * columns, shares):
         v0, u0 = block // columns * _BLOCK, block % columns * _BLOCK
-        some = False
+        any_seen = False
         for tile in range(_TILES):
             v, u = v0 + tile // _SIDE * TILE, u0 + tile % _SIDE * TILE
             seen[tile] = v < depth.shape[0] and u < depth.shape[1]
             if seen[tile]:
                 _depths(depth, v, u, z)
                 seen[tile] = _placed((u + half - K[0, 2]) / K[0, 0], (v + half - K[1, 2]) / K[1, 1], tiles, tile)
-            some |= seen[tile]
-        if not some:
+            any_seen |= seen[tile]
+        if not any_seen:
             continue
-        count = cull(everyone, view[0].size, view[4][4], _union(boxes, seen), view[4], work, in_block)
+        count = cull(packed, view[0].size, view[4][4], _union(boxes, seen), view[4], work, in_block)
         for i in range(FIELDS):
             for j in range(count):
-                near[i, j] = everyone[i, in_block[j]]
+                near[i, j] = packed[i, in_block[j]]
         pad(near, count)
         for tile in range(_TILES):
             if seen[tile]:
@@ -122,8 +122,7 @@ def _blocks(depth, K, view, features, tiles, lists, sums, out, out_f, first, sha
 
 @leaf
 def _by_block(pixels, width, columns, begin, order):
-    """Sort pixels by block, keeping their order within one: block b has those from place ``begin[b]`` of the order to
-    ``begin[b + 1]``."""
+    """Sort pixels stably by block: block b has the pixels ``order[begin[b]:begin[b + 1]]``."""
     for block in range(begin.size):
         begin[block] = 0
     for i in range(pixels.size):
@@ -145,9 +144,9 @@ def _block(pixel, width, columns):
 
 @leaf
 def _at_pixels(depth, K, pixels, begin, order, view, features, tiles, lists, sums, out, out_f):
-    """The blocks of an image at some pixels, up to 64 at a time; ``begin`` and ``order`` are those of
+    """Regress the blocks of an image at some pixels, up to 64 at a time; ``begin`` and ``order`` are those of
     :func:`_by_block`."""
-    grid, z, retained, averages, more, last = tiles[0], tiles[1], lists[2], sums[3], sums[4], out_f.shape[0] - 1
+    grid, z, retained, averages, others, last = tiles[0], tiles[1], lists[2], sums[3], sums[4], out_f.shape[0] - 1
     columns = (depth.shape[1] + _BLOCK - 1) // _BLOCK
     for block in range(begin.size - 2):
         v0, u0 = block // columns * _BLOCK + 0.5 * (_BLOCK - 1), block % columns * _BLOCK + 0.5 * (_BLOCK - 1)
@@ -167,9 +166,9 @@ def _at_pixels(depth, K, pixels, begin, order, view, features, tiles, lists, sum
             _average(filled, tiles, 0, retained, chosen, view, features, sums)
             for i in range(count):
                 out[order[low + i]] = averages[_TOTAL, i]
-                for g in range(more.shape[0]):
-                    out_f[g, order[low + i]] = more[g, i]
-                for g in range(more.shape[0], last + 1):
+                for g in range(others.shape[0]):
+                    out_f[g, order[low + i]] = others[g, i]
+                for g in range(others.shape[0], last + 1):
                     out_f[g, order[low + i]] = averages[_LAST + last - g, i]
 
 
@@ -188,9 +187,9 @@ def _depths(depth, v0, u0, z):
 
 @leaf
 def _placed(x, y, tiles, tile):
-    """The points of a tile, its box (low, high) and its origin; False where all of its pixels are holes.
+    """Write the points of a tile, its box (low, high) and its origin; False where all of its pixels are holes.
 
-    ``x`` and ``y`` are the ray through its middle, at z = 1.
+    ``x`` and ``y`` are the ray through the tile's middle, at z = 1.
     """
     grid, z, points, boxes, _, hole, work = tiles
     work[7], work[8] = x, y
@@ -224,26 +223,26 @@ def _union(boxes, seen):
 
 
 @leaf
-def _average(some, tiles, tile, chosen, count, view, features, sums):
-    """As :func:`mix` at the first points of a tile, over ``chosen`` components, with averages of further features."""
+def _average(points_used, tiles, tile, chosen, count, view, features, sums):
+    """As :func:`mix` at the first ``points_used`` points of a tile, with averages of the other features."""
     points, boxes, hole = tiles[2], tiles[3], tiles[5]
-    start, offsets, densities, averages, more, values = sums
+    start, offsets, densities, averages, others, values = sums
     index, fields, _, terms, _ = view
     _offsets(fields, chosen, count, boxes[tile], offsets)
-    into = averages, densities, more.shape[0] > 0
+    outputs = averages, densities, others.shape[0] > 0
     if features.shape[1] < 3:
-        mix(terms, chosen, offsets, count, points[tile], some, start, hole[tile], *into)
+        mix(terms, chosen, offsets, count, points[tile], points_used, start, hole[tile], *outputs)
     else:
-        mix_three(terms, chosen, offsets, count, points[tile], some, start, hole[tile], *into)
-    for g in range(more.shape[0]):
+        mix_three(terms, chosen, offsets, count, points[tile], points_used, start, hole[tile], *outputs)
+    for g in range(others.shape[0]):
         for j in range(count):
             values[j] = features[index[chosen[j]], g]
-        mix_more(values, count, densities, averages, hole[tile], more[g])
+        mix_more(values, count, densities, averages, hole[tile], others[g])
 
 
 @contracted
 def _offsets(fields, chosen, count, box, offsets):
-    """The whitened offsets of a tile's origin from the means of the chosen components."""
+    """Write the whitened offsets of a tile's origin from the means of the chosen components."""
     x, y, z = box[6], box[7], box[8]
     for j in range(count):
         k = fields[chosen[j]]
@@ -255,16 +254,16 @@ def _offsets(fields, chosen, count, box, offsets):
 
 @leaf
 def _write(sums, v0, u0, out, out_f):
-    """The averages at a tile into the maps."""
-    averages, more, last = sums[3], sums[4], out_f.shape[0] - 1
+    """Copy the averages at a tile to the maps."""
+    averages, others, last = sums[3], sums[4], out_f.shape[0] - 1
     _copy(averages[_TOTAL], v0, u0, out)
     for g in range(out_f.shape[0]):
-        _copy(more[g] if g < more.shape[0] else averages[_LAST + last - g], v0, u0, out_f[g])
+        _copy(others[g] if g < others.shape[0] else averages[_LAST + last - g], v0, u0, out_f[g])
 
 
 @leaf
 def _copy(values, v0, u0, out):
-    """The values [64] of a tile into a map."""
+    """Copy the values [64] of a tile to a map."""
     if v0 + TILE <= out.shape[0] and u0 + TILE <= out.shape[1]:
         for v in range(TILE):
             for u in range(TILE):

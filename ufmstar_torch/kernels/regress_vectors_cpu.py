@@ -10,19 +10,20 @@ from ufmstar_torch.kernels.vectors_cpu import Lanes, vectors
 TILE = 8  # pixels, the side of a tile
 PIXELS = TILE * TILE
 TERMS = 11  # of a component: whitening (6), log2 of the peak, m, the last three features from the last on
-# Sums of features that may have any size start from it, and lose it at the end: a number too small for a normal float,
-# a small feature of a component far away, takes an addition a hundred times as long. It rounds off 1e-7 of it.
+# Sums of features of any magnitude start from TINY, which is subtracted at the end: without it, the product of a small
+# feature and the density of a far component can be subnormal, which slows an addition down a hundred times. It rounds
+# off 1e-7 of TINY.
 TINY = 2.0**-100
 
 
 @vectors
 def place_points(code, z, grid, ray, points, hole, box):
-    """The points of a tile from its origin, the middle of the tile at the least depth.
+    """Write the points of a tile from its origin, the middle of the tile at the least depth.
 
     Args:
         z: [64] depths; where one is not positive, the pixel is a hole and gets the least depth.
-        grid: [2, 64] the pixels' rays less that through the middle.
-        ray: [2] that one, at z = 1.
+        grid: [2, 64] the pixels' rays less the ray through the middle.
+        ray: [2] the ray through the middle, at z = 1.
         points: [3, 64] x, y and z.
         hole: [64] NaN where there is a hole, else 0.
         box: [7] the least x, y and z, the greatest, and the least depth: infinite where all are holes.
@@ -51,13 +52,13 @@ def place_points(code, z, grid, ray, points, hole, box):
 def bounds(code, packed, stride, n, box, upper):
     """log2 of upper bounds of densities in a box of points, and of the greatest lower bound.
 
-    Infinity and NaN, from a far outlier, keep a component and bound nothing.
+    Infinity and NaN, from a far outlier, retain a component and raise no lower bound.
 
     Args:
         packed: [10, stride] the components' fields: mean, whitening, log2 of the peak.
-        n: of them, a multiple of a vector's length.
-        box: [8] its centre, half its sides, what bounds the rounding of a distance as a share of the coordinates and
-            widens the box, and the least lower bound; in place of the latter the greatest is written.
+        n: number of components, a multiple of a vector's length.
+        box: [8] its centre, half its sides, the relative rounding error of a distance, which widens the box, and the
+            least lower bound, which the greatest lower bound replaces.
         upper: [n].
     """
     centre, half = [box.one(i) for i in range(3)], [box.one(3 + i) for i in range(3)]
@@ -79,35 +80,35 @@ def bounds(code, packed, stride, n, box, upper):
 
 
 @vectors
-def mix(code, terms, chosen, offsets, count, points, some, start, hole, sums, densities, keep):
+def mix(code, terms, chosen, offsets, count, points, points_used, start, hole, sums, densities, keep):
     """Averages of m and of the last feature (:func:`_mix`)."""
-    _mix(code, terms, chosen, offsets, count, points, some, start, hole, sums, densities, keep, 1)
+    _mix(code, terms, chosen, offsets, count, points, points_used, start, hole, sums, densities, keep, 1)
 
 
 @vectors
-def mix_three(code, terms, chosen, offsets, count, points, some, start, hole, sums, densities, keep):
+def mix_three(code, terms, chosen, offsets, count, points, points_used, start, hole, sums, densities, keep):
     """Averages of m and of the last three features (:func:`_mix`)."""
-    _mix(code, terms, chosen, offsets, count, points, some, start, hole, sums, densities, keep, 3)
+    _mix(code, terms, chosen, offsets, count, points, points_used, start, hole, sums, densities, keep, 3)
 
 
-def _mix(code, terms, chosen, offsets, count, points, some, start, hole, sums, densities, keep, features):
+def _mix(code, terms, chosen, offsets, count, points, points_used, start, hole, sums, densities, keep, features):
     """Averages over components at the points of a tile, weighted by their densities.
 
     Args:
         terms: [n, TERMS] of the components.
-        chosen: of them take part, of which the first ``count`` count.
-        offsets: [count, 3] whitened, of the tile's origin from theirs.
+        chosen: indices of components; the first ``count`` are used.
+        offsets: [count, 3] whitened offsets of the tile's origin from the components' means.
         points: [3, 64] x, y and z from the tile's origin.
-        some: of the points are computed, from the first on; a multiple of a vector's length.
-        start: [6] what the sums start with: of the densities, of m, of the last feature, of those before it (lost at
-            the end); and what the averages of the feature before the last and of the one before it are moved by.
+        points_used: number of points, from the first on; a multiple of a vector's length.
+        start: [6] initial values of the sums: of the densities, of m, of the last feature, of the features before it
+            (subtracted at the end); then shifts of the averages of the feature before the last and of the one before.
         hole: [64] NaN where there is a hole, else 0.
-        sums: [5, 64] the sum of the densities, the average of m, and those of so many features from the last on; the
+        sums: [5, 64] the sum of the densities, the average of m, and the averages of the features from the last on; the
             averages are NaN in a hole.
         densities: [n, 64], written where ``keep`` is True.
-        features: how many.
+        features: number of features.
     """
-    with code.loop(some, code.lanes) as i:
+    with code.loop(points_used, code.lanes) as i:
         x, y, z = (points.load(i, axis * PIXELS) for axis in range(3))
         totals = [code.variable(start.one(min(row, 3))) for row in range(2 + features)]
         with code.loop(count) as j:
@@ -130,7 +131,7 @@ def _mix(code, terms, chosen, offsets, count, points, some, start, hole, sums, d
 
 @vectors
 def mix_more(code, values, count, densities, sums, hole, averages):
-    """The averages [64] of one more feature, of which the components have ``values`` [n].
+    """The averages [64] of one more feature, whose values at the components are ``values`` [n].
 
     ``densities`` and ``sums`` are those of :func:`mix`, for ``count`` components.
     """
@@ -146,13 +147,13 @@ def mix_more(code, values, count, densities, sums, hole, averages):
 
 @vectors
 def add_shares(code, fields, stride, n, point, row, density, added):
-    """Add the row of a point, in shares by which components explain it, to the rows of the components.
+    """Add the row of a point to the rows of the components, in proportion to their densities at the point.
 
     Args:
         fields: [10, stride] of the components: mean, whitening, log2 of the peak.
-        n: of them, a multiple of a vector's length.
+        n: number of components, a multiple of a vector's length.
         point: [3].
-        row: [4], of which the last is the prior's weight.
+        row: [4] three values and the prior's weight.
         density: [n] scratch.
         added: [3, stride] the components' rows.
     """

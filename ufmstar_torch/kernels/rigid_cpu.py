@@ -1,8 +1,8 @@
 """Changes of frame on the CPU (numba): components from one camera's frame into another's.
 
 Products and sums are in the order of ``ufmstar_torch.fixed_order``, so that the results equal the reference's to the
-last bit. Components in a camera's frame are kept by field, [13, n]: mean (3), covariance row by row (9) and weight, so
-that a vector instruction takes several of them; n is padded (:func:`padded`).
+last bit. Components in a camera's frame are stored by field, [13, n]: mean (3), covariance row by row (9) and weight,
+so that a vector instruction handles several of them; n is padded (:func:`padded`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ COVARIANCE, WEIGHT = 3, 12  # the first field of the covariance, and the weight'
 
 @leaf
 def padded(n):
-    """A multiple, not below n, of what a vector loop takes at a time: its remainder would take as long again."""
+    """n, rounded up to a multiple of a vector loop's step: a loop over the remainder would take as long again."""
     return (n + LANES - 1) // LANES * LANES
 
 
@@ -34,7 +34,7 @@ def relative(T_a, T_b, motion):
 
 @leaf
 def gather(n, mean, covariance, weight, fields):
-    """Write the first n slots by field, as they are; behind them zeros up to the padded number."""
+    """Write the first n slots by field, and zeros after them up to the padded number."""
     for j in range(n):
         for i in range(3):
             fields[i, j] = mean[j, i]
@@ -62,7 +62,8 @@ def turn(code, motion, n, stride, fields):
 
 @leaf
 def scatter(n, fields, mean, covariance):
-    """Write the first n columns of fields [13, n and more] to slots, mean and covariance: :func:`gather` backwards."""
+    """Write mean and covariance of the first n columns of fields [13, n and more] to slots; inverse of
+    :func:`gather`."""
     for j in range(n):
         for i in range(3):
             mean[j, i] = fields[i, j]

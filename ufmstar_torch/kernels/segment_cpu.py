@@ -1,7 +1,7 @@
 """SPGF on the CPU (numba): the same partitions as :mod:`ufmstar_torch.segment`, in well under a millisecond
 at 224 x 224.
 
-The rows of an image are segmented on all threads that torch may use, their segments fused on one.
+All threads that torch may use segment the rows of an image; one thread fuses their segments.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from ufmstar_torch.kernels.threads_cpu import each, shares_of_stream
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.segment_input import SegmentInput
 
-_LIGHTER = 4  # a pixel takes a fraction of what its regression takes: fewer threads pay
+_LIGHTER = 4  # a pixel takes a fraction of its regression's time: fewer threads pay off
 _PRUNE = {"none": 0, "both": 1, "either": 2}
 
 
 class _Limits(NamedTuple):
-    """The thresholds that do not depend on the camera, as compiled code takes them."""
+    """The thresholds that do not depend on the camera, for compiled code."""
 
     noise_floor: float
     noise_thresh: float
@@ -98,7 +98,7 @@ def _feature_means(features: np.ndarray, labels: np.ndarray, weight: np.ndarray)
     """Means [B, K, F] of the features [B, F, H, W] over the pixels of each Gaussian, summed in raster order, in the
     dtype of ``weight`` [B, K]."""
     out = np.empty((*weight.shape, features.shape[1]), weight.dtype)
-    for b, gaussian in enumerate(labels + 1):  # 0: of no Gaussian
+    for b, gaussian in enumerate(labels + 1):  # 0: no Gaussian
         for f, values in enumerate(features[b]):
             sums = np.bincount(gaussian.ravel(), values.ravel(), weight.shape[1] + 1)
             out[b, :, f] = sums[1:] / np.maximum(weight[b], 1)

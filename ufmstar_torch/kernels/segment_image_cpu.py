@@ -28,7 +28,7 @@ from ufmstar_torch.kernels.segment_rows_cpu import (
 
 # Columns of a Gaussian: mean, scatter (upper triangle), line vector, first mean, plane vector, its pi2 ...
 _M, _C, _L, _M0, _PI, _PI2 = 0, 3, 9, 12, 15, 18
-# ... and its whole numbers: those of a segment, n, the row that extended it last, its place in the output.
+# ... and its integers: those of a segment, its number of segments, the row that extended it last, its emission order.
 _MERGED, _ROW, _ORDER = range(4, 7)
 _GAUSSIAN, _GAUSSIAN_INT = 19, 7
 
@@ -37,8 +37,8 @@ _GAUSSIAN, _GAUSSIAN_INT = 19, 7
 def join_rows(width, fy, cy, slope, lengths2, limits, spans, table, table_int):
     """Fuse the segments of all rows of an image, from the first row to the last.
 
-    Returns which Gaussians are kept, in emission order, all their values, and the slot among those kept of the segment
-    that ``runs`` name (see :func:`scan_rows`), -1 for none.
+    Returns the indices of the retained Gaussians in emission order, the values and integers of all Gaussians, and for
+    each segment index in ``runs`` (see :func:`scan_rows`) the slot of its Gaussian, -1 for none.
     """
     height, most = spans.shape[0], segments_of_row(width, limits)
     member = empty(table.shape[0], np.int64)  # segment -> Gaussian
@@ -64,7 +64,7 @@ def join_rows(width, fy, cy, slope, lengths2, limits, spans, table, table_int):
 
 @kernel
 def write_labels(spans, runs, slot, labels):
-    """The slot of every pixel's segment, or -1."""
+    """Write the slot of every pixel's segment, or -1."""
     for v in range(labels.shape[0]):
         for i in range(spans[v, 2], spans[v, 3]):
             for u in range(runs[i, 0], runs[i + 1, 0] if i + 1 < spans[v, 3] else labels.shape[1]):
@@ -73,7 +73,7 @@ def write_labels(spans, runs, slot, labels):
 
 @part
 def _doubled(table):
-    """The same rows with as many free ones behind them."""
+    """The same rows, followed by as many free ones."""
     out = empty((2 * table.shape[0], table.shape[1]), table.dtype)
     for i in range(table.shape[0]):
         for j in range(table.shape[1]):  # a slice assignment takes seconds to compile
@@ -116,26 +116,26 @@ def _join_row(
 
 @leaf
 def _retire(active, interval, n, v, last, whole, emitted):
-    """Emit the Gaussians that row v did not extend, after the last row all of them in the order of the list.
+    """Emit the Gaussians that row v did not extend, or all of them after the last row, in the order of the list.
 
-    Returns how many stay active, at the head of the list, and how many were ever emitted.
+    Returns the number of active Gaussians, at the head of the list, and the number of all emitted ones.
     """
-    going = 0
+    remaining = 0
     for i in range(n):
         g = active[i]
         if whole[g, _ROW] == v and not last:
-            active[going] = g
-            interval[0, going], interval[1, going] = interval[0, i], interval[1, i]
-            going += 1
+            active[remaining] = g
+            interval[0, remaining], interval[1, remaining] = interval[0, i], interval[1, i]
+            remaining += 1
         else:
             whole[g, _ORDER] = emitted
             emitted += 1
-    return going, emitted
+    return remaining, emitted
 
 
 @leaf
 def _lift(segment, ry, h):
-    """A segment as a Gaussian of its own: y and the moments with y follow from y = ry z."""
+    """Write a segment as a Gaussian: y and the moments with y follow from y = ry z."""
     for i in range(h.size):
         h[i] = 0.0
     h[_M], h[_M + 1], h[_M + 2] = segment[MX], ry * segment[MZ], segment[MZ]
@@ -151,14 +151,14 @@ def _best_overlap(low, high, interval, before):
 
     The overlap is shared / union; products of whole numbers compare two of them as their quotients would.
     """
-    best, of, result = ZERO, ZERO + 1, ZERO - 1
+    num, den, best = ZERO, ZERO + 1, ZERO - 1
     left, right = interval[0], interval[1]
     for i in range(before):
         shared = min(right[i], high) - max(left[i], low)
         union = max(right[i], high) - min(left[i], low)
-        better = shared * of > best * union
-        best, of, result = shared if better else best, union if better else of, i if better else result
-    return result
+        better = shared * den > num * union
+        num, den, best = shared if better else num, union if better else den, i if better else best
+    return best
 
 
 @leaf
@@ -211,9 +211,9 @@ def _merge(o, o_int, h, h_int):
 
 @leaf
 def _prune(whole, created, limits, emitted, retained, position):
-    """Write the kept Gaussians in order of emission, and for each in order of creation its place among them or -1.
+    """Write the retained Gaussians in emission order, and for every Gaussian its position among them or -1.
 
-    Returns how many are kept; ``emitted`` is scratch.
+    Returns the number of retained Gaussians; ``emitted`` is scratch.
     """
     for g in range(created):
         emitted[whole[g, _ORDER]] = g
@@ -231,7 +231,7 @@ def _prune(whole, created, limits, emitted, retained, position):
 
 @kernel
 def write_gaussians(retained, gaussians, whole, mean, covariance, weight, count):
-    """The kept Gaussians as the mixture's slots; a single pixel has no sample covariance (zeros)."""
+    """Write the retained Gaussians to the mixture's slots; a single pixel has no sample covariance (zeros)."""
     for i in range(retained.size):
         g = gaussians[retained[i]]
         n = whole[retained[i], N]

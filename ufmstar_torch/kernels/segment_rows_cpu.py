@@ -12,24 +12,24 @@ import numpy as np
 
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
 
-# Counters start here: numba gives a plain 0 another type, and would compile the functions called with it twice.
+# First value of counters: a plain 0 has another type in numba, which would compile the functions called with it twice.
 ZERO: Any = np.int64(0)
 
-# Columns of a finished segment. Within a row y = z (v - cy)/fy, so x and z say everything.
+# Columns of a finished segment. Within a row y = z (v - cy)/fy, so that x and z suffice.
 MX, MZ, CXX, CXZ, CZZ, LX, LZ = range(7)
-# Its whole numbers: N, smallest bin, interval.
+# Its integers: N, smallest bin, interval.
 N, NEAREST, UL, UR = range(4)
 SEGMENT, SEGMENT_INT = 7, 4
 
 
 class _Open(NamedTuple):
-    """An open segment, which compiled code keeps in registers. d = p - pL."""
+    """An open segment, which compiled code holds in registers. d = p - pL."""
 
     n: int
     u_left: int
     u_right: int
     nearest: int  # smallest depth bin
-    born: int  # which of the segments that the row started, from 1 on
+    born: int  # number of the segment in its row, from 1 on
     x_left: float
     z_left: float
     x_right: float
@@ -46,19 +46,16 @@ class _Open(NamedTuple):
 def scan_rows(z, fx, fy, cx, cy, slope, lengths2, edges, limits, first, last, spans, table, table_int, runs):
     """Scanline segmentation of the rows from ``first`` to ``last``, each on its own.
 
-    Finished segments go to ``table`` and ``table_int``, from row ``first * most`` on, with at most ``most`` of an image
-    row. Pixels go to ``runs``, from row ``first * W`` on: where a run of pixels of one segment begins in the image row,
-    and 1 + the place of the segment or 0. ``spans`` [H, 4] receives where a row's segments begin and end, and likewise
-    its runs.
+    Writes finished segments to ``table`` and ``table_int``, from row ``first * segments_of_row`` on. Writes runs of
+    pixels of one segment to ``runs``, from row ``first * W`` on: the column where the run begins, and 1 + the index of
+    the segment or 0. Writes to ``spans`` [H, 4] the begin and end of each row's segments and of its runs.
     """
     width = z.shape[1]
     depth, x, tau_z = empty(width, np.float64), empty(width, np.float64), empty(width, np.float64)
     rx = empty(width, np.float64)
     for u in range(width):
         rx[u] = (u - cx) / fx
-    finished_index = empty(
-        width + 1, np.int32
-    )  # what the row started, from 1 on -> 1 + finished segment; 0 = too sparse
+    finished_index = empty(width + 1, np.int32)  # by ``born``: 1 + index of the finished segment; 0 = too sparse
     older = empty((limits.max_open, 15), np.float64)
     end, pixels = first * segments_of_row(width, limits), first * width
     for v in range(first, last):
@@ -107,11 +104,11 @@ def _scanline(
     """Scanline segmentation of a row, of which ``row`` are depth, x and tau_z.
 
     Writes the finished segments from ``done`` on and the runs from ``run`` on; returns the end of both. The newest open
-    segment lives in registers, the others in a ring of max_open - 1 places, ``front`` being the newest of them.
+    segment is in registers, the others are in a ring of max_open - 1 slots, the newest of them at ``front``.
     ``finished_index`` is scratch.
     """
     depth, x, tau_z = row
-    y_factor, room, first_run = 1.0 + ry * ry, limits.max_open - 1, run
+    y_factor, ring_size, first_run = 1.0 + ry * ry, limits.max_open - 1, run
     front = waiting = started = u = k = ZERO
     low, high, length2 = 0.0, edges[0], lengths2[0]  # of depth bin k
     newest = _fresh(u, k, started, 0.0, 0.0)
@@ -129,7 +126,7 @@ def _scanline(
             low, length2 = edges[k - 1] if k > 0 else 0.0, lengths2[k]
             high = edges[k] if k < edges.size - 1 else np.inf
         if not (newest.n > 0 and _fits(newest, x[u], z, u, slope, tau_z[u], length2, limits)):
-            q = _waiting_match(older, front, waiting, room, x[u], z, u, slope, tau_z[u], length2, limits)
+            q = _waiting_match(older, front, waiting, ring_size, x[u], z, u, slope, tau_z[u], length2, limits)
             if q >= 0:
                 match = _extended(_load(older, q), x[u], z, u, k, y_factor)
                 _store(older, q, match)
@@ -138,24 +135,33 @@ def _scanline(
                 continue
             if newest.n > 0:
                 front, waiting, done = _push(
-                    newest, older, front, waiting, room, limits.sparse, segments, segments_int, done, finished_index
+                    newest,
+                    older,
+                    front,
+                    waiting,
+                    ring_size,
+                    limits.sparse,
+                    segments,
+                    segments_int,
+                    done,
+                    finished_index,
                 )
             started += 1
             newest = _fresh(u, k, started, x[u], z)
         run = _begun(runs, first_run, run, u, started)
         newest = _extended(newest, x[u], z, u, k, y_factor)
         u += 1
-        # Pixels that follow in the same depth bin; holes are in none.
-        while 0 <= u < depth.size:  # the index is not negative: no wrap-around to compile
-            near = _continues(newest, x[u], depth[u], slope, tau_z[u], limits)
-            if not (near & (depth[u] > low) & (depth[u] <= high) & (newest.w2 < length2)):
+        # Following pixels in the same depth bin; holes are in none.
+        while 0 <= u < depth.size:  # the compiler sees no negative index, and omits the wrap-around
+            continues = _continues(newest, x[u], depth[u], slope, tau_z[u], limits)
+            if not (continues & (depth[u] > low) & (depth[u] <= high) & (newest.w2 < length2)):
                 break
             newest = _extended(newest, x[u], depth[u], u, k, y_factor)
             u += 1
     if newest.n > 0:
         done = _finish(newest, limits.sparse, segments, segments_int, done, finished_index)
     for i in range(waiting):
-        q = front - i if front >= i else front - i + room
+        q = front - i if front >= i else front - i + ring_size
         done = _finish(_load(older, q), limits.sparse, segments, segments_int, done, finished_index)
     finished_index[0] = 0
     for i in range(first_run, run):
@@ -165,13 +171,13 @@ def _scanline(
 
 @leaf
 def _fresh(u, k, born, x, z):
-    """An open segment without pixels, anchored at the present one."""
+    """An open segment without pixels, anchored at the current pixel."""
     return _Open(ZERO, u, u, k, born, x, z, x, z, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @leaf
 def _begun(runs, first, run, u, owner):
-    """The end of the runs after pixel u of ``owner``, which begins one unless the run before is the owner's."""
+    """Begin a run at pixel u unless the last run has the same ``owner``; return the end of the runs."""
     if run > first and runs[run - 1, 1] == owner:
         return run
     runs[run, 0], runs[run, 1] = u, owner
@@ -179,12 +185,12 @@ def _begun(runs, first, run, u, owner):
 
 
 @leaf
-def _push(newest, older, front, waiting, room, sparse, segments, segments_int, done, finished_index):
-    """Let the newest open segment wait, and finish the oldest if there is no room."""
-    if room == 0:
+def _push(newest, older, front, waiting, ring_size, sparse, segments, segments_int, done, finished_index):
+    """Move the newest open segment to the ring, and finish the oldest if the ring is full."""
+    if ring_size == 0:
         return front, waiting, _finish(newest, sparse, segments, segments_int, done, finished_index)
-    front = front + 1 if front + 1 < room else 0
-    if waiting == room:  # the ring is full: the place after the front holds the oldest
+    front = front + 1 if front + 1 < ring_size else 0
+    if waiting == ring_size:  # the ring is full: the slot after the front holds the oldest
         oldest = _load(older, front)
         done = _finish(oldest, sparse, segments, segments_int, done, finished_index)
     else:
@@ -209,10 +215,10 @@ def _continues(o, x, z, slope, tau_z, limits):
 
 
 @leaf
-def _waiting_match(older, front, waiting, room, x, z, u, slope, tau_z, length2, limits):
+def _waiting_match(older, front, waiting, ring_size, x, z, u, slope, tau_z, length2, limits):
     """The newest of the waiting segments that the point continues, or -1."""
     for i in range(waiting):
-        q = front - i if front >= i else front - i + room
+        q = front - i if front >= i else front - i + ring_size
         if _fits(_load(older, q), x, z, u, slope, tau_z, length2, limits):
             return q
     return -1
@@ -245,7 +251,7 @@ def _load(older, q):
 
 @leaf
 def _finish(o, sparse, segments, segments_int, done, finished_index):
-    """Output an open segment unless it is too sparse; returns the new number of finished ones."""
+    """Output an open segment unless it is too sparse; return the number of finished segments."""
     if o.n <= sparse:
         finished_index[o.born] = 0
         return done

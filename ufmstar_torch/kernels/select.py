@@ -26,27 +26,28 @@ _LEAST_CAPABILITY = (8, 0)  # of an NVIDIA GPU that triton supports
 
 @runtime_checkable
 class LateStep(Protocol):
-    """A step that keeps something of a frame for the next one."""
+    """A step that defers a part of a frame's work to the next frame."""
 
     def settled(self, state: UfMStarState, config: UfMStarConfig, /) -> UfMStarState:
-        """The state that it returned last, with what it keeps."""
+        """Apply the deferred work to the state that the step returned last."""
         ...
 
 
 def select_step(name: str, device_type: str) -> Step:
-    """The step for a device. That of a GPU has a memory (``step_device``): one for every state.
+    """The step for a device. The step of a GPU has a memory (``step_device``): use one instance for each state.
 
     Args:
-        name: "torch": the reference on every device; it waits for the device only where the mixture may
-            have to grow. "numba": compiled for the CPU, CPU tensors only. "triton": for a GPU; of CPU tensors only in
-            Triton's interpreter (``TRITON_INTERPRET=1``). "auto": numba on the CPU, Triton on CUDA, ROCm and XPU, where
-            it can be imported; on another accelerator the torch reference, except that the segmentation, a long
-            chain of tiny steps there, runs on the host: the depth map is copied over, which waits for the device.
+        name: one of
+            "torch": the reference, on every device; synchronises only where the mixture may have to grow.
+            "numba": compiled for the CPU; CPU tensors only.
+            "triton": for a GPU; CPU tensors only in Triton's interpreter (``TRITON_INTERPRET=1``).
+            "auto": numba on the CPU; Triton on CUDA, ROCm and XPU if it can be imported; else the torch reference with
+            the segmentation, a long chain of tiny steps, on the host, which copies the depth map and synchronises.
         device_type: ``torch.device.type`` of the depth.
 
     Raises:
         ValueError: "numba" or "triton" for tensors of another device.
-        ImportError: "triton" by name where it cannot be imported.
+        ImportError: ``name`` is "triton", which cannot be imported.
     """
     if _compiled(name, device_type):
         from ufmstar_torch.kernels import step_cpu
@@ -73,7 +74,7 @@ def select_check(name: str, device_type: str) -> CheckKernel:
 
 
 def select_anchors(name: str, device_type: str) -> AnchorKernels:
-    """The parts of the evidence of anchors; arguments and errors as :func:`select_step`."""
+    """The kernels of the anchors' evidence; arguments and errors as :func:`select_step`."""
     if _compiled(name, device_type):
         from ufmstar_torch.kernels import anchors_cpu as fast
 
@@ -82,7 +83,7 @@ def select_anchors(name: str, device_type: str) -> AnchorKernels:
 
 
 def select_kernels(name: str, device_type: str) -> Kernels:
-    """The parts of the step where it is the reference's; arguments as :func:`select_step`."""
+    """The kernels of the reference step; arguments as :func:`select_step`."""
     if _on_gpu(name, device_type):
         return _triton()
     if name == "torch" or device_type in ("cpu", "meta"):
@@ -113,8 +114,8 @@ def _on_gpu(name: str, device_type: str) -> bool:
 
 
 def select_posterior(name: str, device_type: str) -> PosteriorUpdate:
-    """The posterior's update for a device; arguments and errors as :func:`select_step`. For tensors of an accelerator
-    it runs on the host."""
+    """The posterior's update for a device, on the host for an accelerator; arguments and errors as
+    :func:`select_step`."""
     compiled = _compiled(name, device_type)
     if not compiled and (name == "torch" or device_type in ("cpu", "meta")):
         return update_posterior
@@ -149,7 +150,7 @@ def _has_triton(device_type: str) -> bool:
 
 
 def compile_triangulation() -> None:
-    """Compile what triangulates tracked corners."""
+    """Compile the triangulation of tracked corners."""
     import numpy as np
 
     from ufmstar_torch.kernels.triangulate_cpu import triangulate

@@ -1,8 +1,8 @@
-"""One image through steps 2 to 5 on the CPU (numba): the whole step, a few compiled calls for a stage of a stream.
+"""Steps 2 to 5 of one image on the CPU (numba): a few compiled calls for each stage and stream.
 
-The reference is :func:`ufmstar_torch.step.step`. The pairs are a list, and what is out of view or unchanged is not
-computed again. Streams are independent and share the threads that torch may use: neither the number of streams nor that
-of threads changes a bit.
+The reference is :func:`ufmstar_torch.step.step`. The pairs are a list; components out of view and unchanged ones are
+not computed again. Streams are independent and share the threads that torch may use: neither the number of streams nor
+that of threads changes a bit.
 """
 
 from __future__ import annotations
@@ -51,16 +51,16 @@ class _Pairs(NamedTuple):
     k: NDArray[np.int64]
     overlap: NDArray[np.float64]
     new: NDArray[np.bool_]
-    found: int
+    segments: int
     matched: int
     created: int
     occupied: int
-    here: NDArray[np.float64]
+    fields: NDArray[np.float64]
 
 
 class _Joined(NamedTuple):
-    """The mixture after the fusion by field, and as the regression takes it; tensors of extensions by name; how many
-    components are new, and how many were dropped."""
+    """The mixture after the fusion by field, and in the form for the regression; tensors of extensions by name; the
+    numbers of new and of dropped components."""
 
     mixture: dict[str, Tensor]
     seen: list[Seen]
@@ -102,18 +102,18 @@ def step(
     result = extensions.after_regression(replace(result, features=result.features[..., :-1]))
     stage("regress")
 
-    smoothed, alpha, before = state.smoothed, config.ema_alpha if smooth else 1.0, disagreement
+    smoothed, alpha, previous = state.smoothed, config.ema_alpha if smooth else 1.0, disagreement
     if alpha < 1:
         smoothed = memory_for(smoothed, frame.size)
-        before = at_pixels(smoothed, pixels)
+        previous = at_pixels(smoothed, pixels)
     after, disagreement, unmeasured = fill_and_smooth(
-        disagreement, measured, at_pixels(frame.depth, pixels), before, config, alpha
+        disagreement, measured, at_pixels(frame.depth, pixels), previous, config, alpha
     )
     if alpha < 1:
         smoothed = with_pixels(smoothed, pixels, after)
     names = ("T_world_first", "started", "frames", "skipped")
-    followed = dict(zip(names, map(torch.from_numpy, cameras), strict=True))
-    updated = state.with_tensors({**joined.mixture, **joined.sums, **changed, **followed, "smoothed": smoothed})
+    stream_fields = dict(zip(names, map(torch.from_numpy, cameras), strict=True))
+    updated = state.with_tensors({**joined.mixture, **joined.sums, **changed, **stream_fields, "smoothed": smoothed})
     statistics = frame_statistics(frame, _counts(frame, pairs, joined, unmeasured))
     out = StepOutput(disagreement, result.features, measured, current_cam, statistics)
     stage("average")
@@ -123,8 +123,7 @@ def step(
 def _segment(
     frame: FrameInput, intrinsics: Floats, config: UfMStarConfig, stored: torch.dtype
 ) -> tuple[NDArray[Any], ...]:
-    """Step 2: the fields of C_i in the camera frame, float64, its covariances lifted to the floor that the reference
-    states."""
+    """Step 2: the fields of C_i in the camera frame, float64, with the covariances lifted to the reference's floor."""
     mixture, _ = gaussians(SegmentInput.of_frame(frame, config))
     segments = tuple(map(array, mixture.to(torch.float64).tensors().values()))
     epsilon = 8 * torch.finfo(stored).eps
@@ -136,9 +135,8 @@ def _segment(
 def _match(
     state: UfMStarState, frame: FrameInput, segments: Sequence[NDArray[Any]], config: UfMStarConfig
 ) -> tuple[tuple[NDArray[Any], ...], list[_Pairs]]:
-    """Step 3: of the state after the frame, camera-to-world of the first camera, started, frames and skipped; and what
-    each stream matches."""
-    fine, poses, cameras = array(frame.fault) == 0, array(frame.T_world_cam), array(frame.intrinsics)
+    """Step 3: the state's T_world_first, started, frames and skipped after the frame, and the pairs of each stream."""
+    valid, poses, cameras = array(frame.fault) == 0, array(frame.T_world_cam), array(frame.intrinsics)
     first_before, started, frames, skipped = map(
         array, (state.T_world_first, state.started, state.frames, state.skipped)
     )
@@ -147,14 +145,14 @@ def _match(
     thresholds = (config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE)
     calls = [
         (
-            (bool(fine[b]), poses[b], cameras[b]), bool(started[b]), first_before[b], first[b],
+            (bool(valid[b]), poses[b], cameras[b]), bool(started[b]), first_before[b], first[b],
             tuple(value[b] for value in mixture), tuple(value[b] for value in segments[:3]),
             frame.size, thresholds,
         )
-        for b in range(len(fine))
+        for b in range(len(valid))
     ]  # fmt: skip
-    after = first, started | fine, frames + fine, skipped + ~fine
-    return after, [_Pairs(*found) for found in each(match, calls)]
+    after = first, started | valid, frames + valid, skipped + ~valid
+    return after, [_Pairs(*pairs) for pairs in each(match, calls)]
 
 
 def _join(
@@ -166,7 +164,7 @@ def _join(
     config: UfMStarConfig,
     columns: int,
 ) -> _Joined:
-    """Step 4, and the mixture as the regression takes it, with room for ``columns`` of extensions; ``first`` is
+    """Step 4, and the mixture in the form for the regression, with ``columns`` for extensions; ``first`` is
     camera-to-world of the first cameras."""
     slots = tuple(array(getattr(state, name)) for name in _NAMES)
     needed = max(pair.occupied + pair.created for pair in pairs)
@@ -187,34 +185,34 @@ def _join(
     mixture = dict(zip(_NAMES, map(torch.from_numpy, updated), strict=True))
     seen = [Seen(*one) for one in each(join, calls)]
     sums = dict(state.by_component)
-    all_of_them = _Joined(mixture, seen, sums, [p.created for p in pairs], [0] * len(seen))
+    unlimited = _Joined(mixture, seen, sums, [p.created for p in pairs], [0] * len(seen))
     limit = config.max_components
     if limit is None or capacity <= limit:
-        return all_of_them
+        return unlimited
     position = relative_pose(frame.T_world_cam, torch.from_numpy(first))[1]
-    return _within_limit(all_of_them, [pair.occupied for pair in pairs], position, limit)
+    return _within_limit(unlimited, [pair.occupied for pair in pairs], position, limit)
 
 
 def _extended(value: NDArray[Any], capacity: int) -> NDArray[Any]:
-    """A copy of slots [B, K, ...] with empty ones behind them up to the capacity."""
+    """A copy of slots [B, K, ...], followed by empty ones up to the capacity."""
     out = np.empty((value.shape[0], capacity, *value.shape[2:]), value.dtype)
-    present = value.shape[1]
-    out[:, :present], out[:, present:] = value, 0
+    occupied = value.shape[1]
+    out[:, :occupied], out[:, occupied:] = value, 0
     return out
 
 
 def _within_limit(joined: _Joined, old: Sequence[int], position: Tensor, limit: int) -> _Joined:
-    """At most ``limit`` components and slots (:func:`ufmstar_torch.fuse.make_room`), of which the first ``old`` of each
-    stream were remembered before."""
+    """At most ``limit`` components and slots (:func:`ufmstar_torch.fuse.make_room`); the first ``old`` components of
+    each stream were in the mixture before."""
     before = torch.tensor(old)
     coming = torch.zeros_like(before)
     room = make_room(GaussianMixture(**joined.mixture), joined.sums, before, coming, position, limit)
     seen = []
     for one, source, components in zip(joined.seen, array(room.slot), room.mixture.components.tolist(), strict=True):
         retained = source[:components]
-        here = np.zeros((FIELDS, padded(components)))
-        here[:, :components] = one.components[:, retained]
-        seen.append(Seen(here, one.disagreement[retained], one.features[retained]))
+        by_field = np.zeros((FIELDS, padded(components)))
+        by_field[:, :components] = one.components[:, retained]
+        seen.append(Seen(by_field, one.disagreement[retained], one.features[retained]))
     return _Joined(
         {name: value[:, :limit].contiguous() for name, value in room.mixture.tensors().items()},
         seen,
@@ -228,13 +226,13 @@ def _columns(
     state: UfMStarState, joined: _Joined, frame: FrameInput, extensions: FrameExtensions, config: UfMStarConfig,
     first: Tensor,
 ) -> tuple[dict[str, Tensor], list[View] | None, NDArray[np.float64] | None]:  # fmt: skip
-    """Write the columns of extensions to the features before the last. Returns the tensors of the state that change;
-    what is in view, and what the regression is to add to the columns, where an extension works on what is in view."""
+    """Write the columns of extensions to the features before the last. Returns the changed tensors of the state; and,
+    if an extension works on the components in view, the views and the shift that the regression adds to the columns."""
     capacity, tensors = joined.mixture["weight"].shape[1], {**state.by_stream, **joined.sums}
     if config.regression == "exact":
         views = views_of(joined.seen, frame.depth, frame.intrinsics, config, state.covariance.dtype)
-        if (found := extensions.in_view(tensors, capacity, joined.seen, views)) is not None:
-            return found[0], views, array(found[1])
+        if (result := extensions.in_view(tensors, capacity, joined.seen, views)) is not None:
+            return result[0], views, array(result[1])
     mixture = GaussianMixture(**joined.mixture).to(torch.float64)
     mixture_cam = mixture.rigid(*relative_pose(first, frame.T_world_cam))
     changed, with_columns = extensions.before_regression(tensors, mixture_cam, distribute)
@@ -245,10 +243,10 @@ def _columns(
 
 
 def _distance(b: int, pair: _Pairs, segments: Sequence[Floats], config: UfMStarConfig) -> NDArray[np.float64]:
-    """The disagreement [P] of the pairs of a stream where the step does not take W2^2, else [0]."""
+    """The overlap disagreement [P] of the pairs of a stream, or [0] where the step uses W2^2."""
     if config.disagreement != "overlap":
         return np.empty(0)
-    mean, covariance = pair.here[:COVARIANCE, pair.k].T, pair.here[COVARIANCE:WEIGHT, pair.k].T.reshape(-1, 3, 3)
+    mean, covariance = pair.fields[:COVARIANCE, pair.k].T, pair.fields[COVARIANCE:WEIGHT, pair.k].T.reshape(-1, 3, 3)
     both = segments[0][b][pair.c], segments[1][b][pair.c], mean, covariance
     return overlap_disagreement(*map(torch.from_numpy, both)).numpy()
 
@@ -259,14 +257,14 @@ def _counts(
     """Count the step's statistics [B]; ``unmeasured`` holds the pixels that no two views compare."""
     totals = np.zeros((len(_COUNTS), len(pairs)), np.int64)
     valid, seen_in = array(frame.valid), array(joined.mixture["count"])
-    for b, (pair, one, new, gone) in enumerate(zip(pairs, joined.seen, joined.new, joined.dropped, strict=True)):
+    for b, (pair, one, new, removed) in enumerate(zip(pairs, joined.seen, joined.new, joined.dropped, strict=True)):
         totals[:, b] = (
             len(one.disagreement),
-            pair.found,
+            pair.segments,
             pair.matched,
             pair.c.size,
             new,
-            gone + pair.found - pair.matched - new,  # too many, or too near
+            removed + pair.segments - pair.matched - new,  # too many, or too near
             np.count_nonzero(valid[b]),
             unmeasured[b],
             np.count_nonzero(seen_in[b] == 1),

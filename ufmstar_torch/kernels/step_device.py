@@ -1,15 +1,15 @@
-"""A step on a GPU in about ten launches that waits for nothing.
+"""A step on a GPU in about ten launches, without synchronisation.
 
-The mixture has a fixed number of slots. What a frame adds is counted on the device, and the counts are copied to the
-host behind the frame's last change of the mixture. The host reads them when the next frame comes, so it waits only
-where it is more than a frame ahead of the device. Where slots ran short, it then doubles them and appends what had
-found none, before anything else: the next frame matches what it would have matched had the mixture grown in time, and
-only the map of the frame before was regressed without it. Growth starts before the last slot is taken, so that this is
-rare.
+The mixture has a fixed number of slots. The device counts the components that a frame adds, and copies the counts to
+the host after the frame's last change of the mixture. The host reads them at the next frame, so that it waits only if
+it is more than a frame ahead of the device. If slots ran short, the host then doubles them and appends the components
+without a slot, before anything else: the next frame matches the same components as if the mixture had grown in time,
+and only the map of the frame before was regressed without them. Growth starts before the slots are full, so that this
+is rare.
 
-What the paper's step does not have (columns of extensions, a subset of pixels, ``config.disagreement == "overlap"``,
-``config.overlap_weighted``, the neighbourhood) runs as ``step.step`` with the GPU's kernels. It grows one frame ahead
-instead: to slots for all that a frame can segment, so that it reads nothing but the count of the frame before.
+Features outside the paper's step (columns of extensions, a subset of pixels, ``config.disagreement == "overlap"``,
+``config.overlap_weighted``, the neighbourhood) run as ``step.step`` with the GPU's kernels. The mixture then grows one
+frame ahead, to slots for all that a frame can segment, so that the host reads only the count of the frame before.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from ufmstar_torch.kernels.triton.regress import regress_frame
 from ufmstar_torch.kernels.triton.segment import Floor, fit
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import FrameStatistics, StepOutput
-from ufmstar_torch.segment import most_kept
+from ufmstar_torch.segment import max_gaussians
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.step import step
 from ufmstar_torch.step_parts import Kernels, StepObserver
 
-_ROOM = 4 / 3  # slots for each that is needed, below which the mixture grows ahead of need
+_ROOM = 4 / 3  # slots for each needed slot, below which the mixture grows
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Rest:
     Attributes:
         current: C_i in the camera frame, [B, C].
         to_first: R and t into the mixture's frame.
-        left: [B, C] bool, which of them.
+        left: [B, C] bool, the Gaussians without a slot.
     """
 
     current: GaussianMixture
@@ -60,9 +60,9 @@ class Waiting:
     """A frame whose counts the host has not read yet.
 
     Attributes:
-        needed: [B] integers on the host, slots that would hold everything, once ``copied``.
-        copied: the end of the copy; None on the CPU.
-        rest: what found no slot; None where everything did.
+        needed: [B] integers on the host, slots for all components; valid after ``copied``.
+        copied: event at the end of the copy; None on the CPU.
+        rest: the Gaussians without a slot; None if the mixture has slots for all.
     """
 
     needed: Tensor
@@ -81,26 +81,26 @@ class Waiting:
         return cls(on_host, copied, rest)
 
     def slots(self) -> int:
-        """The slots that the fullest stream needs; waits until they are known."""
+        """The slots that the fullest stream needs; waits for the copy."""
         if self.copied is not None:
             self.copied.synchronize()
         return int(self.needed.max())
 
 
 class DeviceStep:
-    """:class:`ufmstar_torch.step.Step` with the memory that late growth needs.
+    """:class:`ufmstar_torch.step.Step` with deferred growth of the mixture.
 
-    The memory belongs to the state that was returned last. A caller that takes this state elsewhere (to save it, say)
-    asks :meth:`settled` for it first; another state makes the step forget what was waiting.
+    The pending components belong to the state that was returned last. Call :meth:`settled` before this state is saved,
+    copied or moved. A call with another state discards them.
 
     Args:
-        kernels: for what is not run here.
+        kernels: for the configurations that :func:`device_step` does not support.
     """
 
     def __init__(self, kernels: Kernels) -> None:
         self._kernels = kernels
         self._waiting: Waiting | None = None
-        self._of: Tensor | None = None
+        self._last_mean: Tensor | None = None
         self._lost: Tensor | None = None
 
     def __call__(
@@ -116,7 +116,7 @@ class DeviceStep:
     ) -> tuple[UfMStarState, StepOutput]:
         plain = config.disagreement == "w2" and config.regression == "exact"
         if extensions.columns or config.overlap_weighted or not plain or pixels is not None or observer is not None:
-            state = self._with_room(state, config, ahead=most_kept(SegmentInput.of_frame(frame, config)))
+            state = self._with_room(state, config, ahead=max_gaussians(SegmentInput.of_frame(frame, config)))
             updated, out = step(
                 state, frame, config, pixels=pixels, smooth=smooth, extensions=extensions, observer=observer,
                 kernels=self._kernels, grow=False,
@@ -128,37 +128,37 @@ class DeviceStep:
         if self._lost is not None:
             dropped = out.statistics.dropped + self._lost
             out = replace(out, statistics=replace(out.statistics, dropped=dropped))
-        self._waiting, self._of, self._lost = waiting, updated.mean, None
+        self._waiting, self._last_mean, self._lost = waiting, updated.mean, None
         return self.settled(updated, config) if extensions.changes_mixture else updated, out
 
     def settled(self, state: UfMStarState, config: UfMStarConfig) -> UfMStarState:
-        """The state with everything appended that was waiting; waits for the device."""
+        """Append the pending components to the state; synchronises with the device."""
         state = self._with_room(state, config, ahead=0)
-        self._waiting, self._of = None, state.mean
+        self._waiting, self._last_mean = None, state.mean
         return state
 
     def _with_room(self, state: UfMStarState, config: UfMStarConfig, ahead: int | None = None) -> UfMStarState:
-        """The state with what was waiting for a slot, and with slots for the next frame.
+        """The state with the pending components appended, and with slots for the next frame.
 
-        It is still waiting afterwards: a step that raises loses nothing. What finds no slot even so, because of
-        ``config.max_components``, counts as dropped by the next frame.
+        The components stay pending, so that a step that raises loses nothing. Components without a slot because of
+        ``config.max_components`` count as dropped by the next frame.
 
         Args:
             state: the step's argument.
             config: of UfM*.
-            ahead: slots that are free afterwards, as far as the limit allows; None = a third of those in use.
+            ahead: number of free slots afterwards, up to the limit; None = a third of the slots in use.
         """
-        if state.mean is not self._of:
+        if state.mean is not self._last_mean:
             self._waiting = self._lost = None
         mixture, waiting = state.mixture, self._waiting
         if waiting is None:
             if not ahead or _full(mixture.capacity, config):
                 return state
-            needed = int(mixture.components.max())  # a state from elsewhere: the one read
+            needed = int(mixture.components.max())  # another state: the only read from the device
         else:
             needed = waiting.slots()
-        room = int(needed * _ROOM) if ahead is None else needed + ahead
-        grown = mixture.grown(room, config.max_components)
+        wanted = int(needed * _ROOM) if ahead is None else needed + ahead
+        grown = mixture.grown(wanted, config.max_components)
         if waiting is not None and waiting.rest is not None and needed > mixture.capacity:
             rest = waiting.rest
             lost, _ = append(
@@ -175,37 +175,37 @@ def device_step(
     """One image through steps 2 to 5 with the slots that the state has; see :func:`ufmstar_torch.step.step`.
 
     Returns:
-        The new state, the output, and what may be waiting for slots; None where the mixture cannot grow.
+        The new state, the output, and the counts with the pending components; None where the mixture cannot grow.
     """
     b = frame.depth.shape[0]
     stored = state.covariance.dtype
     eps = 8 * torch.finfo(stored).eps
     inputs = SegmentInput.of_frame(frame, config)
     current, _ = fit(inputs, floor=Floor(config.near_plane, eps))
-    here = cameras(state, frame)
+    poses = cameras(state, frame)
     camera = frame.intrinsics.contiguous()
-    previous, new = candidates(state.mixture, here.to_camera, current, camera, frame.size, config)
+    previous, new = candidates(state.mixture, poses.to_camera, current, camera, frame.size, config)
     counts = torch.zeros(ends.COUNTS, b, dtype=torch.int64, device=frame.depth.device)
     bits, matched = match_bits(previous, new, config, counts[ends.PAIRS])
-    mixture = fuse_bits(state.mixture, current, here.to_first, (bits, new.index, previous.position, new.count), config)
-    full, gone = _full(mixture.capacity, config), torch.zeros_like(frame.fault)
+    mixture = fuse_bits(state.mixture, current, poses.to_first, (bits, new.index, previous.position, new.count), config)
+    full, removed = _full(mixture.capacity, config), torch.zeros_like(frame.fault)
     if full and config.max_components is not None:
         coming = (current.valid & (current.mean[..., 2] > config.near_plane) & ~matched).sum(1)
-        position = here.to_first[1]
+        position = poses.to_first[1]
         room = make_room(mixture, {}, mixture.components, coming, position, config.max_components)
-        mixture, gone = room.mixture, room.dropped
+        mixture, removed = room.mixture, room.dropped
     left, needed = append(
-        mixture, current, here.to_first, matched, counts, near_plane=config.near_plane, again=False, last=full
+        mixture, current, poses.to_first, matched, counts, near_plane=config.near_plane, again=False, last=full
     )
-    waiting = None if full else Waiting.after(needed, Rest(current, here.to_first, left))
-    result = regress_frame(mixture, here.to_camera, frame, state.smoothed, config, counts, smooth=smooth)
+    waiting = None if full else Waiting.after(needed, Rest(current, poses.to_first, left))
+    result = regress_frame(mixture, poses.to_camera, frame, state.smoothed, config, counts, smooth=smooth)
     statistics = FrameStatistics(
         components=counts[ends.COMPONENTS],
         segments=counts[ends.SEGMENTS],
         matched=counts[ends.MATCHED],
         pairs=counts[ends.PAIRS],
         new=counts[ends.NEW],
-        dropped=counts[ends.DROPPED] + gone,
+        dropped=counts[ends.DROPPED] + removed,
         valid_pixels=counts[ends.VALID],
         beyond=frame.beyond,
         out_of_range=frame.out_of_range,
@@ -215,8 +215,8 @@ def device_step(
         rotation_deviation=frame.rotation_deviation,
     )
     updated = state.with_tensors({
-        **mixture.tensors(), "T_world_first": here.first, "started": here.started, "frames": here.frames,
-        "skipped": here.skipped, "smoothed": result.memory,
+        **mixture.tensors(), "T_world_first": poses.first, "started": poses.started, "frames": poses.frames,
+        "skipped": poses.skipped, "smoothed": result.memory,
     })  # fmt: skip
     out = StepOutput(result.disagreement, result.features, result.measured, current, statistics)
     return updated, out, waiting

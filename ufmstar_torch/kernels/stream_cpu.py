@@ -1,4 +1,4 @@
-"""The stages of a step between segmentation and regression, of one stream, as one compiled call each (numba)."""
+"""The stages between segmentation and regression for one stream, one compiled call each (numba)."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from ufmstar_torch.kernels.rigid_cpu import FIELDS, gather, padded, relative, sc
 
 @kernel
 def match(camera, started, first_before, first, mixture, segments, size, thresholds):
-    """Step 3 of a stream: M_(i-1) [K] in the camera frame, and its pairs with C_i [C].
+    """Step 3 for one stream: transform M_(i-1) [K] into the camera frame and match it with C_i [C].
 
     Args:
-        camera: whether the frame has no fault, camera-to-world [4, 4] and intrinsics [3, 3].
+        camera: True for a frame without fault, camera-to-world [4, 4] and intrinsics [3, 3].
         started: whether the stream has had a frame.
         first_before, first: camera-to-world [4, 4] of the first camera; the latter is written.
         mixture, segments: mean, covariance and weight.
@@ -23,55 +23,55 @@ def match(camera, started, first_before, first, mixture, segments, size, thresho
         thresholds: of :func:`matches`: eta, eta_occl, near plane, widening.
 
     Returns:
-        The pairs c [P], k [P] and their overlap [P]; which segments are new [C]; how many segments there are, how many
-        of them are matched, how many new; the n occupied slots, which are the first ones; and these by field
-        [13, n and more].
+        The pairs c [P], k [P] and their overlap [P]; the mask of new segments [C]; the numbers of segments, of matched
+        and of new ones; the number n of occupied slots, which are the first ones; and the occupied slots by field
+        [13, n and more] in the camera frame.
     """
-    fine, present, K = camera
+    valid, pose, K = camera
     mean, covariance, weight = mixture
     mean_c, cov_c, weight_c = segments
     for i in range(4):
         for j in range(4):
-            first[i, j] = present[i, j] if fine and not started else first_before[i, j]
+            first[i, j] = pose[i, j] if valid and not started else first_before[i, j]
     motion, n = empty((3, 4), np.float64), 0
-    relative(first, present, motion)
+    relative(first, pose, motion)
     while n < weight.size and weight[n] > 0:
         n += 1
-    here = empty((FIELDS, padded(n)), np.float64)
-    segments_here = empty((FIELDS, padded(weight_c.size)), np.float64)
-    gather(n, mean, covariance, weight, here)
-    turn(motion, here.shape[1], here.shape[1], here)
-    gather(weight_c.size, mean_c, cov_c, weight_c, segments_here)
-    c, k, overlap = matches(here, n, segments_here, weight_c.size, K, size[0], size[1], thresholds)
-    new, found, matched, created = empty(weight_c.size, np.bool_), 0, 0, 0
+    components = empty((FIELDS, padded(n)), np.float64)
+    segment_fields = empty((FIELDS, padded(weight_c.size)), np.float64)
+    gather(n, mean, covariance, weight, components)
+    turn(motion, components.shape[1], components.shape[1], components)
+    gather(weight_c.size, mean_c, cov_c, weight_c, segment_fields)
+    c, k, overlap = matches(components, n, segment_fields, weight_c.size, K, size[0], size[1], thresholds)
+    new, count, matched, created = empty(weight_c.size, np.bool_), 0, 0, 0
     for i in range(new.size):
         new[i] = True
     for i in range(c.size):
         new[c[i]] = False
     for i in range(new.size):
-        found += weight_c[i] > 0
+        count += weight_c[i] > 0
         matched += not new[i]
         # A Gaussian nearer than the near plane could never be matched again: it is not appended.
         new[i] = new[i] and weight_c[i] > 0 and mean_c[i, 2] > thresholds[2]
         created += new[i]
-    return c, k, overlap, new, found, matched, created, n, here
+    return c, k, overlap, new, count, matched, created, n, components
 
 
 @kernel
-def join(present, first, slots, segments, pairs, distance, new, occupied, settings, extra):
-    """Step 4 of a stream: the mixture with the pairs fused and what is new appended, and all of it as the
-    regression takes it, in the camera frame.
+def join(pose, first, slots, segments, pairs, distance, new, occupied, settings, extra):
+    """Step 4 for one stream: fuse the pairs, append the new components, and transform the mixture into the camera frame
+    for the regression.
 
     Args:
-        present, first: camera-to-world [4, 4].
+        pose, first: camera-to-world [4, 4] of this frame and of the first.
         slots: mean, covariance, weight, disagreement, count and features [K, ...] of the mixture; changed.
         segments: mean, covariance, weight and features [C, ...] of C_i.
         pairs: c, k and overlap [P].
         distance: as :func:`fuse_pairs`.
         new: [C] which segments to append, from slot ``occupied`` on.
         settings: ``weighted`` and ``epsilon`` as :func:`fuse_pairs`.
-        extra: features of the regression behind the mixture's own. The last one is that of
-            ``unmeasured.before_regression``, the others are unset.
+        extra: number of columns after the mixture's features. The last one is the feature of
+            ``unmeasured.before_regression``; the others are not written.
 
     Returns:
         The n components by field [13, n and more], their disagreement [n] and features [n, F] for the regression.
@@ -81,7 +81,7 @@ def join(present, first, slots, segments, pairs, distance, new, occupied, settin
     c, k, overlap = pairs
     work, motion = empty(WORK, np.float64), empty((3, 4), np.float64)
     moved, turned = empty(mean_c.shape, np.float64), empty(cov_c.shape, np.float64)
-    relative(present, first, motion)
+    relative(pose, first, motion)
     by_field = empty((FIELDS, padded(weight_c.size)), np.float64)
     gather(weight_c.size, mean_c, cov_c, weight_c, by_field)
     turn(motion, by_field.shape[1], by_field.shape[1], by_field)
@@ -93,14 +93,14 @@ def join(present, first, slots, segments, pairs, distance, new, occupied, settin
     n = append(
         mean, covariance, weight, disagreement, count, features, moved, turned, weight_c, features_c, new, occupied
     )
-    here = empty((FIELDS, padded(n)), np.float64)
-    gather(n, mean, covariance, weight, here)
-    relative(first, present, motion)
-    turn(motion, here.shape[1], here.shape[1], here)
-    m, more = empty(n, np.float64), empty((n, features.shape[1] + extra), np.float64)
+    components = empty((FIELDS, padded(n)), np.float64)
+    gather(n, mean, covariance, weight, components)
+    relative(first, pose, motion)
+    turn(motion, components.shape[1], components.shape[1], components)
+    m, columns = empty(n, np.float64), empty((n, features.shape[1] + extra), np.float64)
     for i in range(n):
         m[i] = disagreement[i]
         for f in range(features.shape[1]):
-            more[i, f] = features[i, f]
-        more[i, more.shape[1] - 1] = 1.0 if count[i] > 1 else 0.0
-    return here, m, more
+            columns[i, f] = features[i, f]
+        columns[i, columns.shape[1] - 1] = 1.0 if count[i] > 1 else 0.0
+    return components, m, columns

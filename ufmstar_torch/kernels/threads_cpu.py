@@ -1,7 +1,7 @@
-"""Compiled code that releases the GIL, on several threads at a time.
+"""Runs compiled code, which releases the GIL, on several threads.
 
-Threads of our own and not numba's parallel loops: those start OpenMP, which puts torch's number of threads back to all
-cores. They are kept from call to call.
+numba's parallel loops start OpenMP, which resets torch's number of threads to all cores. This module uses a thread pool
+instead, which lasts from call to call.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ def each(function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> 
     threads = min(torch.get_num_threads(), len(arguments))
     if threads <= 1:
         return [function(*one) for one in arguments]
-    # The calls are independent: which thread takes which changes no result. The last one is this thread's own.
+    # The calls are independent: their distribution over threads changes no result. This thread has the last share.
     pool = _pool(os.getpid(), threads - 1)
-    here = range(threads - 1, len(arguments), threads)
-    others = {i: pool.submit(function, *arguments[i]) for i in range(len(arguments)) if i not in here}
-    results = {i: function(*arguments[i]) for i in here} | {i: other.result() for i, other in others.items()}
+    local = range(threads - 1, len(arguments), threads)
+    others = {i: pool.submit(function, *arguments[i]) for i in range(len(arguments)) if i not in local}
+    results = {i: function(*arguments[i]) for i in local} | {i: other.result() for i, other in others.items()}
     return [results[i] for i in range(len(arguments))]
 
 
 def shares_of_stream(streams: int, pixels: int) -> int:
-    """Into how many parts to divide the work on each of ``streams`` images of so many pixels."""
+    """Number of parts of the work on each of ``streams`` images with so many ``pixels``."""
     return max(1, min(-(-torch.get_num_threads() // streams), pixels // _SHARE))
 
 
 @functools.lru_cache(maxsize=2)
 def _pool(process: int, threads: int) -> ThreadPoolExecutor:
-    """The kept threads of a process; a forked one has none of its parent's."""
+    """The threads of a process, by its id: a forked process has none of its parent's threads."""
     return ThreadPoolExecutor(threads, thread_name_prefix="ufmstar")

@@ -1,4 +1,4 @@
-"""Points from tracks seen by posed cameras: position, depth, its variance, and whether to believe them.
+"""Points from tracks in several posed views: position, covariance, reprojection error, and the test of their depth.
 
 On the CPU (numba), float64, some tracks at a time, each in a lane of the processor's vectors. The start is the point
 nearest to all rays; a few Gauss-Newton steps on the reprojection error follow, whose normal matrix is the information
@@ -22,8 +22,7 @@ STEPS = 3
 DAMPING = 1e-12
 
 
-# NumPy's error model: no test for zero before every division, and hopeless geometry gives no exception but a covariance
-# that is not finite.
+# NumPy's error model: divisions are not tested for zero, and degenerate geometry gives a covariance that is not finite.
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +49,7 @@ def triangulate(
 
     Args:
         pixel: [N, W, 2] positions (u, v) [px].
-        seen: [N, W] which of them hold; at least two of each track.
+        seen: [N, W] mask of valid positions; at least two of each track.
         T_world_cam: [W, 4, 4] poses of the views.
         K: [3, 3] [px].
     """
@@ -61,9 +60,9 @@ def triangulate(
     centre, rotation = T_world_cam[:, :3, 3] - origin, T_world_cam[:, :3, :3]
     scale = np.diag([0.0, 0.0, 1.0])
     scale[:2, :2] = K[:2, :2]
-    into = np.ascontiguousarray(scale @ rotation.transpose(0, 2, 1))
-    out_of = np.ascontiguousarray(rotation @ np.linalg.inv(scale))
-    _tracks(pixel - K[:2, 2], seen, into, out_of, centre, DAMPING, STEPS, point, covariance, error, ahead)
+    to_image = np.ascontiguousarray(scale @ rotation.transpose(0, 2, 1))
+    to_ray = np.ascontiguousarray(rotation @ np.linalg.inv(scale))
+    _tracks(pixel - K[:2, 2], seen, to_image, to_ray, centre, DAMPING, STEPS, point, covariance, error, ahead)
     return Triangulated(point + origin, covariance, error, ahead)
 
 
@@ -74,23 +73,19 @@ _X, _Y, _Z, _N00, _N01, _N02, _N11, _N12, _N22, _R0, _R1, _R2, _SQUARES, _FRONT 
 
 
 @kernel
-def _tracks(pixel, seen, into, out_of, centre, damping, steps, point, covariance, error, ahead):
-    """Pixels [N, W, 2] are counted from the principal point. ``into`` [W, 3, 3] takes an offset from a camera to
-    (u z, v z, z) in its image, ``out_of`` [W, 3, 3] a pixel (u, v, 1) to the direction of its ray."""
+def _tracks(pixel, seen, to_image, to_ray, centre, damping, steps, point, covariance, error, ahead):
+    """Pixels [N, W, 2] are counted from the principal point. ``to_image`` [W, 3, 3] takes an offset from a camera to
+    (u z, v z, z) in its image, ``to_ray`` [W, 3, 3] a pixel (u, v, 1) to the direction of its ray."""
     views = seen.shape[1]
-    seen_at, work, inverse = np.empty((views, 3 * _LANES)), np.empty(14 * _LANES), np.empty((3, 3))
+    obs, work, inverse = np.empty((views, 3 * _LANES)), np.empty(14 * _LANES), np.empty((3, 3))
     for first in range(0, seen.shape[0], _LANES):
         count = min(_LANES, seen.shape[0] - first)
         for w in range(views):
             for lane in range(_LANES):
                 n = first + min(lane, count - 1)
                 u, v = (pixel[n, w, 0], pixel[n, w, 1]) if seen[n, w] else (0.0, 0.0)
-                seen_at[w, lane], seen_at[w, _LANES + lane], seen_at[w, 2 * _LANES + lane] = (
-                    u,
-                    v,
-                    1.0 if seen[n, w] else 0.0,
-                )
-        _nearest(seen_at, out_of, centre, work)
+                obs[w, lane], obs[w, _LANES + lane], obs[w, 2 * _LANES + lane] = u, v, 1.0 if seen[n, w] else 0.0
+        _nearest(obs, to_ray, centre, work)
         for step in range(steps + 1):
             for lane in range(count):
                 _inverse(work, lane, damping, inverse)
@@ -102,7 +97,7 @@ def _tracks(pixel, seen, into, out_of, centre, damping, steps, point, covariance
             for lane in range(count, _LANES):
                 for i in range(3):
                     work[i * _LANES + lane] = work[i * _LANES + count - 1]
-            _linearised(seen_at, into, centre, work)
+            _linearised(obs, to_image, centre, work)
         for lane in range(count):
             n, shown = first + lane, 0
             for w in range(views):
@@ -115,17 +110,17 @@ def _tracks(pixel, seen, into, out_of, centre, damping, steps, point, covariance
 
 
 @part
-def _nearest(seen_at, out_of, centre, work):
+def _nearest(obs, to_ray, centre, work):
     """Normal equations of the points nearest to all rays."""
     for i in range(_N00, work.size):
         work[i] = 0.0
-    for w in range(seen_at.shape[0]):
-        m00, m01, m02 = out_of[w, 0, 0], out_of[w, 0, 1], out_of[w, 0, 2]
-        m10, m11, m12 = out_of[w, 1, 0], out_of[w, 1, 1], out_of[w, 1, 2]
-        m20, m21, m22 = out_of[w, 2, 0], out_of[w, 2, 1], out_of[w, 2, 2]
+    for w in range(obs.shape[0]):
+        m00, m01, m02 = to_ray[w, 0, 0], to_ray[w, 0, 1], to_ray[w, 0, 2]
+        m10, m11, m12 = to_ray[w, 1, 0], to_ray[w, 1, 1], to_ray[w, 1, 2]
+        m20, m21, m22 = to_ray[w, 2, 0], to_ray[w, 2, 1], to_ray[w, 2, 2]
         c0, c1, c2 = centre[w, 0], centre[w, 1], centre[w, 2]
         for i in range(_LANES):
-            u, v, seen = seen_at[w, i], seen_at[w, _LANES + i], seen_at[w, 2 * _LANES + i]
+            u, v, seen = obs[w, i], obs[w, _LANES + i], obs[w, 2 * _LANES + i]
             x, y, z = m00 * u + m01 * v + m02, m10 * u + m11 * v + m12, m20 * u + m21 * v + m22
             share = seen / (x * x + y * y + z * z)
             a00, a01, a02 = seen - share * x * x, -share * x * y, -share * x * z
@@ -142,23 +137,23 @@ def _nearest(seen_at, out_of, centre, work):
 
 
 @part
-def _linearised(seen_at, into, centre, work):
+def _linearised(obs, to_image, centre, work):
     """Normal equations of a Gauss-Newton step from the points; the sums of squared residuals [px^2], and whether the
     points lie in front of all views."""
     for i in range(_N00, work.size):
         work[i] = 1.0 if i >= _FRONT else 0.0
-    for w in range(seen_at.shape[0]):
-        p00, p01, p02 = into[w, 0, 0], into[w, 0, 1], into[w, 0, 2]
-        p10, p11, p12 = into[w, 1, 0], into[w, 1, 1], into[w, 1, 2]
-        p20, p21, p22 = into[w, 2, 0], into[w, 2, 1], into[w, 2, 2]
+    for w in range(obs.shape[0]):
+        p00, p01, p02 = to_image[w, 0, 0], to_image[w, 0, 1], to_image[w, 0, 2]
+        p10, p11, p12 = to_image[w, 1, 0], to_image[w, 1, 1], to_image[w, 1, 2]
+        p20, p21, p22 = to_image[w, 2, 0], to_image[w, 2, 1], to_image[w, 2, 2]
         c0, c1, c2 = centre[w, 0], centre[w, 1], centre[w, 2]
         for i in range(_LANES):
-            x, y, z, seen = work[_X + i] - c0, work[_Y + i] - c1, work[_Z + i] - c2, seen_at[w, 2 * _LANES + i]
+            x, y, z, seen = work[_X + i] - c0, work[_Y + i] - c1, work[_Z + i] - c2, obs[w, 2 * _LANES + i]
             depth = p20 * x + p21 * y + p22 * z
             work[_FRONT + i] = work[_FRONT + i] if depth > 0 or seen == 0 else 0.0
             over = 1 / depth if abs(depth) > 1e-9 else 1e9
             u, v = (p00 * x + p01 * y + p02 * z) * over, (p10 * x + p11 * y + p12 * z) * over
-            du, dv, over = seen * (u - seen_at[w, i]), seen * (v - seen_at[w, _LANES + i]), seen * over
+            du, dv, over = seen * (u - obs[w, i]), seen * (v - obs[w, _LANES + i]), seen * over
             a0, a1, a2 = (p00 - u * p20) * over, (p01 - u * p21) * over, (p02 - u * p22) * over
             b0, b1, b2 = (p10 - v * p20) * over, (p11 - v * p21) * over, (p12 - v * p22) * over
             work[_SQUARES + i] += du * du + dv * dv

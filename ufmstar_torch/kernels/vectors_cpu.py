@@ -1,8 +1,7 @@
-"""Vector instructions stated one by one, for compiled code where loops in Python's syntax are not enough (numba, LLVM).
+"""Explicit vector instructions for compiled code (numba, LLVM), where LLVM does not vectorise Python's loops well.
 
-LLVM keeps the sums of nested loops in memory, takes half of a vector where whole ones are as fast, and reduces one
-number after the other. Here vectors of 64 bytes are written down as expressions. A processor with shorter ones takes
-several for one.
+In nested loops, LLVM keeps sums in memory, uses half of a vector where whole ones are as fast, and reduces one number
+after the other. Here expressions work on vectors of 64 bytes. A processor with shorter vectors uses several for one.
 """
 
 from __future__ import annotations
@@ -24,10 +23,9 @@ _INDEX = ir.IntType(64)
 
 
 class Lanes:
-    """A vector of numbers, or of truth values, with the operators of its code.
+    """A vector of numbers or of truth values, with arithmetic operators.
 
-    A product and a sum become one instruction where the processor has it, one rounding less, where ``flags``
-    allow it.
+    If ``flags`` allow it, a product and a sum become one instruction where the processor has it: one rounding less.
     """
 
     def __init__(self, builder: Any, value: Any, flags: tuple[str, ...]) -> None:
@@ -57,11 +55,11 @@ class Lanes:
         return self._new(self._builder.select(self.value, yes.value, yes._other(no)))
 
     def at_least(self, other: Lanes | float) -> Lanes:
-        """The greater one; ``other`` for NaN."""
+        """Maximum; ``other`` for NaN."""
         return (self > other).select(self, other)
 
     def at_most(self, other: Lanes) -> Lanes:
-        """The less one; ``self`` for NaN."""
+        """Minimum; ``self`` for NaN."""
         return (self > other).select(other, self)
 
     def size(self) -> Lanes:
@@ -73,17 +71,17 @@ class Lanes:
         return self._new(self._builder.fdiv(self.value, by.value))
 
     def everywhere(self, choose: Callable[[Lanes, Lanes], Lanes]) -> Lanes:
-        """The least or greatest number (``Lanes.at_most``, ``Lanes.at_least``) in all places."""
+        """The reduction of all numbers by ``choose``, such as ``Lanes.at_most``, in every lane."""
         value, n = self, self.value.type.count
         while (n := n // 2) > 0:
             count = self.value.type.count
-            turned = ir.Constant(ir.VectorType(ir.IntType(32), count), [(i + n) % count for i in range(count)])
-            value = choose(value, self._new(self._builder.shuffle_vector(value.value, value.value, turned)))
+            rotated = ir.Constant(ir.VectorType(ir.IntType(32), count), [(i + n) % count for i in range(count)])
+            value = choose(value, self._new(self._builder.shuffle_vector(value.value, value.value, rotated)))
         return value
 
     def exp2(self) -> Lanes:
-        """2^t for t < 127, and 2^-120 (doubles: 2^-1000) below: products with numbers too small for normal floats take
-        a hundred times as long.
+        """2^t for t < 127, and at least 2^-120 (doubles: 2^-1000): products with subnormal numbers take a hundred times
+        as long.
 
         2^n 2^r with |r| <= 1/2 and the polynomial that interpolates 2^r at Chebyshev's nodes, off by 3e-7 (3e-15) of it
         with all rounding. Adding 1.5 2^23 (2^52) rounds to the integer n, in the last bits, from where a shift
@@ -106,7 +104,7 @@ class Lanes:
 
 
 class Memory:
-    """A contiguous array; places count from its first number."""
+    """A contiguous array; indices count its numbers."""
 
     def __init__(self, builder: Any, data: Any, flags: tuple[str, ...]) -> None:
         real = data.type.pointee
@@ -122,25 +120,25 @@ class Memory:
         return Lanes(self._builder, value, self._flags)
 
     def load(self, index: Any, offset: int = 0) -> Lanes:
-        """The vector from ``place + offset`` on."""
+        """The vector from ``index + offset`` on."""
         value = self._builder.load(self._builder.bitcast(self._at(index, offset), self._vector.as_pointer()))
         value.align = self._size
         return self._lanes(value)
 
     def store(self, value: Lanes, index: Any, offset: int = 0) -> None:
-        """Write a vector from ``place + offset`` on."""
+        """Write a vector from ``index + offset`` on."""
         at = self._builder.bitcast(self._at(index, offset), self._vector.as_pointer())
         self._builder.store(value.value, at).align = self._size
 
     def one(self, index: Any, offset: int = 0) -> Lanes:
-        """A single number, in all places of a vector."""
-        none, first = ir.Constant(self._vector, ir.Undefined), ir.IntType(32)(0)
-        filled = self._builder.insert_element(none, self._builder.load(self._at(index, offset)), first)
-        places = ir.Constant(ir.VectorType(ir.IntType(32), self._vector.count), [0] * self._vector.count)
-        return self._lanes(self._builder.shuffle_vector(filled, none, places))
+        """A single number in every lane of a vector."""
+        undefined, first = ir.Constant(self._vector, ir.Undefined), ir.IntType(32)(0)
+        filled = self._builder.insert_element(undefined, self._builder.load(self._at(index, offset)), first)
+        zeros = ir.Constant(ir.VectorType(ir.IntType(32), self._vector.count), [0] * self._vector.count)
+        return self._lanes(self._builder.shuffle_vector(filled, undefined, zeros))
 
     def whole(self, index: Any) -> Any:
-        """A number of an array of int64, as a place in another one."""
+        """A number of an array of int64, as an index of another array."""
         return self._builder.load(self._at(index, 0))
 
     def put(self, value: Lanes, index: Any, offset: int = 0) -> None:
@@ -150,7 +148,7 @@ class Memory:
 
 
 class Code:
-    """The instructions with which a function of vectors is written.
+    """The instructions for functions of vectors.
 
     Attributes:
         lanes: numbers of a vector.
@@ -186,23 +184,23 @@ class Variable:
     """See :meth:`Code.variable`."""
 
     def __init__(self, builder: Any, value: Lanes) -> None:
-        self._builder, self._place = builder, cgutils.alloca_once_value(builder, value.value)
+        self._builder, self._slot = builder, cgutils.alloca_once_value(builder, value.value)
         self._like = value
 
     @property
     def value(self) -> Lanes:
-        return self._like._new(self._builder.load(self._place))
+        return self._like._new(self._builder.load(self._slot))
 
     @value.setter
     def value(self, value: Lanes) -> None:
-        self._builder.store(value.value, self._place)
+        self._builder.store(value.value, self._slot)
 
 
 def vectors(function: Callable[..., None], *, joined: bool = True) -> Any:
-    """Make a function of compiled code from one that writes vector instructions.
+    """Make a function for compiled code from a function that writes vector instructions.
 
     ``function(code, ...)`` gets a :class:`Code`, and a :class:`Memory` for each contiguous array of one floating dtype;
-    integers (int64) and truth values as LLVM's. It returns nothing.
+    integers (int64) and truth values are LLVM's. It returns nothing.
 
     Args:
         function: the writer.

@@ -1,1 +1,1 @@
-"""p(depth | network, UfM*, anchors), an extension that is off by default: a depth that anchors have corrected."""
+"""Extension, off by default: p(depth | network, UfM*, anchors), a depth map corrected by anchors."""

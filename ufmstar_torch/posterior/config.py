@@ -1,4 +1,4 @@
-"""The constants of the posterior, one place for all tiers."""
+"""The constants of the posterior, shared by all tiers."""
 
 from __future__ import annotations
 
@@ -9,35 +9,35 @@ from ufmstar_torch.checked import Checked, number
 
 @dataclass(frozen=True)
 class PosteriorConfig(Checked):
-    """The posterior's model (``posterior.update``). Lengths are in widths of the image, y = log(g/d).
+    """Constants of the posterior's model (``posterior.update``). Lengths are in image widths; y = log(g/d).
 
-    ``python docs/measure_posterior.py`` fits them: it prints what the table of rendered tours becomes with each of them
-    changed (docs/results/posterior.md).
+    ``python docs/measure_posterior.py`` prints the results on rendered tours with each constant varied
+    (docs/results/posterior.md).
 
     Attributes:
         link_variance: variance of f's difference between neighbouring nodes of equal predicted depth
-        edge_variance: what is added to it, over the square of their difference of log d
+        edge_variance: additional variance per squared difference of log d between the two nodes
         precision: precision of f at a node
         prior_sigma: standard deviation of b's constant and of its slope in log d before the first anchor
-        tilt_sigma: the same of its slopes in u and v
+        tilt_sigma: standard deviation of b's slopes in u and v before the first anchor
         drift: standard deviation of b's change from frame to frame
-        degrees_of_freedom: of the Student-t distributions of an anchor about the others' prediction, and of a link
-        alone: variance of y of an anchor without others; 1/N of it, of each among N
-        roughness: standard deviation of y from one pixel to the next, before it is learnt
-        unseen: variance of y a width of the image from evidence, before it is learnt
-        prior_weight: anchors, or pairs of neighbouring ones, for which these values count
-        half_life: age after which what an anchor taught counts half
-        clip: largest z^2 of an anchor in what is learnt of roughness and noise
-        weak_sigma: an anchor whose noise has this standard deviation counts half by area; a noisier one is no evidence
-        reach: distance from the evidence from which on a node has none
-        discs: discs of anchors that are held out in a frame
-        radius: of a disc; standard deviation of the Gaussian that weighs the anchors around a node; distance from the
-            evidence from which on the errors of anchors do not change the probability of another surface
-        wrong: probability that the local correction does not hold, before it is learnt
-        elsewhere: how many times as fast the variance of y grows with the distance from evidence if it does not hold
-        near: standard deviation of the Gaussian that weighs the errors of anchors around a node
-        widest: variance of y from which on the variance of the depth grows no more
-        edge_contrast: difference of log d at which a node counts half at a pixel
+        degrees_of_freedom: of the Student-t distributions of an anchor's residual and of f's difference across a link
+        alone: each of a frame's N anchors has the additional variance alone/N of y
+        roughness: initial value of the standard deviation of y between neighbouring pixels
+        unseen: initial value of the variance of y per image width of distance from evidence
+        prior_weight: weight of the initial values, in anchors or pairs of neighbouring anchors
+        half_life: age at which an anchor's contribution to the learnt values counts half
+        clip: upper limit of an anchor's z^2 in the estimates of roughness, noise and local scale
+        weak_sigma: noise standard deviation at which an anchor counts half; noisier anchors are no evidence
+        reach: distance from the evidence beyond which a node counts as without evidence
+        discs: number of discs whose anchors are held out in each frame
+        radius: radius of a disc; standard deviation of the Gaussian window for the variance of y around a node;
+            distance from the evidence beyond which local errors do not change ``wrong``
+        wrong: initial value of the probability that the local correction does not hold
+        elsewhere: factor on ``unseen`` where the local correction does not hold
+        near: standard deviation of the Gaussian window of the local scale
+        widest: upper limit of the variance of y
+        edge_contrast: difference of log d between a node and a pixel at which the node's weight is halved
     """
 
     link_variance: float = number(0.0015, "v_0", "1", 0.0, open_low=True)

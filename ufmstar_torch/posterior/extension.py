@@ -1,4 +1,4 @@
-"""The posterior as an extension of UfM* (``ufmstar_torch.extension``), which follows the one of anchors."""
+"""The posterior as an extension of UfM* (``ufmstar_torch.extension``). It runs after the anchors' extension."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ class PosteriorFrame(FrameExtension):
     """The posterior of one frame.
 
     Args:
-        of_anchors: the anchors during the same frame.
+        anchor_frame: the anchors' extension in the same frame.
         config: with ``posterior``.
         update: an implementation of :func:`ufmstar_torch.posterior.update.update`.
     """
 
-    def __init__(self, of_anchors: AnchorFrame, config: UfMStarConfig, update: PosteriorUpdate) -> None:
-        self._anchors, self._config, self._update = of_anchors, config, update
+    def __init__(self, anchor_frame: AnchorFrame, config: UfMStarConfig, update: PosteriorUpdate) -> None:
+        self._anchors, self._config, self._update = anchor_frame, config, update
         self._posterior: Posterior | None = None
 
     def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
@@ -38,23 +38,23 @@ class PosteriorFrame(FrameExtension):
         assert self._config.posterior is not None
         claimed = total(out.disagreement).detach()
         frame, anchors, packed = self._anchors.frame, self._anchors.anchors, state.by_stream["posterior"]
-        if anchors is not None and anchors.shared is not None:  # the poses contradict the images, for an unknown time
+        if anchors is not None and anchors.shared is not None:  # wrong poses, for an unknown time
             start = restarted(packed, self._config.posterior)
             packed = torch.where(anchors.shared.isinf()[:, None], start, packed)
         learnt, posterior = self._update(packed, frame, anchors, claimed, self._config.posterior)
-        more = torch.zeros_like(posterior.variance)
-        if anchors is not None and anchors.contradiction is not None:  # most are off by more than a factor of 100
-            more = posterior.depth.square() * anchors.contradiction[:, None, None].to(more.dtype)
+        added = torch.zeros_like(posterior.variance)
+        if anchors is not None and anchors.contradiction is not None:  # most anchors are off by a factor over 100
+            added = posterior.depth.square() * anchors.contradiction[:, None, None].to(added.dtype)
         if anchors is not None:
-            more = more + common_error(anchors, posterior.depth, self._config.posterior.prior_sigma**2)
+            added = added + common_error(anchors, posterior.depth, self._config.posterior.prior_sigma**2)
         floor = self._config.variance_floor
-        variance, inlier = (v.clamp_min(floor) + more for v in (posterior.variance, posterior.inlier))
+        variance, inlier = (v.clamp_min(floor) + added for v in (posterior.variance, posterior.inlier))
         self._posterior = replace(posterior, variance=variance, inlier=inlier)
         statistics = replace(out.statistics, calibration=posterior.calibration, unseen=posterior.unseen)
         return state.with_tensors({"posterior": learnt}), replace(out, statistics=statistics)
 
     def outputs(self) -> dict[str, Tensor]:
-        """The corrected depth, its variance, the probability of another surface, and the variance on its own."""
+        """Corrected depth, its variance, the probability of another surface, and the variance without that case."""
         assert self._posterior is not None
         p = self._posterior
         return {
@@ -63,12 +63,12 @@ class PosteriorFrame(FrameExtension):
         }  # fmt: skip
 
 
-def common_error(anchors: AnchorInput, depth: Tensor, most: float) -> Tensor:
-    """Variance of the depth [B, H, W] by the errors that all anchors of the frame have in common [m^2], which no anchor
-    shows beside the others; at most ``most`` of the squared depth."""
-    none = torch.zeros((), dtype=depth.dtype, device=depth.device)
-    shared, scale = (none if x is None else x[:, None, None].to(depth) for x in (anchors.shared, anchors.scale))
-    return depth.square() * (depth.square() * shared + scale).clamp(0, most)
+def common_error(anchors: AnchorInput, depth: Tensor, limit: float) -> Tensor:
+    """Variance of the depth [B, H, W] from errors common to all anchors of the frame [m^2], which residuals do not
+    show; at most ``limit`` times the squared depth."""
+    zero = torch.zeros((), dtype=depth.dtype, device=depth.device)
+    shared, scale = (zero if x is None else x[:, None, None].to(depth) for x in (anchors.shared, anchors.scale))
+    return depth.square() * (depth.square() * shared + scale).clamp(0, limit)
 
 
 class PosteriorExtension(Extension):
@@ -85,14 +85,14 @@ class PosteriorExtension(Extension):
         self._config, self._update = config, update
 
     def by_stream(self, streams: int, dtype: torch.dtype, device: torch.device | str) -> dict[str, Tensor]:
-        """``posterior`` [B, S] float64, what was learnt of the stream (``posterior.running``)."""
+        """``posterior`` [B, S] float64, the memory of each stream (``posterior.running``)."""
         return {"posterior": torch.zeros(streams, SIZE, dtype=torch.float64, device=device)}
 
     def require_state(self, state: Tensors) -> None:
         """See :meth:`Extension.require_state`."""
         assert self._config.posterior is not None
         packed = state["posterior"]
-        started = torch.cat([packed[:, :1].clamp_min(1), packed[:, 1:]], 1)  # what is stored, not the start
+        started = torch.cat([packed[:, :1].clamp_min(1), packed[:, 1:]], 1)  # check the stored values, not the start's
         Running.of(torch.where(packed.any(1, keepdim=True), started, packed), self._config.posterior).require()
 
     def of_frame(
@@ -104,9 +104,9 @@ class PosteriorExtension(Extension):
         *,
         dense: bool,
     ) -> FrameExtension:
-        """It needs whole maps: with a subset of pixels it does nothing."""
-        of_anchors = [one for one in before if isinstance(one, AnchorFrame)]
-        if not dense or not of_anchors:
+        """The posterior needs dense maps and anchors; the frame extension has no effect without them."""
+        anchor_frames = [extension for extension in before if isinstance(extension, AnchorFrame)]
+        if not dense or not anchor_frames:
             return FrameExtension()
         update = self._update(self._config.backend, frame.depth.device.type)
-        return PosteriorFrame(of_anchors[0], self._config, update)
+        return PosteriorFrame(anchor_frames[0], self._config, update)

@@ -1,10 +1,10 @@
-"""A Gaussian field on the nodes, given what was observed at some: mean, and variance at every node.
+"""A Gaussian field on a grid's nodes, conditioned on observations at some: mean and variance at every node.
 
     y = x . b + f + noise,      b ~ N(b_0, P),      f ~ N(0, Q^-1)
 
 with the features x and the field f of precision Q: f^T Q f = kappa |f|^2 + sum over links (f_i - f_j)^2 / variance of
-the link. An observation of variance 1/w at node i adds w to Q_ii. b is integrated out by its Schur complement, so the
-only large system is that of the nodes, whose band is as wide as a row of them.
+the link. An observation of variance 1/w at node i adds w to Q_ii. A Schur complement integrates b out. The only large
+system is that of the nodes; its bandwidth is the number of nodes in a row.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ class Solved:
 
 
 def solve(diagonal: Tensor, right: Tensor, down: Tensor, columns: Tensor, cols: int) -> Solved:
-    """A^-1 columns and the diagonal of A^-1, for A = the diagonal and the links of a grid; dense.
+    """Solve A X = Y and compute the diagonal of A^-1, for A from a diagonal and the links of a grid; dense.
 
     Args:
-        diagonal: [B, n] without the links, positive.
+        diagonal: [B, n] diagonal of A without the links, positive.
         right, down: [B, n] precision of the link to the next node in the row, in the column; 0 where there is none.
         columns: [B, n, q] Y.
         cols: nodes in a row.
@@ -49,7 +49,7 @@ def solve(diagonal: Tensor, right: Tensor, down: Tensor, columns: Tensor, cols: 
 
 @dataclass(frozen=True)
 class Prior:
-    """Before the observations.
+    """Prior of b and f.
 
     Attributes:
         diagonal: [B, n] kappa.
@@ -69,7 +69,7 @@ class Prior:
 
 @dataclass(frozen=True)
 class Observed:
-    """N observations, of which some may have the weight 0.
+    """N observations. Some may have the weight 0.
 
     Attributes:
         node: [B, N] int64.
@@ -84,14 +84,14 @@ class Observed:
 
 @dataclass(frozen=True)
 class Field:
-    """After the observations.
+    """b and f, conditioned on the observations.
 
     Attributes:
         coefficients: [B, F] mean of b.
         covariance: [B, F, F] of b.
         offset: [B, n] mean of f.
-        response: [B, n, F] by how much f gives way to a change of b.
-        variance: [B, n] of f where b is known.
+        response: [B, n, F] decrease of f's mean per unit of b.
+        variance: [B, n] variance of f for fixed b.
     """
 
     coefficients: Tensor
@@ -102,18 +102,18 @@ class Field:
 
     @classmethod
     def conditioned(cls, prior: Prior, observed: Observed, weight: Tensor) -> Field:
-        """Condition the prior on the observations with the precisions ``weight`` [B, N]."""
+        """Condition the prior on observations of precision ``weight`` [B, N]."""
         weighted = weight[..., None] * observed.features
-        left = observed.value - (observed.features * prior.mean[:, None]).sum(-1)
-        rows = torch.cat([weighted, (weight * left)[..., None], weight[..., None]], -1)
+        residual = observed.value - (observed.features * prior.mean[:, None]).sum(-1)
+        rows = torch.cat([weighted, (weight * residual)[..., None], weight[..., None]], -1)
         nodes = torch.zeros(*prior.diagonal.shape, rows.shape[-1], dtype=rows.dtype, device=rows.device)
         nodes = nodes.scatter_add(1, observed.node[..., None].expand_as(rows), rows)
         solved = solve(prior.diagonal + nodes[..., -1], prior.right, prior.down, nodes[..., :-1], prior.cols)
         response, offset = solved.columns[..., :-1], solved.columns[..., -1]
-        to_features = nodes[..., :-2].mT
-        precision = prior.precision + weighted.mT @ observed.features - to_features @ response
+        cross = nodes[..., :-2].mT
+        precision = prior.precision + weighted.mT @ observed.features - cross @ response
         covariance = torch.linalg.inv_ex(precision).inverse
-        right_side = (weighted * left[..., None]).sum(1) - (to_features @ offset[..., None])[..., 0]
+        right_side = (weighted * residual[..., None]).sum(1) - (cross @ offset[..., None])[..., 0]
         b = (covariance @ right_side[..., None])[..., 0]
         field = offset - (response @ b[..., None])[..., 0]
         return cls(prior.mean + b, covariance, field, response, solved.variance)

@@ -1,8 +1,7 @@
-"""The nodes on which the error of a depth map is estimated: cells of the image, and how closely neighbours are linked.
+"""The grid of nodes on which the error of a depth map is estimated: cells of the image, and links between neighbours.
 
-The image is cut into at most 28 x 28 cells (the compiled field has room for 31 in a row). Neighbouring nodes are linked
-the more loosely, the more the predicted depth differs between them: across an edge of the depth map the network may err
-by another factor.
+The image has at most 28 x 28 cells (the compiled field allows 31 in a row). A link is weaker, the more the predicted
+depths of its two nodes differ: across a depth edge, the network may err by another factor.
 """
 
 from __future__ import annotations
@@ -25,11 +24,11 @@ class Grid:
 
     Attributes:
         size: (R, C).
-        log_depth: [B, R C] mean of log d in the cell; of the map where the cell has no valid pixel.
+        log_depth: [B, R C] mean of log d over the cell's valid pixels; the mean of all other cells if it has none.
         mean: [B] m_0, mean of ``log_depth``.
-        right, down: [B, R C] variance of the difference of y to the next node in the row, in the column; infinite where
-            there is none.
-        far_right, far_down: [B, R C] lengths of the same links, a cell and the difference of log d; infinite likewise.
+        right, down: [B, R C] variance of the difference of y to the next node in the row, in the column; infinite at
+            the border.
+        far_right, far_down: [B, R C] lengths of the same links: size of a cell plus difference of log d.
     """
 
     size: tuple[int, int]
@@ -47,13 +46,13 @@ class Grid:
         valid = frame.valid.double()[:, None]
         logs = torch.where(frame.valid, frame.depth, torch.ones_like(frame.depth)).log().double()[:, None] * valid
         covered = adaptive_avg_pool2d(valid, (rows, cols)).flatten(1)
-        inside = adaptive_avg_pool2d(logs, (rows, cols)).flatten(1) / covered.clamp_min(1e-9)
-        used = (covered > 0).double()
-        whole = (inside * used).sum(1, keepdim=True) / used.sum(1, keepdim=True).clamp_min(1)
-        log_depth = torch.where(covered > 0, inside, whole)
-        shaped = log_depth.view(-1, rows, cols)
-        across = pad(shaped[:, :, 1:] - shaped[:, :, :-1], (0, 1), value=torch.inf).flatten(1)
-        along = pad(shaped[:, 1:] - shaped[:, :-1], (0, 0, 0, 1), value=torch.inf).flatten(1)
+        cell_mean = adaptive_avg_pool2d(logs, (rows, cols)).flatten(1) / covered.clamp_min(1e-9)
+        has_pixels = (covered > 0).double()
+        map_mean = (cell_mean * has_pixels).sum(1, keepdim=True) / has_pixels.sum(1, keepdim=True).clamp_min(1)
+        log_depth = torch.where(covered > 0, cell_mean, map_mean)
+        by_cell = log_depth.view(-1, rows, cols)
+        across = pad(by_cell[:, :, 1:] - by_cell[:, :, :-1], (0, 1), value=torch.inf).flatten(1)
+        along = pad(by_cell[:, 1:] - by_cell[:, :-1], (0, 0, 0, 1), value=torch.inf).flatten(1)
         return cls(
             (rows, cols), log_depth, log_depth.mean(1),
             config.link_variance + config.edge_variance * across.square(),
@@ -85,7 +84,7 @@ def _centres(count: int, like: Tensor) -> Tensor:
 
 
 def _relative(pixel: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Positions as shares of the image's width and height, 0 to 1."""
+    """Positions as fractions of the image's width and height."""
     u, v = pixel.unbind(-1)
     return (u + 0.5) / size[1], (v + 0.5) / size[0]
 

@@ -1,10 +1,10 @@
-"""Learns ``running`` from a frame's anchors: each is predicted from the others, alone or without its whole region.
+"""Updates ``running`` from a frame's anchors by cross-validation: one anchor, or a disc of anchors, is held out.
 
-Roughness and noise follow from anchors that are left out alone. For the rest, discs that move over the image are left
-out of the field, which then predicts the anchors in them. Products of errors in neighbouring cells teach the amplitude,
-and ``unseen`` in proportion to the distance from evidence. ``wrong`` is the mean probability that an anchor lies on
-another surface, by area and not by number, since corners cluster on what is well textured. ``inlier`` is the mean z^2
-of the anchors that do not: outliers have widened the field's variance, and ``wrong`` states them already.
+Leave-one-out residuals give roughness and noise. For the other ratios, discs that move over the image are held out, and
+the field of the other anchors predicts those in them. Products of errors in neighbouring cells give the amplitude, and
+their increase with the distance from evidence gives ``unseen``. ``wrong`` is the mean probability that an anchor lies
+on another surface, weighted by area because corners cluster on textured surfaces. ``inlier`` is the mean z^2 of the
+other anchors: outliers have widened the field's variance, and ``wrong`` accounts for them.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from ufmstar_torch.posterior.scene import (
     wrong_factor,
 )
 
-# Variance of the difference between neighbouring nodes, over that of the link between them: on a square lattice the
-# other ways from one to the other are worth as much as the link.
+# Variance of the difference between neighbouring nodes over the link's variance: on a square lattice, all other paths
+# between the two nodes conduct as much as the link.
 APART = 0.5
-# With fewer anchors outside the discs, no anchor is held out: the field alone would be close to its prior.
+# With fewer anchors outside the discs none is held out: the field would be close to its prior.
 LEAST_REST = 5
-# The frame's number moves the discs along this sequence of low discrepancy (R2, Roberts).
+# Disc centres follow this low-discrepancy sequence over the frames (R2, Roberts).
 STEPS = (0.7548776662466927, 0.5698402909980532)
 
 
@@ -49,14 +49,14 @@ def learnt(scene: Scene, field: Field, weight: Tensor, left_out: LeftOut, runnin
 
 
 def _of_neighbours(scene: Scene, left_out: LeftOut, running: Running) -> dict[str, tuple[Tensor, Tensor]]:
-    """Sums for roughness and noise from leave-one-out residuals: what they are beyond the rest of their variance, each
-    weighted by the squared share that the quantity has in it."""
+    """Sums for roughness and noise from the excess of squared leave-one-out residuals over their variance, weighted by
+    the squared share of the quantity in that variance."""
     variance = left_out.total
     excess = torch.minimum(left_out.residual.square(), scene.config.clip * variance) - variance
-    once = torch.where(scene.valid, 1 / scene.counted(torch.ones_like(excess)), 0.0)
+    per_cell = torch.where(scene.valid, 1 / scene.counted(torch.ones_like(excess)), 0.0)
     sums = {}
     for name, part in (("roughness", running.ratio("roughness")[:, None]), ("noise", scene.stated)):
-        w = once * (part / variance).square()
+        w = per_cell * (part / variance).square()
         unit = running.ratio(name)[:, None] / part.clamp_min(1e-12)
         sums[name] = (total(w * (part + excess) * unit, 1), total(w, 1))
     return sums
@@ -65,15 +65,15 @@ def _of_neighbours(scene: Scene, left_out: LeftOut, running: Running) -> dict[st
 def _of_discs(
     scene: Scene, weight: Tensor, left_out: LeftOut, running: Running
 ) -> dict[str, tuple[Tensor, Tensor]]:  # fmt: skip
-    """Sums for all else that is learnt, from anchors whose whole region is left out."""
-    held = _discs(scene, running.frames) & scene.valid
-    rest = scene.valid & ~held
-    held = held & (rest.sum(1, keepdim=True) >= LEAST_REST)
+    """Sums for the other ratios, from anchors in held-out discs."""
+    held_out = _discs(scene, running.frames) & scene.valid
+    rest = scene.valid & ~held_out
+    held_out = held_out & (rest.sum(1, keepdim=True) >= LEAST_REST)
     field = Field.conditioned(scene.prior, scene.observed, weight * rest)
     mean, variance = field.at(scene.observed.node, scene.observed.features)
     away = torch.gather(away_from(scene, rest), 1, scene.observed.node)
     error, b = scene.observed.value - mean, field.coefficients
-    believed = torch.where(held, scene.believed(), 0.0)
+    believed = torch.where(held_out, scene.believed(), 0.0)
     area = believed / scene.counted(believed).clamp_min(1e-12)
     offset = mean - (scene.observed.features * b[:, None]).sum(-1)
     nodes = spread_around(scene, rest, b[:, 0]), local_scale(scene, left_out, rest), steepness(scene.grid, field.offset)
@@ -85,7 +85,7 @@ def _of_discs(
     z2 = error.square() / inlier_variance - (error + offset).square() / (scene.noise + wide)
     elsewhere = torch.sigmoid(p.logit() + ((inlier_variance / (scene.noise + wide)).log() + z2) / 2)
     stated = second_moments(scene.config, inlier_variance, p, offset, wide)[0]
-    return _of_pairs(scene, held, torch.stack([error, variance, away, scene.noise]), running) | {
+    return _of_pairs(scene, held_out, torch.stack([error, variance, away, scene.noise]), running) | {
         "wrong": (total(area * elsewhere, 1), total(area * more_wrong, 1)),
         "inlier": (
             total(area * (1 - elsewhere) * factor * error.square() / inlier_variance, 1),
@@ -95,21 +95,21 @@ def _of_discs(
     }
 
 
-def _of_pairs(scene: Scene, held: Tensor, values: Tensor, running: Running) -> dict[str, tuple[Tensor, Tensor]]:
+def _of_pairs(scene: Scene, held_out: Tensor, values: Tensor, running: Running) -> dict[str, tuple[Tensor, Tensor]]:
     """Sums for amplitude and unseen from the errors at pairs of neighbouring cells.
 
-    The mean of their product is the covariance of what all depths there have in common. The anchors' own errors, and
-    anchors that are wrong, differ from cell to cell and have no part in it. A cell without neighbours is its own, less
-    its noise; such cells count the less, the more pairs there are.
+    The mean product of their errors is the covariance of the network's errors: noise and wrong anchors are independent
+    between cells. An isolated cell contributes its squared error less its noise. The more pairs there are, the less
+    isolated cells count.
 
     Args:
         scene: of the frame.
-        held: [B, N] bool, anchors left out.
-        values: [4, B, N] their error, its variance in the field, distance from evidence and noise.
+        held_out: [B, N] bool.
+        values: [4, B, N] error, its variance in the field, distance from evidence and noise.
         running: up to the frame before.
     """
-    streams, (rows, cols) = len(held), scene.grid.size
-    each = torch.cat([torch.where(held, values, 0.0), held[None].to(values)])
+    streams, (rows, cols) = len(held_out), scene.grid.size
+    each = torch.cat([torch.where(held_out, values, 0.0), held_out[None].to(values)])
     cells = torch.zeros(5, streams, rows * cols, dtype=each.dtype, device=each.device)
     cells = cells.scatter_add(2, scene.observed.node.expand_as(each), each).view(5, streams, rows, cols)
     count, means = cells[4], cells[:4] / cells[4].clamp_min(1)
@@ -137,7 +137,7 @@ def _of_pairs(scene: Scene, held: Tensor, values: Tensor, running: Running) -> d
 def _products(
     used: Tensor, product: Tensor, expected: Tensor, variance: Tensor, noise: Tensor, away: Tensor
 ) -> Tensor:  # fmt: skip
-    """[4, B] sums over the mask of products of errors: the two of amplitude, weighted, and the two of unseen."""
+    """[4, B] sums over the mask ``used``: numerator and denominator of amplitude, weighted, and of unseen."""
     weight = 1 / (variance + noise).clamp_min(1e-12)
     terms = weight * product, weight * expected, away * (product - expected), away.square()
     return torch.stack([total(torch.where(used, x, 0.0).flatten(1), 1) for x in terms])
@@ -145,9 +145,9 @@ def _products(
 
 def _discs(scene: Scene, frames: Tensor) -> Tensor:
     """[B, N] whether an anchor lies in one of the frame's discs."""
-    at, discs = (scene.observed.features[..., 2:4] + 1) / 2, scene.config.discs
+    position, discs = (scene.observed.features[..., 2:4] + 1) / 2, scene.config.discs
     inside = torch.zeros_like(scene.valid)
     for disc in range(discs):
         centre = torch.stack([((frames * discs + disc + 1) * step) % 1 for step in STEPS], -1)
-        inside = inside | ((at - centre[:, None]).square().sum(-1) < scene.config.radius**2)
+        inside = inside | ((position - centre[:, None]).square().sum(-1) < scene.config.radius**2)
     return inside

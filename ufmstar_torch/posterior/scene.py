@@ -1,4 +1,4 @@
-"""A frame's nodes and anchors, the field fitted to them, and the variance that follows (model: ``update``)."""
+"""A frame's nodes and anchors, the field fitted to them, and the resulting variance (model: ``update``)."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from ufmstar_torch.posterior.grid import Grid
 from ufmstar_torch.posterior.read import LARGEST
 from ufmstar_torch.posterior.running import Running
 
-# Least share of 1 - w v, by which a residual is divided to leave its anchor out: an anchor alone would divide by 0.
+# Least divisor 1 - w v of a leave-one-out residual: it is 0 for a single anchor.
 LEAST_LEFT = 0.05
-# No probability that the local correction does not hold is larger.
+# Largest probability that the local correction does not hold.
 MOST_WRONG = 0.5
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A frame's nodes and anchors, before they are fitted.
+    """A frame's nodes and anchors, before the fit.
 
     Attributes:
         config: of the posterior.
         grid: the nodes.
         prior: of b and f.
         observed: the anchors.
-        stated: [B, N] noise s^2/g^2 of y, as learnt.
-        noise: [B, N] n, with roughness and blur^2.
+        stated: [B, N] noise s^2/g^2 + alone/N.
+        noise: [B, N] n: ``stated`` with roughness and blur^2.
         valid: [B, N] bool.
     """
 
@@ -59,23 +59,23 @@ class Scene:
         return cls(running.config, grid, _prior(grid, running), observed, stated, noise, anchors.valid)
 
     def counted(self, values: Tensor) -> Tensor:
-        """[B, N] values, summed over the anchors of the same cell."""
+        """[B, N] sums of ``values`` over the anchors of the same cell."""
         masked = torch.where(self.valid, values, torch.zeros_like(values))
         nodes = torch.zeros_like(self.grid.log_depth).scatter_add(1, self.observed.node, masked)
         return torch.gather(nodes, 1, self.observed.node)
 
     def believed(self) -> Tensor:
-        """[B, N] by how much an anchor counts for what is learnt: less the noisier it is, 0 where not valid."""
+        """[B, N] weight of an anchor in the learnt means: 1/(1 + n/weak_sigma^2), 0 where not valid."""
         return torch.where(self.valid, 1 / (1 + self.noise / self.config.weak_sigma**2), torch.zeros_like(self.noise))
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Each anchor, predicted by the field of the others.
+    """Leave-one-out prediction of each anchor.
 
     Attributes:
         residual: [B, N] of y.
-        total: [B, N] variance that is predicted for it.
+        total: [B, N] predicted variance of the residual.
     """
 
     residual: Tensor
@@ -100,14 +100,14 @@ def _range(frame: FrameInput, anchors: AnchorInput) -> Tensor:
     for down in (-1, 0, 1):
         for right in (-1, 0, 1):
             index = (row + down).clamp(0, height - 1) * width + (column + right).clamp(0, width - 1)
-            fine = torch.gather(valid, 1, index) & anchors.valid
-            near = torch.where(fine, torch.gather(depth, 1, index).double(), anchors.predicted).log()
-            low, high = torch.minimum(low, near), torch.maximum(high, near)
+            usable = torch.gather(valid, 1, index) & anchors.valid
+            log_depth = torch.where(usable, torch.gather(depth, 1, index).double(), anchors.predicted).log()
+            low, high = torch.minimum(low, log_depth), torch.maximum(high, log_depth)
     return high - low
 
 
 def fitted(scene: Scene) -> tuple[Field, LeftOut, Tensor]:
-    """The field, how well it predicts each anchor from the others, and the anchors' weights in it."""
+    """The field with robust weights, its leave-one-out predictions, and the anchors' weights."""
     zero = torch.zeros_like(scene.noise)
     first, left_out = _with_weights(scene, torch.where(scene.valid, 1 / scene.noise, zero))
     excess = (left_out.residual.square() - left_out.total).clamp_min(0) / (scene.config.degrees_of_freedom + 1)
@@ -116,7 +116,7 @@ def fitted(scene: Scene) -> tuple[Field, LeftOut, Tensor]:
 
 
 def _loosened(scene: Scene, field: Field) -> Prior:
-    """The prior with Student's t for links too: across one whose ends differ by much in the field, f may jump."""
+    """The prior with Student-t weights on the links: a link across a jump of ``field`` is weaker."""
     nu, prior = scene.config.degrees_of_freedom, scene.prior
     f = field.offset.unflatten(1, scene.grid.size)
     right, down = pad(f.diff(dim=2), (0, 1)).flatten(1), pad(f.diff(dim=1), (0, 0, 0, 1)).flatten(1)
@@ -127,13 +127,13 @@ def _loosened(scene: Scene, field: Field) -> Prior:
 def _with_weights(scene: Scene, weight: Tensor) -> tuple[Field, LeftOut]:
     field = Field.conditioned(scene.prior, scene.observed, weight)
     mean, variance = field.at(scene.observed.node, scene.observed.features)
-    left = (1 - weight * variance).clamp_min(LEAST_LEFT)
-    return field, LeftOut((scene.observed.value - mean) / left, variance / left + scene.noise)
+    divisor = (1 - weight * variance).clamp_min(LEAST_LEFT)
+    return field, LeftOut((scene.observed.value - mean) / divisor, variance / divisor + scene.noise)
 
 
 def spread_around(scene: Scene, used: Tensor, mean: Tensor) -> Tensor:
-    """[B, n] variance of y among the anchors of the mask [B, N] around every node, and one anchor of the prior variance
-    about ``mean`` [B]."""
+    """[B, n] variance of y around every node, over the anchors of the mask ``used`` [B, N] and one virtual anchor of
+    the prior variance about ``mean`` [B]."""
     y = scene.observed.value
     weight, first, second = _around(scene, used, scene.config.radius, y, y.square())
     centre, prior = mean[:, None], scene.config.prior_sigma**2
@@ -142,33 +142,33 @@ def spread_around(scene: Scene, used: Tensor, mean: Tensor) -> Tensor:
 
 
 def local_scale(scene: Scene, left_out: LeftOut, used: Tensor) -> Tensor:
-    """[B, n] by what factor errors around every node exceed what the field predicts: the mean z^2 of the anchors of the
-    mask [B, N], each predicted from the others, and of one anchor of z^2 = 1."""
+    """[B, n] factor by which errors around every node exceed the field's prediction: the mean leave-one-out z^2 of the
+    anchors of the mask ``used`` [B, N] and of one virtual anchor with z^2 = 1."""
     z2 = (left_out.residual.square() / left_out.total).clamp_max(scene.config.clip)
     weight, first = _around(scene, used, scene.config.near, z2)
     return (first + 1) / (weight + 1)
 
 
 def _around(scene: Scene, used: Tensor, width: float, *values: Tensor) -> Tensor:
-    """[1 + k, B, n] sums of 1 and of the k values [B, N] over the anchors of the mask [B, N], weighted by a Gaussian
-    around every node; each cell and each certain anchor counts alike."""
-    each = torch.where(used, scene.believed() / scene.counted(torch.ones_like(scene.noise)).clamp_min(1), 0.0)
+    """[1 + k, B, n] sums of 1 and of the k values [B, N] over the anchors of the mask ``used`` [B, N], weighted by a
+    Gaussian window around every node, by ``believed``, and by 1/(anchors in the cell)."""
+    weight = torch.where(used, scene.believed() / scene.counted(torch.ones_like(scene.noise)).clamp_min(1), 0.0)
     rows, cols = scene.grid.size
-    added = torch.stack([each, *(each * x for x in values)])
-    nodes = torch.zeros(len(added), *scene.grid.log_depth.shape, dtype=each.dtype, device=each.device)
-    nodes = nodes.scatter_add(2, scene.observed.node.expand_as(added), added).unflatten(2, (rows, cols))
-    return (_window(rows, width, each) @ nodes @ _window(cols, width, each)).flatten(2)
+    terms = torch.stack([weight, *(weight * x for x in values)])
+    nodes = torch.zeros(len(terms), *scene.grid.log_depth.shape, dtype=weight.dtype, device=weight.device)
+    nodes = nodes.scatter_add(2, scene.observed.node.expand_as(terms), terms).unflatten(2, (rows, cols))
+    return (_window(rows, width, weight) @ nodes @ _window(cols, width, weight)).flatten(2)
 
 
 def _window(count: int, width: float, like: Tensor) -> Tensor:
-    """[count, count] weight of a row of nodes, or column, for another one."""
-    at = torch.arange(count, dtype=like.dtype, device=like.device) / count
-    return (-((at[:, None] - at) / width).square() / 2).exp()
+    """[count, count] Gaussian weights between the rows, or columns, of nodes."""
+    position = torch.arange(count, dtype=like.dtype, device=like.device) / count
+    return (-((position[:, None] - position) / width).square() / 2).exp()
 
 
 def wrong_factor(config: PosteriorConfig, away: Tensor, scale: Tensor) -> Tensor:
-    """[B, n] by what the probability that the local correction does not hold is multiplied: near evidence, at a small
-    distance ``away`` [B, n], the local ``scale`` [B, n] of errors."""
+    """[B, n] factor on ``wrong``: the local ``scale`` [B, n] of errors at the evidence, 1 from the distance ``radius``
+    on; ``away`` [B, n] is the distance."""
     return scale ** (1 - away / config.radius).clamp_min(0)
 
 
@@ -178,30 +178,30 @@ def wrong(running: Running, factor: Tensor) -> Tensor:
 
 
 def inlier_factor(running: Running, away: Tensor) -> Tensor:
-    """[B, n] by what the variance of y on the evidence's own surface is multiplied, at distances ``away`` [B, n] from
-    it. Held-out anchors are within a disc's reach of others: from a disc's width on, they say nothing."""
+    """[B, n] factor on the variance of y on the evidence's surface, at distances ``away`` [B, n]: ``inlier`` at the
+    evidence, 1 from a disc's diameter on. Held-out anchors are no farther from the others."""
     near = (1 - away / (2 * running.config.radius)).clamp_min(0)
     return 1 + (running.ratio("inlier")[:, None] - 1) * near
 
 
 def steepness(grid: Grid, f: Tensor) -> Tensor:
-    """[B, n] variance of the field's mean ``f`` [B, n] among a node and its eight neighbours. Where an edge of depth
-    lies is known to a node only, and on its other side y is another surface's."""
+    """[B, n] variance of the field's mean ``f`` [B, n] over a node and its eight neighbours: the grid locates a depth
+    edge, where y changes, to one node only."""
     padded = pad(f.unflatten(1, grid.size)[:, None], (1, 1, 1, 1), mode="replicate")
     return unfold(padded, 3).var(1, correction=0)
 
 
 def elsewhere_variance(config: PosteriorConfig, around: Tensor, unseen: Tensor) -> Tensor:
-    """Variance of y on another surface than the evidence's: that of the anchors' y ``around`` and ``elsewhere`` times
-    what the distance adds on their own surface, ``unseen``; at most ``widest``."""
+    """Variance of y on another surface than the evidence's: the variance ``around`` of the anchors' y plus
+    ``elsewhere`` times the variance ``unseen`` from the distance; at most ``widest``."""
     return (around + config.elsewhere * unseen).clamp_max(config.widest)
 
 
 def second_moments(
     config: PosteriorConfig, variance: Tensor, p: Tensor, offset: Tensor, wide: Tensor
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Variances over the squared depth: in total, and of y's ``variance`` alone. With the probability p, which the
-    total contains, the local correction ``offset`` does not hold and y has the variance ``wide``."""
+    """Variances over the squared depth: in total, and if the local correction holds. With probability ``p`` the local
+    correction ``offset`` does not hold, and y has the variance ``wide`` instead of ``variance``."""
     inlier_variance, q = variance.clamp_max(config.widest), (-offset).clamp_max(LARGEST).exp()
     tail = q.square() * (2 * wide).exp() - 2 * q * (wide / 2).exp() + 1
     inlier = (2 * inlier_variance).exp() - 2 * (inlier_variance / 2).exp() + 1
@@ -209,7 +209,7 @@ def second_moments(
 
 
 def away_from(scene: Scene, evidence: Tensor) -> Tensor:
-    """[B, n] how far every node is from the anchors of the mask [B, N], in widths of the image."""
+    """[B, n] geodesic distance of every node from the anchors of the mask ``evidence`` [B, N], in image widths."""
     grid = scene.grid
     source = torch.zeros_like(grid.log_depth).scatter_add(1, scene.observed.node, evidence.to(grid.log_depth)) > 0
     return distance(source, grid.far_right, grid.far_down, grid.size[1], scene.config.reach)

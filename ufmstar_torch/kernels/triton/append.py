@@ -1,7 +1,7 @@
-"""The ends of a step on a GPU: where the cameras are, and the components that a frame adds.
+"""First and last part of a step on a GPU: relative camera poses, and the components that a frame adds.
 
-What finds no slot stays in a mask beside the frame's Gaussians, so that a later launch can append it: the number of
-slots is known to the host one frame late (``kernels.step_device``).
+The host learns the number of slots one frame late (``kernels.step_device``). A mask therefore marks the frame's
+Gaussians without a slot, so that a later launch can append them.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class Cameras:
 
     Attributes:
         first: [B, 4, 4] float64 pose of the first camera.
-        to_camera: R [B, 3, 3] and t [B, 3] float64 from the first camera's frame into the present one's.
-        to_first: the way back.
+        to_camera: R [B, 3, 3] and t [B, 3] float64 from the first camera's frame to the present one's.
+        to_first: R and t of the inverse.
         started, frames, skipped: [B] of the new state.
     """
 
@@ -44,7 +44,7 @@ class Cameras:
 
 
 def cameras(state: UfMStarState, frame: FrameInput) -> Cameras:
-    """Poses relative to the first camera's, in one launch; a stream at fault keeps its counters and its first pose."""
+    """Compute poses relative to the first camera in one launch. A faulty stream only counts a skipped frame."""
     b = frame.depth.shape[0]
     first = torch.empty_like(state.T_world_first)
     motion = first.new_empty(2, b, 3, 3)
@@ -69,36 +69,36 @@ def append(
     again: bool,
     last: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Add Gaussians of a frame to ``mixture``, in place, and count what happened.
+    """Append Gaussians of a frame to ``mixture``, in place, and count them.
 
     Args:
-        mixture: [B, K], of this step's own memory.
+        mixture: [B, K], in memory that only this step uses.
         current: C_i in the camera frame, [B, C].
-        to_first: R and t into the mixture's frame.
-        chosen: [B, C] bool: with ``again`` what is to be added, else what matched and is not.
+        to_first: R and t to the mixture's frame.
+        chosen: [B, C] bool: with ``again``, the Gaussians to append; else those that matched, which are not appended.
         counts: [8, B] int64, written without ``again``.
-        near_plane: what is nearer is not remembered [m].
-        again: whether the Gaussians found no slot before.
-        last: whether the mixture cannot grow: what finds no slot is dropped.
+        near_plane: nearer Gaussians are dropped [m].
+        again: whether these Gaussians had no slot in an earlier launch.
+        last: whether the mixture cannot grow: Gaussians without a slot are dropped.
 
     Returns:
-        Mask [B, C] of the Gaussians that found no slot and wait; the number of slots that would hold all [B] int32.
+        Mask [B, C] of the Gaussians that wait for a slot; number of slots [B] int32 that would hold all Gaussians.
     """
     b, c = current.weight.shape
-    left = torch.empty(b, c, dtype=torch.bool, device=counts.device)
+    waiting = torch.empty(b, c, dtype=torch.bool, device=counts.device)
     needed = torch.empty(b, dtype=torch.int32, device=counts.device)
     channels = mixture.features.shape[2]
     launch(
         _append, (b,), current.mean, current.covariance, current.weight, current.features, *to_first, chosen,
-        *mixture.tensors().values(), counts, left, needed, c, mixture.capacity, b,
+        *mixture.tensors().values(), counts, waiting, needed, c, mixture.capacity, b,
         near_plane=near_plane, again=again, last=last, channels=channels, padded=power_of_two(channels), chunk=128,
     )  # fmt: skip
-    return left, needed
+    return waiting, needed
 
 
 @triton.jit
 def _relative(a, b, R, t):
-    """The motion of points of camera a into camera b, poses [4, 4] in memory (``camera.relative_pose``)."""
+    """R and t from camera a to camera b, from poses [4, 4] in memory (``camera.relative_pose``)."""
     for i in tl.static_range(3):
         x, y, z = tl.load(b + i), tl.load(b + 4 + i), tl.load(b + 8 + i)
         for j in tl.static_range(3):
@@ -109,29 +109,30 @@ def _relative(a, b, R, t):
 
 @triton.jit
 def _cameras(
-    T_first, T_now, fault, started, frames, skipped, first, R_cam, t_cam, R_first, t_first, started_o, frames_o,
+    T_first, T, fault, started, frames, skipped, first, R_cam, t_cam, R_first, t_first, started_o, frames_o,
     skipped_o,
 ):  # fmt: skip
     b = tl.program_id(0).to(tl.int64)
-    fine = tl.load(fault + b) == 0
-    before = tl.load(started + b) != 0
-    now = T_now + 16 * b
+    usable = tl.load(fault + b) == 0
+    was_started = tl.load(started + b) != 0
+    pose = T + 16 * b
     base = T_first + 16 * b
-    if fine & (before == 0):
-        base = now
+    if usable & (was_started == 0):
+        base = pose
     entry = tl.arange(0, 16)
     tl.store(first + 16 * b + entry, tl.load(base + entry))
-    _relative(base, now, R_cam + 9 * b, t_cam + 3 * b)
-    _relative(now, base, R_first + 9 * b, t_first + 3 * b)
-    tl.store(started_o + b, before | fine)
-    tl.store(frames_o + b, tl.load(frames + b) + fine.to(tl.int64))
-    tl.store(skipped_o + b, tl.load(skipped + b) + 1 - fine.to(tl.int64))
+    _relative(base, pose, R_cam + 9 * b, t_cam + 3 * b)
+    _relative(pose, base, R_first + 9 * b, t_first + 3 * b)
+    tl.store(started_o + b, was_started | usable)
+    tl.store(frames_o + b, tl.load(frames + b) + usable.to(tl.int64))
+    tl.store(skipped_o + b, tl.load(skipped + b) + 1 - usable.to(tl.int64))
 
 
 @triton.jit
 def _append(
     mean_c, covariance_c, weight_c, features_c, R, t, chosen,
-    mean, covariance, weight, disagreement, count, features, counts, left, needed, many_c, many_k, streams,
+    mean, covariance, weight, disagreement, count, features, counts, waiting_mask, needed,
+    capacity_c, capacity_k, streams,
     near_plane: tl.constexpr, again: tl.constexpr, last: tl.constexpr, channels: tl.constexpr, padded: tl.constexpr,
     chunk: tl.constexpr,
 ):  # fmt: skip
@@ -140,19 +141,19 @@ def _append(
     lane = tl.arange(0, chunk)
     f = tl.arange(0, padded)
     n = 0
-    for first in range(0, many_k, chunk):
+    for first in range(0, capacity_k, chunk):
         k = first + lane
-        n += tl.sum((tl.load(weight + b * many_k + k, mask=k < many_k, other=0.0) > 0).to(tl.int32), 0)
+        n += tl.sum((tl.load(weight + b * capacity_k + k, mask=k < capacity_k, other=0.0) > 0).to(tl.int32), 0)
     segments, matched, dropped, added, waiting = 0, 0, 0, 0, 0
-    for first in range(0, many_c, chunk):
-        there = first + lane < many_c
-        c = b * many_c + first + lane
-        pi = tl.load(weight_c + c, mask=there, other=0.0)
-        valid = there & (pi > 0)
+    for first in range(0, capacity_c, chunk):
+        inside = first + lane < capacity_c
+        c = b * capacity_c + first + lane
+        pi = tl.load(weight_c + c, mask=inside, other=0.0)
+        valid = inside & (pi > 0)
         x = tl.load(mean_c + 3 * c, mask=valid, other=0.0)
         y = tl.load(mean_c + 3 * c + 1, mask=valid, other=0.0)
         z = tl.load(mean_c + 3 * c + 2, mask=valid, other=0.0)
-        flag = tl.load(chosen + c, mask=there, other=0) != 0
+        flag = tl.load(chosen + c, mask=inside, other=0) != 0
         if again:
             new = valid & flag
         else:
@@ -161,31 +162,31 @@ def _append(
             matched += tl.sum((valid & flag).to(tl.int32), 0)
         segments += tl.sum(valid.to(tl.int32), 0)
         slot = n + tl.cumsum(new.to(tl.int32), 0) - 1
-        fits = new & (slot < many_k)
-        k = b * many_k + slot
+        has_slot = new & (slot < capacity_k)
+        k = b * capacity_k + slot
         x, y, z = moved(R, t, x, y, z)
         xx, xy, xz, yy, yz, zz = load_symmetric(covariance_c + 9 * c, 1, valid)
         xx, xy, xz, yy, yz, zz = turned(R, xx, xy, xz, yy, yz, zz)
-        tl.store(mean + 3 * k, x, mask=fits)
-        tl.store(mean + 3 * k + 1, y, mask=fits)
-        tl.store(mean + 3 * k + 2, z, mask=fits)
-        store_symmetric(covariance + 9 * k, xx, xy, xz, yy, yz, zz, fits)
-        tl.store(weight + k, pi, mask=fits)
-        tl.store(disagreement + k, pi * 0.0, mask=fits)
-        tl.store(count + k, (lane * 0 + 1).to(tl.int64), mask=fits)
+        tl.store(mean + 3 * k, x, mask=has_slot)
+        tl.store(mean + 3 * k + 1, y, mask=has_slot)
+        tl.store(mean + 3 * k + 2, z, mask=has_slot)
+        store_symmetric(covariance + 9 * k, xx, xy, xz, yy, yz, zz, has_slot)
+        tl.store(weight + k, pi, mask=has_slot)
+        tl.store(disagreement + k, pi * 0.0, mask=has_slot)
+        tl.store(count + k, (lane * 0 + 1).to(tl.int64), mask=has_slot)
         if channels > 0:
-            wanted = fits[:, None] & (f < channels)[None, :]
-            value = tl.load(features_c + c[:, None] * channels + f[None, :], mask=wanted, other=0.0)
-            tl.store(features + k[:, None] * channels + f[None, :], value, mask=wanted)
-        over = new & ~fits
+            stored = has_slot[:, None] & (f < channels)[None, :]
+            value = tl.load(features_c + c[:, None] * channels + f[None, :], mask=stored, other=0.0)
+            tl.store(features + k[:, None] * channels + f[None, :], value, mask=stored)
+        without_slot = new & ~has_slot
         if last:
-            dropped += tl.sum(over.to(tl.int32), 0)
-            added -= tl.sum(over.to(tl.int32), 0)
-            over = over & (lane < 0)
-        tl.store(left + c, over, mask=there)
-        n += tl.sum(fits.to(tl.int32), 0)
+            dropped += tl.sum(without_slot.to(tl.int32), 0)
+            added -= tl.sum(without_slot.to(tl.int32), 0)
+            without_slot = without_slot & (lane < 0)
+        tl.store(waiting_mask + c, without_slot, mask=inside)
+        n += tl.sum(has_slot.to(tl.int32), 0)
         added += tl.sum(new.to(tl.int32), 0)
-        waiting += tl.sum(over.to(tl.int32), 0)
+        waiting += tl.sum(without_slot.to(tl.int32), 0)
     tl.store(needed + b, n + waiting)
     if not again:
         tl.store(counts + b, n)

@@ -1,4 +1,4 @@
-"""The check of a frame's values on a GPU in two launches: a program per stream for the camera, one per 1,024 pixels."""
+"""Check of a frame's values on a GPU in two launches: a program per stream for the camera, one per 1,024 pixels."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def check_values(
     pose, intrinsics = (of_streams(camera, b) for camera in (pose, intrinsics))
     host_fault = None
     if pose.device.type == intrinsics.device.type == "cpu" != device.type:
-        first = pose_fault(pose, rotation_deviation(pose[..., :3, :3]), rotation_tolerance)
-        host_fault = torch.where(first > 0, first, intrinsics_fault(intrinsics, (height, width)))
+        pose_faults = pose_fault(pose, rotation_deviation(pose[..., :3, :3]), rotation_tolerance)
+        host_fault = torch.where(pose_faults > 0, pose_faults, intrinsics_fault(intrinsics, (height, width)))
     T, K = (v.to(device, non_blocking=True).contiguous() for v in (pose, intrinsics))
     T_safe, K_safe, deviation = torch.empty_like(T), torch.empty_like(K), T.new_empty(b)
     counts = torch.zeros(2, b, dtype=torch.int64, device=device)
@@ -56,8 +56,8 @@ def check_values(
     launch(
         _maps, (triton.cdiv(height * width, 1024), b), depth,
         *(depth if v is None else v.detach().contiguous() for v in optional), fault, safe, valid, counts,
-        height * width, b, masked=mask is not None, a_given=aleatoric is not None,
-        e_given=epistemic is not None, channels=0 if features is None else features.shape[1],
+        height * width, b, masked=mask is not None, has_aleatoric=aleatoric is not None,
+        has_epistemic=epistemic is not None, channels=0 if features is None else features.shape[1],
         nearest=DEPTH_RANGE[0], deepest=DEPTH_RANGE[1], max_depth=float(max_depth), largest=LARGEST, chunk=1024,
     )  # fmt: skip
     return FrameInput(
@@ -75,9 +75,9 @@ def _gram(a, b, c, d, e, f, g, h, i):
 
 
 @triton.jit
-def _some(bad):
-    """True if any of a block of flags is set."""
-    return tl.sum(bad.to(tl.int32), 0) > 0
+def _any(flags):
+    """True if any flag of a block is set."""
+    return tl.sum(flags.to(tl.int32), 0) > 0
 
 
 @triton.jit
@@ -96,10 +96,10 @@ def _camera(
     g, h, i = tl.load(T + 8), tl.load(T + 9), tl.load(T + 10)
     g0, g1, g2, g3, g4, g5 = _gram(a, b, c, d, e, f, g, h, i)
     diagonal = tl.maximum(tl.abs(g0 - 1), tl.maximum(tl.abs(g3 - 1), tl.abs(g5 - 1)))
-    off = tl.maximum(tl.abs(g1), tl.maximum(tl.abs(g2), tl.abs(g4)))
+    off_diagonal = tl.maximum(tl.abs(g1), tl.maximum(tl.abs(g2), tl.abs(g4)))
     total = g0 + g1 + g2 + g3 + g4 + g5
-    apart = tl.where(total != total, float("nan"), tl.maximum(diagonal, off))
-    tl.store(deviation + stream, apart)
+    error = tl.where(total != total, float("nan"), tl.maximum(diagonal, off_diagonal))
+    tl.store(deviation + stream, error)
 
     focal_x, focal_y, cx, cy = tl.load(K), tl.load(K + 4), tl.load(K + 2), tl.load(K + 5)
     determinant = (b * f - c * e) * g + (c * d - a * f) * h + (a * e - b * d) * i
@@ -108,16 +108,16 @@ def _camera(
     zeros = (entry == 1) | (entry == 3) | (entry == 6) | (entry == 7)
     least, most = tl.minimum(focal_x, focal_y), tl.maximum(focal_x, focal_y)
     fault = 0
-    # From the last check to the first: the first that fails is the fault.
+    # In reverse order of the checks, so that the first failed check determines the fault.
     fault = tl.where((tl.minimum(cx, cy) < -0.5) | (cx > width - 0.5) | (cy > height - 0.5), 9, fault)
     fault = tl.where((least < exact(shortest, least)) | (most > exact(longest, most)), 8, fault)
-    fault = tl.where(_some(zeros & (k != 0)) | (tl.load(K + 8) != 1) | (focal_x <= 0) | (focal_y <= 0), 6, fault)
-    fault = tl.where(_some(k - k != 0), 5, fault)
-    fault = tl.where(_some(shift & (tl.abs(t) > exact(farthest, t))), 7, fault)
+    fault = tl.where(_any(zeros & (k != 0)) | (tl.load(K + 8) != 1) | (focal_x <= 0) | (focal_y <= 0), 6, fault)
+    fault = tl.where(_any(k - k != 0), 5, fault)
+    fault = tl.where(_any(shift & (tl.abs(t) > exact(farthest, t))), 7, fault)
     fault = tl.where(determinant < 0, 4, fault)
-    fault = tl.where(apart > exact(tolerance, apart), 3, fault)
-    fault = tl.where(_some((entry >= 12) & (last > exact(tolerance, last))), 2, fault)
-    fault = tl.where(_some(t - t != 0), 1, fault)
+    fault = tl.where(error > exact(tolerance, error), 3, fault)
+    fault = tl.where(_any((entry >= 12) & (last > exact(tolerance, last))), 2, fault)
+    fault = tl.where(_any(t - t != 0), 1, fault)
     tl.store(faults + stream, fault)
 
     fine = fault == 0
@@ -148,30 +148,30 @@ def _camera(
 @triton.jit
 def _maps(
     depth, mask, aleatoric, epistemic, features, faults, safe, valid, counts, pixels, streams,
-    masked: tl.constexpr, a_given: tl.constexpr, e_given: tl.constexpr, channels: tl.constexpr, nearest: tl.constexpr,
-    deepest: tl.constexpr, max_depth: tl.constexpr, largest: tl.constexpr, chunk: tl.constexpr,
+    masked: tl.constexpr, has_aleatoric: tl.constexpr, has_epistemic: tl.constexpr, channels: tl.constexpr,
+    nearest: tl.constexpr, deepest: tl.constexpr, max_depth: tl.constexpr, largest: tl.constexpr, chunk: tl.constexpr,
 ):  # fmt: skip
     b = tl.program_id(1).to(tl.int64)
     i = tl.program_id(0) * chunk + tl.arange(0, chunk)
     inside = i < pixels
-    at = b * pixels + i
-    z = tl.load(depth + at, mask=inside, other=0.0)
+    pixel = b * pixels + i
+    z = tl.load(depth + pixel, mask=inside, other=0.0)
     has_depth = inside & (z > 0) & (z < float("inf")) & (tl.load(faults + b) == 0)
     if masked:
-        has_depth = has_depth & (tl.load(mask + at, mask=inside, other=0) != 0)
+        has_depth = has_depth & (tl.load(mask + pixel, mask=inside, other=0) != 0)
     beyond = has_depth & (z > exact(max_depth, z))
     near = has_depth & ~beyond
     use = near & (z >= exact(nearest, z)) & (z <= exact(deepest, z))
-    if a_given:
-        variance = tl.load(aleatoric + at, mask=inside, other=0.0)
+    if has_aleatoric:
+        variance = tl.load(aleatoric + pixel, mask=inside, other=0.0)
         use = use & (variance >= 0) & (variance <= exact(largest, variance))
-    if e_given:
-        variance = tl.load(epistemic + at, mask=inside, other=0.0)
+    if has_epistemic:
+        variance = tl.load(epistemic + pixel, mask=inside, other=0.0)
         use = use & (variance >= 0) & (variance <= exact(largest, variance))
     for channel in tl.static_range(channels):
         value = tl.load(features + (b * channels + channel) * pixels + i, mask=inside, other=0.0)
         use = use & (tl.abs(value) <= exact(largest, value))
-    tl.store(safe + at, tl.where(use, z, 0.0), mask=inside)
-    tl.store(valid + at, use, mask=inside)
+    tl.store(safe + pixel, tl.where(use, z, 0.0), mask=inside)
+    tl.store(valid + pixel, use, mask=inside)
     tl.atomic_add(counts + b, tl.sum(beyond.to(tl.int32), 0))
     tl.atomic_add(counts + streams + b, tl.sum((near & ~use).to(tl.int32), 0))

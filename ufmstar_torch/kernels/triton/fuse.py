@@ -1,7 +1,7 @@
-"""Fusion on a GPU: a lane per (stream, component) walks its matches in order, with no rounds and no read.
+"""Fusion on a GPU: a lane per (stream, component) fuses its matches in order, without rounds and without synchronising.
 
-A program holds 32 components of a stream in registers. As long as one of them has a match left, each takes its next
-one; a component without any is copied as it is.
+A program holds 32 components of a stream in registers. While any of them has a match left, each fuses its next match.
+A component without matches is copied unchanged.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def fuse(
     *,
     rounds: int | None = None,
 ) -> GaussianMixture:
-    """As :func:`ufmstar_torch.fuse.fuse`; ``rounds`` is not needed."""
+    """As :func:`ufmstar_torch.fuse.fuse`; ``rounds`` is ignored."""
     b, c, k = pairs.match.shape
     device = pairs.match.device
     words = triton.cdiv(c, WORD)
@@ -64,19 +64,20 @@ def fuse_bits(
     Args:
         mixture: M_(i-1), [B, K].
         current: C_i, [B, C] float64.
-        motion: R [B, 3, 3] and t [B, 3] float64 that take ``current`` into the mixture's frame.
-        matches: bits [B, K, words], the listed c's [B, C], each k's place in the bits [B, K], the number of c's [B].
+        motion: R [B, 3, 3] and t [B, 3] float64 from the frame of ``current`` to the mixture's frame.
+        matches: bits [B, K, words], indices of the listed c's [B, C], row of each k in the bits [B, K], number of
+            listed c's [B].
         config: of UfM*.
-        pairs: overlaps and distances where the config needs them; None = W2^2, not weighted by overlap.
+        pairs: overlaps and distances if the config needs them; None = W2^2, not weighted by overlap.
     """
     b, k = mixture.weight.shape
     out = GaussianMixture(**{name: torch.empty_like(value.contiguous()) for name, value in mixture.tensors().items()})
     bits, index, position, count = matches
     has_distance = pairs is not None and pairs.distance is not None
     weighted = pairs is not None and config.overlap_weighted
-    nothing = current.weight
-    overlap = pairs.overlap.contiguous() if pairs is not None and weighted else nothing
-    distance = pairs.distance.contiguous() if pairs is not None and pairs.distance is not None else nothing
+    unused = current.weight
+    overlap = pairs.overlap.contiguous() if pairs is not None and weighted else unused
+    distance = pairs.distance.contiguous() if pairs is not None and pairs.distance is not None else unused
     channels = mixture.features.shape[2]
     launch(
         _fuse, (triton.cdiv(k, _LANES), b),
@@ -101,12 +102,12 @@ def floor_covariance(covariance: Tensor, floor: Tensor) -> Tensor:
 @triton.jit
 def _floor(covariance, floor, lifted, count, chunk: tl.constexpr):
     n = tl.program_id(0) * chunk + tl.arange(0, chunk)
-    there = n < count
+    inside = n < count
     n = n.to(tl.int64)
-    limit = tl.load(floor + n, mask=there, other=0.0)
-    xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * n, 1, there)
+    limit = tl.load(floor + n, mask=inside, other=0.0)
+    xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * n, 1, inside)
     xx, xy, xz, yy, yz, zz = floored(xx, xy, xz, yy, yz, zz, limit)
-    store_symmetric(lifted + 9 * n, xx, xy, xz, yy, yz, zz, there)
+    store_symmetric(lifted + 9 * n, xx, xy, xz, yy, yz, zz, inside)
 
 
 @triton.jit
@@ -114,51 +115,51 @@ def _fuse(
     mean, covariance, weight, disagreement, count, features,
     mean_c, covariance_c, weight_c, disagreement_c, count_c, features_c,
     R, t, bits, index_c, position, listed_c, overlap, distances,
-    mean_o, covariance_o, weight_o, disagreement_o, count_o, features_o, many_k, many_c, words,
+    mean_o, covariance_o, weight_o, disagreement_o, count_o, features_o, capacity_k, capacity_c, words,
     epsilon: tl.constexpr, weighted: tl.constexpr, has_distance: tl.constexpr, channels: tl.constexpr,
     padded: tl.constexpr, word: tl.constexpr, lanes: tl.constexpr,
 ):  # fmt: skip
     b = tl.program_id(1).to(tl.int64)
     stored = mean.dtype.element_ty
     slot = tl.program_id(0) * lanes + tl.arange(0, lanes)
-    there = slot < many_k
-    k = b * many_k + slot
+    inside = slot < capacity_k
+    k = b * capacity_k + slot
     R, t = R + 9 * b, t + 3 * b
     f = tl.arange(0, padded)
-    x = tl.load(mean + 3 * k, mask=there, other=0.0).to(tl.float64)
-    y = tl.load(mean + 3 * k + 1, mask=there, other=0.0).to(tl.float64)
-    z = tl.load(mean + 3 * k + 2, mask=there, other=0.0).to(tl.float64)
-    xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * k, 1, there)
-    # A rotation leaves the rounding of one entry and its mirror image apart; where nothing is fused both stay.
-    yx = tl.load(covariance + 9 * k + 3, mask=there, other=0.0).to(tl.float64)
-    zx = tl.load(covariance + 9 * k + 6, mask=there, other=0.0).to(tl.float64)
-    zy = tl.load(covariance + 9 * k + 7, mask=there, other=0.0).to(tl.float64)
-    pi = tl.load(weight + k, mask=there, other=0.0).to(tl.float64)
-    m = tl.load(disagreement + k, mask=there, other=0.0).to(tl.float64)
-    seen = tl.load(count + k, mask=there, other=0)
-    in_f = there[:, None] & (f < channels)[None, :]
+    x = tl.load(mean + 3 * k, mask=inside, other=0.0).to(tl.float64)
+    y = tl.load(mean + 3 * k + 1, mask=inside, other=0.0).to(tl.float64)
+    z = tl.load(mean + 3 * k + 2, mask=inside, other=0.0).to(tl.float64)
+    xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * k, 1, inside)
+    # A rotation rounds mirrored entries differently. Components without matches retain both triangles.
+    yx = tl.load(covariance + 9 * k + 3, mask=inside, other=0.0).to(tl.float64)
+    zx = tl.load(covariance + 9 * k + 6, mask=inside, other=0.0).to(tl.float64)
+    zy = tl.load(covariance + 9 * k + 7, mask=inside, other=0.0).to(tl.float64)
+    pi = tl.load(weight + k, mask=inside, other=0.0).to(tl.float64)
+    m = tl.load(disagreement + k, mask=inside, other=0.0).to(tl.float64)
+    views = tl.load(count + k, mask=inside, other=0)
+    in_f = inside[:, None] & (f < channels)[None, :]
     h = tl.zeros([lanes, padded], tl.float64)
     if channels > 0:
         h = tl.load(features + k[:, None] * channels + f[None, :], mask=in_f, other=0.0).to(tl.float64)
-    at = tl.load(position + k, mask=there, other=-1)
+    row = tl.load(position + k, mask=inside, other=-1)
     n = tl.load(listed_c + b)
     for w in range(tl.cdiv(n, word)):
-        left = tl.load(bits + (b * many_k + at) * words + w, mask=at >= 0, other=0)
-        while tl.max(left, 0) > 0:
-            use = left != 0
-            bit, rest = lowest_bit(tl.where(use, left, 1))
-            left = tl.where(use, rest, 0)
-            c = tl.load(index_c + b * many_c + w * word + bit, mask=use, other=0)
-            at_c = b * many_c + c
-            cx = tl.load(mean_c + 3 * at_c, mask=use, other=0.0).to(tl.float64)
-            cy = tl.load(mean_c + 3 * at_c + 1, mask=use, other=0.0).to(tl.float64)
-            cz = tl.load(mean_c + 3 * at_c + 2, mask=use, other=0.0).to(tl.float64)
-            c0, c1, c2, c3, c4, c5 = load_symmetric(covariance_c + 9 * at_c, 1, use)
+        remaining = tl.load(bits + (b * capacity_k + row) * words + w, mask=row >= 0, other=0)
+        while tl.max(remaining, 0) > 0:
+            use = remaining != 0
+            bit, rest = lowest_bit(tl.where(use, remaining, 1))
+            remaining = tl.where(use, rest, 0)
+            c = tl.load(index_c + b * capacity_c + w * word + bit, mask=use, other=0)
+            index = b * capacity_c + c
+            cx = tl.load(mean_c + 3 * index, mask=use, other=0.0).to(tl.float64)
+            cy = tl.load(mean_c + 3 * index + 1, mask=use, other=0.0).to(tl.float64)
+            cz = tl.load(mean_c + 3 * index + 2, mask=use, other=0.0).to(tl.float64)
+            c0, c1, c2, c3, c4, c5 = load_symmetric(covariance_c + 9 * index, 1, use)
             cx, cy, cz = moved(R, t, cx, cy, cz)
             c0, c1, c2, c3, c4, c5 = turned(R, c0, c1, c2, c3, c4, c5)
-            pi_c = tl.load(weight_c + at_c, mask=use, other=0.0).to(tl.float64)
+            pi_c = tl.load(weight_c + index, mask=use, other=0.0).to(tl.float64)
             if weighted:
-                pi_c = pi_c * tl.load(overlap + at_c * many_k + slot, mask=use, other=0.0).to(tl.float64)
+                pi_c = pi_c * tl.load(overlap + index * capacity_k + slot, mask=use, other=0.0).to(tl.float64)
             lam = pi_c / tl.where(use, pi + pi_c, 1.0)
             nx, ny, nz, n0, n1, n2, n3, n4, n5, d = geodesic(
                 x, y, z, tl.where(use, xx, 1.0), tl.where(use, xy, 0.0), tl.where(use, xz, 0.0),
@@ -167,9 +168,9 @@ def _fuse(
                 tl.where(use, c3, 1.0), tl.where(use, c4, 0.0), tl.where(use, c5, 1.0), lam,
             )  # fmt: skip
             if has_distance:
-                d = tl.load(distances + at_c * many_k + slot, mask=use, other=0.0).to(tl.float64)
+                d = tl.load(distances + index * capacity_k + slot, mask=use, other=0.0).to(tl.float64)
             n0, n1, n2, n3, n4, n5 = floored(n0, n1, n2, n3, n4, n5, epsilon * (n0 + n3 + n5))
-            # After each match the values take the precision they are stored in.
+            # After each match, the values are rounded to the stored precision.
             x = tl.where(use, nx.to(stored).to(tl.float64), x)
             y = tl.where(use, ny.to(stored).to(tl.float64), y)
             z = tl.where(use, nz.to(stored).to(tl.float64), z)
@@ -182,21 +183,21 @@ def _fuse(
             yx, zx, zy = tl.where(use, xy, yx), tl.where(use, xz, zx), tl.where(use, yz, zy)
             pi = tl.where(use, (pi + pi_c).to(stored).to(tl.float64), pi)
             m = tl.where(use, ((1 - lam) * m + lam * d).to(stored).to(tl.float64), m)
-            seen = tl.where(use, seen + 1, seen)
+            views = tl.where(use, views + 1, views)
             if channels > 0:
-                from_c = features_c + at_c[:, None] * channels + f[None, :]
+                from_c = features_c + index[:, None] * channels + f[None, :]
                 new = tl.load(from_c, mask=in_f & use[:, None], other=0.0).to(tl.float64)
                 mixed = ((1 - lam)[:, None] * h + lam[:, None] * new).to(stored).to(tl.float64)
                 h = tl.where(use[:, None], mixed, h)
-    tl.store(mean_o + 3 * k, x, mask=there)
-    tl.store(mean_o + 3 * k + 1, y, mask=there)
-    tl.store(mean_o + 3 * k + 2, z, mask=there)
-    store_symmetric(covariance_o + 9 * k, xx, xy, xz, yy, yz, zz, there)
-    tl.store(covariance_o + 9 * k + 3, yx, mask=there)
-    tl.store(covariance_o + 9 * k + 6, zx, mask=there)
-    tl.store(covariance_o + 9 * k + 7, zy, mask=there)
-    tl.store(weight_o + k, pi, mask=there)
-    tl.store(disagreement_o + k, m, mask=there)
-    tl.store(count_o + k, seen, mask=there)
+    tl.store(mean_o + 3 * k, x, mask=inside)
+    tl.store(mean_o + 3 * k + 1, y, mask=inside)
+    tl.store(mean_o + 3 * k + 2, z, mask=inside)
+    store_symmetric(covariance_o + 9 * k, xx, xy, xz, yy, yz, zz, inside)
+    tl.store(covariance_o + 9 * k + 3, yx, mask=inside)
+    tl.store(covariance_o + 9 * k + 6, zx, mask=inside)
+    tl.store(covariance_o + 9 * k + 7, zy, mask=inside)
+    tl.store(weight_o + k, pi, mask=inside)
+    tl.store(disagreement_o + k, m, mask=inside)
+    tl.store(count_o + k, views, mask=inside)
     if channels > 0:
         tl.store(features_o + k[:, None] * channels + f[None, :], h, mask=in_f)

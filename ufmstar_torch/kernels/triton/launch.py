@@ -1,4 +1,4 @@
-"""Launches every kernel."""
+"""Launch of Triton kernels."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def launch(
 
     Args:
         kernel: compiled by ``triton.jit``.
-        grid: numbers of programs; with a 0 among them nothing runs.
+        grid: numbers of programs; if one is 0, nothing runs.
         arguments: tensors (contiguous), integers.
-        warps: of 32 threads, in a program.
-        fused: whether a product and a sum may be rounded once. Where a decision hangs on a value they may not, or it
-            would differ from the CPU's.
-        meta: compile-time constants. Every number that is no integer is one: as an argument it would be float32.
+        warps: number of warps of 32 threads in a program.
+        fused: whether to contract products and sums (fused multiply-add). Kernels that decide by thresholds must not:
+            their decisions would differ from the CPU's.
+        meta: compile-time constants. Floats must be constants, since an argument would be rounded to float32.
     """
     if 0 in grid:
         return

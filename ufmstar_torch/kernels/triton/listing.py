@@ -1,6 +1,6 @@
-"""The components that can matter in an image, listed by a program per stream: the first level of the culling.
+"""First level of the culling: a program per stream lists the components that can contribute to an image.
 
-The silhouette of the ellipsoid outside of which a density stays below the threshold is compared with the image.
+It compares the image with the silhouette of the ellipsoid outside of which a component's density is below a threshold.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from ufmstar_torch.kernels.triton.launch import launch
 from ufmstar_torch.kernels.triton.matrices import load_symmetric, moved, turned
 from ufmstar_torch.mixture import GaussianMixture
 
-# As the CPU's: share of the denominator that culling may leave out, and that of the prior in a threshold.
+# As on the CPU: share of the denominator that culling may omit, and share of the prior in the threshold.
 EPSILON = {torch.float32: 1e-7, torch.float64: 1e-14}
 PRIOR = 1e-3
 _LOG2_E = tl.constexpr(math.log2(math.e))
 _HALF_LOG_TWO_PI_CUBED = tl.constexpr(1.5 * math.log(2 * math.pi))
-_SLOTS = 128  # slots of the mixture looked at together
+_SLOTS = 128  # slots of the mixture processed together
 
 
 def prepare(
@@ -33,7 +33,7 @@ def prepare(
     config: UfMStarConfig,
     motion: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The components that can matter in the image, listed in their order.
+    """List the components that can contribute to the image, in slot order.
 
     Args:
         mixture: [B, K].
@@ -41,7 +41,7 @@ def prepare(
         size: H and W [px].
         dtype: of the regression.
         config: of UfM*.
-        motion: R [B, 3, 3] and t [B, 3] float64 from the mixture's frame into the camera's; None = it is there.
+        motion: R [B, 3, 3] and t [B, 3] float64 from the mixture's frame to the camera's; None = identity.
 
     Returns:
         Means [B, 3, K] float64 [m]; whitening and log2 of the peak [B, 7, K] in ``dtype``; index [B, K] int32 into the
@@ -82,7 +82,7 @@ def whitened(xx, xy, xz, yy, yz, zz):
 def _outside(m, z, smm, smz, square, a, focal, centre, size):
     """True if the silhouette of the ellipsoid (x - mu)^T S^-1 (x - mu) = square lies outside the image along one axis.
 
-    It lies between the planes x = s z that touch it, (mu_x - s mu_z)^2 = square (S_xx - 2 s S_xz + s^2 S_zz).
+    The silhouette lies between the tangent planes x = s z, (mu_x - s mu_z)^2 = square (S_xx - 2 s S_xz + s^2 S_zz).
     """
     half_b = m * z - square * smz
     root = tl.sqrt(tl.maximum(half_b * half_b - a * (m * m - square * smm), 0.0))
@@ -107,18 +107,18 @@ def _prepare(
     n = 0
     for first in range(0, capacity, chunk):
         k = b * capacity + first + lane
-        there = first + lane < capacity
-        w = tl.load(weight + k, mask=there, other=0.0).to(tl.float64)
-        there = there & (w > 0)
-        x = tl.load(mean + 3 * k, mask=there, other=0.0).to(tl.float64)
-        y = tl.load(mean + 3 * k + 1, mask=there, other=0.0).to(tl.float64)
-        z = tl.load(mean + 3 * k + 2, mask=there, other=0.0).to(tl.float64)
+        inside = first + lane < capacity
+        w = tl.load(weight + k, mask=inside, other=0.0).to(tl.float64)
+        inside = inside & (w > 0)
+        x = tl.load(mean + 3 * k, mask=inside, other=0.0).to(tl.float64)
+        y = tl.load(mean + 3 * k + 1, mask=inside, other=0.0).to(tl.float64)
+        z = tl.load(mean + 3 * k + 2, mask=inside, other=0.0).to(tl.float64)
         x, y, z = moved(R, t, x, y, z)
-        xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * k, 1, there)
-        xx, yy, zz = tl.where(there, xx, 1.0), tl.where(there, yy, 1.0), tl.where(there, zz, 1.0)
+        xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * k, 1, inside)
+        xx, yy, zz = tl.where(inside, xx, 1.0), tl.where(inside, yy, 1.0), tl.where(inside, zz, 1.0)
         xx, xy, xz, yy, yz, zz = turned(R, xx, xy, xz, yy, yz, zz)
         i00, i10, i11, i20, i21, i22, det = whitened(xx, xy, xz, yy, yz, zz)
-        peak = tl.log(tl.where(there, w, 1.0) / det) - _HALF_LOG_TWO_PI_CUBED
+        peak = tl.log(tl.where(inside, w, 1.0) / det) - _HALF_LOG_TWO_PI_CUBED
 
         square = 2 * (peak - limit / _LOG2_E) * (1 + 1e-6)
         least = 1e-14 * tl.maximum(xx, tl.maximum(yy, zz))
@@ -129,15 +129,15 @@ def _prepare(
         a = tl.where(behind | anywhere, 1.0, a)
         outside = _outside(x, z, xx + least, xz, square, a, tl.load(camera), tl.load(camera + 2), width)
         outside = outside | _outside(y, z, yy + least, yz, square, a, tl.load(camera + 4), tl.load(camera + 5), height)
-        seen = there & (anywhere | ~outside) & ~behind
+        seen = inside & (anywhere | ~outside) & ~behind
 
-        at = n + tl.cumsum(seen.to(tl.int32), 0) - 1
-        tl.store(index + b * capacity + at, (first + lane).to(tl.int32), mask=seen)
-        out = means + 3 * b * capacity + at
+        rank = n + tl.cumsum(seen.to(tl.int32), 0) - 1
+        tl.store(index + b * capacity + rank, (first + lane).to(tl.int32), mask=seen)
+        out = means + 3 * b * capacity + rank
         tl.store(out, x, mask=seen)
         tl.store(out + capacity, y, mask=seen)
         tl.store(out + 2 * capacity, z, mask=seen)
-        out = fields + 7 * b * capacity + at
+        out = fields + 7 * b * capacity + rank
         scale = tl.sqrt(w * 0.0 + 0.5 * _LOG2_E)
         tl.store(out, i00 * scale, mask=seen)
         tl.store(out + capacity, i10 * scale, mask=seen)

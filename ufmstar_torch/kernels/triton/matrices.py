@@ -1,7 +1,7 @@
-"""Symmetric 3x3 matrices in registers: the twins of ``ufmstar_torch.gaussian`` inside Triton kernels.
+"""Symmetric 3x3 matrices in registers: functions of ``ufmstar_torch.gaussian`` for Triton kernels.
 
-A symmetric matrix is its upper triangle (xx, xy, xz, yy, yz, zz), a lower triangular one its rows
-(00, 10, 11, 20, 21, 22), any other its nine entries row by row. Entries are float64 blocks of any one shape.
+A symmetric matrix is stored as its upper triangle (xx, xy, xz, yy, yz, zz), a lower triangular one as its rows
+(00, 10, 11, 20, 21, 22), any other as its nine entries, row by row. The entries are float64 blocks of one shape.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ _SWEEPS = tl.constexpr(6)  # of cyclic Jacobi; gaussian._SWEEPS is enough, one m
 
 @triton.jit
 def exact(number: tl.constexpr, like):
-    """A constant in the precision of another value. Triton 3.6 rounds it to float32 in a comparison or a maximum."""
+    """A constant in the dtype of ``like``. Triton 3.6 rounds a Python float to float32 in comparisons and maxima."""
     return tl.full([], number, like.dtype)
 
 
 @triton.jit
 def lowest_bit(mask):
-    """The number of the lowest bit set in int64 ``mask`` (of bits 0 to 62, not 0), and the mask without it."""
+    """Index of the lowest set bit of int64 ``mask`` (not 0, bits 0 to 62), and the mask without this bit."""
     low = mask & -mask
     return ((low.to(tl.float64).to(tl.int64, bitcast=True) >> 52) & 0x7FF) - 1023, mask ^ low
 
@@ -77,18 +77,19 @@ def turned(R, xx, xy, xz, yy, yz, zz):
 
 @triton.jit
 def cholesky(xx, xy, xz, yy, yz, zz):
-    """Lower Cholesky factor of a positive semidefinite matrix; a pivot at rounding ends its column with zeros."""
+    """Lower Cholesky factor of a positive semidefinite matrix; a pivot within rounding errors sets its column to 0."""
     negligible = 16 * 2.220446049250313e-16 * tl.maximum(xx, tl.maximum(yy, zz))
-    some = xx > negligible
-    root = tl.sqrt(tl.where(some, xx, 1.0))
-    l00, l10, l20 = tl.where(some, xx / root, 0.0), tl.where(some, xy / root, 0.0), tl.where(some, xz / root, 0.0)
+    positive = xx > negligible
+    root = tl.sqrt(tl.where(positive, xx, 1.0))
+    l00, l10 = tl.where(positive, xx / root, 0.0), tl.where(positive, xy / root, 0.0)
+    l20 = tl.where(positive, xz / root, 0.0)
     pivot = yy - l10 * l10
-    some = pivot > negligible
-    root = tl.sqrt(tl.where(some, pivot, 1.0))
-    l11, l21 = tl.where(some, pivot / root, 0.0), tl.where(some, (yz - l20 * l10) / root, 0.0)
+    positive = pivot > negligible
+    root = tl.sqrt(tl.where(positive, pivot, 1.0))
+    l11, l21 = tl.where(positive, pivot / root, 0.0), tl.where(positive, (yz - l20 * l10) / root, 0.0)
     pivot = zz - l20 * l20 - l21 * l21
-    some = pivot > negligible
-    l22 = tl.where(some, pivot / tl.sqrt(tl.where(some, pivot, 1.0)), 0.0)
+    positive = pivot > negligible
+    l22 = tl.where(positive, pivot / tl.sqrt(tl.where(positive, pivot, 1.0)), 0.0)
     return l00, l10, l11, l20, l21, l22
 
 
@@ -140,7 +141,7 @@ def right_singular(m00, m01, m02, m10, m11, m12, m20, m21, m22):
 
 @triton.jit
 def floored(xx, xy, xz, yy, yz, zz, floor):
-    """The positive semidefinite matrix with its eigenvalues lifted to ``floor``; as it is where they are above."""
+    """Raise the eigenvalues of a positive semidefinite matrix to ``floor``; unchanged if all are above."""
     s0, s1, s2, v00, v01, v02, v10, v11, v12, v20, v21, v22 = right_singular(xx, xy, xz, xy, yy, yz, xz, yz, zz)
     low = tl.minimum(s0, tl.minimum(s1, s2)) < floor
     s0, s1, s2 = tl.maximum(s0, floor), tl.maximum(s1, floor), tl.maximum(s2, floor)
@@ -155,7 +156,7 @@ def floored(xx, xy, xz, yy, yz, zz, floor):
 
 
 @triton.jit
-def _back(l00, l10, l11, l20, l21, l22, x0, x1, x2):
+def _solve_transposed(l00, l10, l11, l20, l21, l22, x0, x1, x2):
     """L^-T x."""
     y2 = x2 / l22
     y1 = (x1 - l21 * y2) / l11
@@ -164,7 +165,7 @@ def _back(l00, l10, l11, l20, l21, l22, x0, x1, x2):
 
 @triton.jit
 def geodesic(ax, ay, az, a0, a1, a2, a3, a4, a5, bx, by, bz, b0, b1, b2, b3, b4, b5, lam):
-    """Mean (3) and covariance (6) of Gaussian a moved by ``lam`` towards b, and W2^2 between the two as they were."""
+    """Mean (3) and covariance (6) of Gaussian a moved by ``lam`` towards b, and W2^2 between a and b."""
     l0, l1, l2, l3, l4, l5 = cholesky(a0, a1, a2, a3, a4, a5)
     k0, k1, k2, k3, k4, k5 = cholesky(b0, b1, b2, b3, b4, b5)
     s0, s1, s2, v00, v01, v02, v10, v11, v12, v20, v21, v22 = right_singular(
@@ -175,9 +176,9 @@ def geodesic(ax, ay, az, a0, a1, a2, a3, a4, a5, bx, by, bz, b0, b1, b2, b3, b4,
     shape = (a0 + a3 + a5) + (b0 + b3 + b5) - 2 * (s0 + s1 + s2)
     dx, dy, dz = ax - bx, ay - by, az - bz
     distance = dx * dx + dy * dy + dz * dz + tl.maximum(shape, 0.0)
-    h00, h10, h20 = _back(l0, l1, l2, l3, l4, l5, v00, v10, v20)
-    h01, h11, h21 = _back(l0, l1, l2, l3, l4, l5, v01, v11, v21)
-    h02, h12, h22 = _back(l0, l1, l2, l3, l4, l5, v02, v12, v22)
+    h00, h10, h20 = _solve_transposed(l0, l1, l2, l3, l4, l5, v00, v10, v20)
+    h01, h11, h21 = _solve_transposed(l0, l1, l2, l3, l4, l5, v01, v11, v21)
+    h02, h12, h22 = _solve_transposed(l0, l1, l2, l3, l4, l5, v02, v12, v22)
     rest = 1 - lam
     t0 = lam * (h00 * s0 * h00 + h01 * s1 * h01 + h02 * s2 * h02) + rest
     t1 = lam * (h00 * s0 * h10 + h01 * s1 * h11 + h02 * s2 * h12)

@@ -1,9 +1,9 @@
 """Gaussian mixture regression on a GPU: the exact sum with culling in two levels.
 
-The bound is that of ``kernels.regress_cull_cpu``: a component is left out where its density is at most
-(eps / 3n) max(max_j l_j, pi_0 / 1000), l_j a lower bound of the densities there. Here the levels are the image (a
-program per stream lists the components whose silhouette meets it) and a tile of 16 x 16 pixels (a program). Of chosen
-pixels, 256 in their order take the place of a tile.
+The bound is that of ``kernels.regress_cull_cpu``: a component is omitted where its density is at most
+(eps / 3n) max(max_j l_j, pi_0 / 1000), with a lower bound l_j of each density. The first level is the image: a program
+per stream lists the components whose silhouette meets it. The second level is a tile of 16 x 16 pixels, with a program
+each. Chosen pixels are processed in groups of 256 instead of tiles.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from ufmstar_torch.regress import Regression
 from ufmstar_torch.regress import regress_image as reference
 
 _SIDE = 16  # pixels of a tile
-_CHUNK = 32  # components bounded at a time: the bits of a mask
+_CHUNK = 32  # components bounded at a time, the bits of a mask
 _UNMEASURED = {"paper": 0, "relative": 1, "nan": 2}
 
 
 @dataclass(frozen=True)
 class FrameRegression:
-    """Step 5 and what follows it in a step.
+    """Maps of step 5 and of the moving average.
 
     Attributes:
         disagreement: M [B, H, W] [m^2] after the moving average, NaN where not valid.
@@ -58,11 +58,11 @@ def regress_frame(
     *,
     smooth: bool,
 ) -> FrameRegression:
-    """Regression, what was not measured, and the moving average at every pixel, in two launches.
+    """Compute regression, unmeasured pixels and moving average of a frame in two launches.
 
     Args:
         mixture: M_i, [B, K].
-        to_camera: R and t that take it into the camera frame.
+        to_camera: R and t from the mixture's frame to the camera frame.
         frame: of B streams.
         memory: of the moving average.
         config: exact regression, no anchors.
@@ -93,7 +93,7 @@ def regress_image(
     config: UfMStarConfig,
     pixels: Tensor | None = None,
 ) -> Regression:
-    """As :func:`ufmstar_torch.regress.regress_image`; ``config.regression == "neighbourhood"`` runs there."""
+    """As :func:`ufmstar_torch.regress.regress_image`; which also runs ``config.regression == "neighbourhood"``."""
     if config.regression != "exact":
         return reference(mixture_cam, depth, intrinsics, valid, config, pixels)
     maps = depth.new_empty(depth.shape if pixels is None else pixels.shape)
@@ -129,26 +129,26 @@ def _launch(
 
 
 @triton.jit
-def mixed(before, now, alpha: tl.constexpr):
-    """The new memory of the moving average; NaN is no value."""
-    both = (1 - alpha) * before + alpha * now
-    return tl.where(now != now, before, tl.where(before != before, now, both))
+def mixed(running, newest, alpha: tl.constexpr):
+    """Update the moving average; NaN values are skipped."""
+    average = (1 - alpha) * running + alpha * newest
+    return tl.where(newest != newest, running, tl.where(running != running, newest, average))
 
 
 @triton.jit
-def _bounds(means, fields, capacity, j, there, cx, cy, cz, hx, hy, hz, slack: tl.constexpr):
-    """log2 of bounds of the densities of components j in the box centre +- half; nothing for those not ``there``."""
+def _bounds(means, fields, capacity, j, listed, cx, cy, cz, hx, hy, hz, slack: tl.constexpr):
+    """log2 of lower and upper bounds of the densities of components j in the box c +- h; -1e30 if not ``listed``."""
     real = fields.dtype.element_ty
-    mx = tl.load(means + j, mask=there, other=0.0).to(real)
-    my = tl.load(means + capacity + j, mask=there, other=0.0).to(real)
-    mz = tl.load(means + 2 * capacity + j, mask=there, other=0.0).to(real)
-    a = tl.load(fields + j, mask=there, other=0.0)
-    b = tl.load(fields + capacity + j, mask=there, other=0.0)
-    c = tl.load(fields + 2 * capacity + j, mask=there, other=0.0)
-    d = tl.load(fields + 3 * capacity + j, mask=there, other=0.0)
-    e = tl.load(fields + 4 * capacity + j, mask=there, other=0.0)
-    f = tl.load(fields + 5 * capacity + j, mask=there, other=0.0)
-    peak = tl.load(fields + 6 * capacity + j, mask=there, other=-1e30)
+    mx = tl.load(means + j, mask=listed, other=0.0).to(real)
+    my = tl.load(means + capacity + j, mask=listed, other=0.0).to(real)
+    mz = tl.load(means + 2 * capacity + j, mask=listed, other=0.0).to(real)
+    a = tl.load(fields + j, mask=listed, other=0.0)
+    b = tl.load(fields + capacity + j, mask=listed, other=0.0)
+    c = tl.load(fields + 2 * capacity + j, mask=listed, other=0.0)
+    d = tl.load(fields + 3 * capacity + j, mask=listed, other=0.0)
+    e = tl.load(fields + 4 * capacity + j, mask=listed, other=0.0)
+    f = tl.load(fields + 5 * capacity + j, mask=listed, other=0.0)
+    peak = tl.load(fields + 6 * capacity + j, mask=listed, other=-1e30)
     dx, dy, dz = cx - mx, cy - my, cz - mz
     wx, wy, wz = hx + slack * tl.abs(mx), hy + slack * tl.abs(my), hz + slack * tl.abs(mz)
     y0, r0 = tl.abs(a * dx), a * wx
@@ -165,7 +165,7 @@ def _bounds(means, fields, capacity, j, there, cx, cy, cz, hx, hy, hz, slack: tl
 @triton.jit
 def _regress(
     depth, valid, camera, pixels, means, fields, index, count, m, features, out, out_f,
-    compared, before, memory, measured, counts, height, width, chosen, capacity, streams,
+    compared, running, memory, measured, counts, height, width, chosen, capacity, streams,
     prior: tl.constexpr, prior_total: tl.constexpr, least: tl.constexpr, share: tl.constexpr, slack: tl.constexpr,
     channels: tl.constexpr, padded: tl.constexpr, side: tl.constexpr, chunk: tl.constexpr, subset: tl.constexpr,
     stepped: tl.constexpr, alpha: tl.constexpr, mode: tl.constexpr, relative: tl.constexpr,
@@ -190,26 +190,26 @@ def _regress(
         inside = (v < height) & (u < width)
         source = (b * height + v) * width + u
         target = source
-    ok = inside & (tl.load(valid + source, mask=inside, other=0) != 0)
-    z = tl.load(depth + source, mask=ok, other=0.0).to(tl.float64)
+    usable = inside & (tl.load(valid + source, mask=inside, other=0) != 0)
+    z = tl.load(depth + source, mask=usable, other=0.0).to(tl.float64)
     x = (u - tl.load(camera + 2)) / tl.load(camera) * z
     y = (v - tl.load(camera + 5)) / tl.load(camera + 4) * z
-    some = tl.sum(ok.to(tl.int32), 0) > 0
-    n = tl.where(some, tl.load(count + b), 0)
+    any_valid = tl.sum(usable.to(tl.int32), 0) > 0
+    n = tl.where(any_valid, tl.load(count + b), 0)
 
-    # The box of the points, and the nearest of them as their origin.
+    # The box of the points, and the nearest point as the origin.
     inf = float("inf")
-    x_low, x_high = tl.min(tl.where(ok, x, inf), 0), tl.max(tl.where(ok, x, -inf), 0)
-    y_low, y_high = tl.min(tl.where(ok, y, inf), 0), tl.max(tl.where(ok, y, -inf), 0)
-    z_low, z_high = tl.min(tl.where(ok, z, inf), 0), tl.max(tl.where(ok, z, -inf), 0)
-    x_low, x_high = tl.where(some, x_low, 0.0), tl.where(some, x_high, 0.0)
-    y_low, y_high = tl.where(some, y_low, 0.0), tl.where(some, y_high, 0.0)
-    z_low, z_high = tl.where(some, z_low, 0.0), tl.where(some, z_high, 0.0)
+    x_low, x_high = tl.min(tl.where(usable, x, inf), 0), tl.max(tl.where(usable, x, -inf), 0)
+    y_low, y_high = tl.min(tl.where(usable, y, inf), 0), tl.max(tl.where(usable, y, -inf), 0)
+    z_low, z_high = tl.min(tl.where(usable, z, inf), 0), tl.max(tl.where(usable, z, -inf), 0)
+    x_low, x_high = tl.where(any_valid, x_low, 0.0), tl.where(any_valid, x_high, 0.0)
+    y_low, y_high = tl.where(any_valid, y_low, 0.0), tl.where(any_valid, y_high, 0.0)
+    z_low, z_high = tl.where(any_valid, z_low, 0.0), tl.where(any_valid, z_high, 0.0)
     cx, cy, cz = 0.5 * (x_low + x_high), 0.5 * (y_low + y_high), 0.5 * (z_low + z_high)
     hx, hy, hz = 0.5 * (x_high - x_low), 0.5 * (y_high - y_low), 0.5 * (z_high - z_low)
     hx, hy, hz = hx + slack * (hx + tl.abs(cx)), hy + slack * (hy + tl.abs(cy)), hz + slack * (hz + tl.abs(cz))
     cx, cy, cz, hx, hy, hz = cx.to(real), cy.to(real), cz.to(real), hx.to(real), hy.to(real), hz.to(real)
-    nearest = tl.min(tl.where(ok & (z == z_low), lane, side * side), 0)
+    nearest = tl.min(tl.where(usable & (z == z_low), lane, side * side), 0)
     x_0, y_0 = tl.sum(tl.where(lane == nearest, x, 0.0), 0), tl.sum(tl.where(lane == nearest, y, 0.0), 0)
     x, y, z = (x - x_0).to(real), (y - y_0).to(real), (z - z_low).to(real)
 
@@ -222,16 +222,16 @@ def _regress(
 
     evidence = tl.full([side * side], prior, real)
     total = tl.full([side * side], prior_total, real)
-    seen = tl.zeros([side * side], real)
+    compared_sum = tl.zeros([side * side], real)
     f = tl.arange(0, padded)
     sums = tl.zeros([side * side, padded], real)
     for first in range(0, n, chunk):
-        there = first + part < n
-        _, upper = _bounds(means, fields, capacity, first + part, there, cx, cy, cz, hx, hy, hz, slack)
-        bits = tl.where(there & (upper > threshold), tl.full([chunk], 1, tl.int64) << part.to(tl.int64), 0)
-        left = tl.sum(bits, 0)
-        while left != 0:
-            bit, left = lowest_bit(left)
+        listed = first + part < n
+        _, upper = _bounds(means, fields, capacity, first + part, listed, cx, cy, cz, hx, hy, hz, slack)
+        bits = tl.where(listed & (upper > threshold), tl.full([chunk], 1, tl.int64) << part.to(tl.int64), 0)
+        remaining = tl.sum(bits, 0)
+        while remaining != 0:
+            bit, remaining = lowest_bit(remaining)
             j = first + bit
             dx = x - (tl.load(means + j) - x_0).to(real)
             dy = y - (tl.load(means + capacity + j) - y_0).to(real)
@@ -244,7 +244,7 @@ def _regress(
             k = b * capacity + tl.load(index + j)
             evidence += w
             if stepped:
-                seen += tl.where(tl.load(compared + k) > 1, w, 0.0)
+                compared_sum += tl.where(tl.load(compared + k) > 1, w, 0.0)
             total += w * tl.load(m + k).to(real)
             if channels > 0:
                 value = tl.load(features + k * channels + f, mask=f < channels, other=0.0).to(real)
@@ -252,24 +252,24 @@ def _regress(
     nan = float("nan")
     value = total / evidence
     if stepped:
-        measured_share = seen / evidence
+        measured_share = compared_sum / evidence
         if mode == 1:
-            size = relative * tl.load(depth + source, mask=ok, other=0.0)
+            size = relative * tl.load(depth + source, mask=usable, other=0.0)
             value += tl.maximum(1 - measured_share, 0.0) * (size * size)
         if mode == 2:
             value = tl.where(measured_share < half, nan, value)
-        tl.store(measured + target, tl.where(ok, measured_share, nan), mask=inside)
-        tl.atomic_add(counts + 6 * streams + b, tl.sum(ok.to(tl.int32), 0))
-        tl.atomic_add(counts + 7 * streams + b, tl.sum((ok & (measured_share < half)).to(tl.int32), 0))
-        value = tl.where(ok, value, nan)
+        tl.store(measured + target, tl.where(usable, measured_share, nan), mask=inside)
+        tl.atomic_add(counts + 6 * streams + b, tl.sum(usable.to(tl.int32), 0))
+        tl.atomic_add(counts + 7 * streams + b, tl.sum((usable & (measured_share < half)).to(tl.int32), 0))
+        value = tl.where(usable, value, nan)
         if alpha < 1.0:
-            now = value.to(memory.dtype.element_ty)
-            averaged = mixed(tl.load(before + target, mask=inside, other=0.0), now, alpha)
+            newest = value.to(memory.dtype.element_ty)
+            averaged = mixed(tl.load(running + target, mask=inside, other=0.0), newest, alpha)
             tl.store(memory + target, averaged, mask=inside)
-            value = tl.where(now != now, now, averaged).to(real)
-    tl.store(out + target, tl.where(ok, value, nan), mask=inside)
+            value = tl.where(newest != newest, newest, averaged).to(real)
+    tl.store(out + target, tl.where(usable, value, nan), mask=inside)
     if channels > 0:
-        values = tl.where(ok[:, None], sums / evidence[:, None], nan)
+        values = tl.where(usable[:, None], sums / evidence[:, None], nan)
         tl.store(
             out_f + target[:, None] * channels + f[None, :], values, mask=inside[:, None] & (f < channels)[None, :]
         )

@@ -1,7 +1,7 @@
 """First half of SPGF on a GPU: the rows of all streams in parallel, a lane each, columns in order.
 
-The open segments of a row are a few registers of its lane. Formulas stand in the torch reference's order of operations
-and are never contracted, so that every decision agrees to the last bit.
+Each lane holds the open segments of its row in registers. The order of operations is that of the torch reference, and
+no product and sum are contracted, so that every decision agrees to the last bit.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ufmstar_torch.kernels.triton.launch import interpreted, launch, power_of_tw
 from ufmstar_torch.kernels.triton.matrices import exact
 from ufmstar_torch.segment_input import SegmentInput
 
-MOMENTS, WHOLE = 8, 3  # of a finished segment: mean x, z; scatter xx, xz, zz; line x, z; length^2 | N, interval
+MOMENTS, INTEGERS = 8, 3  # of a finished segment: mean x, z; scatter xx, xz, zz; line x, z; length^2 | N, interval
 
 
 @dataclass(frozen=True)
@@ -29,13 +29,14 @@ class Rows:
         moments: [B H, M, 8] float64.
         whole: [B H, M, 3] int32.
         count: [B H] int32.
-        owner: [B H, W] int32, which of the row's starts a pixel belongs to, -1 = none (int16 where it holds W).
-        finished_index: [B H, W] int32, the finished segment of every start, -1 = too sparse; likewise.
+        owner: [B H, W] int32 (int16 if W fits), index of the start in the row to whose segment a pixel belongs, -1 =
+            none.
+        finished_index: [B H, W] of the same dtype, index of the finished segment of every start, -1 = too sparse.
     """
 
     camera: Tensor
     moments: Tensor
-    whole: Tensor
+    integers: Tensor
     count: Tensor
     owner: Tensor
     finished_index: Tensor
@@ -47,7 +48,7 @@ def scanlines(inputs: SegmentInput) -> Rows:
     device, limits = inputs.depth.device, inputs.config
     most, rows = inputs.segments_per_row, b * height
 
-    def whole(*shape: int, dtype: torch.dtype = torch.int32) -> Tensor:
+    def integers(*shape: int, dtype: torch.dtype = torch.int32) -> Tensor:
         return torch.empty(*shape, dtype=dtype, device=device)
 
     camera, depth = inputs.intrinsics.to(torch.float64).contiguous(), inputs.depth.contiguous()
@@ -60,22 +61,22 @@ def scanlines(inputs: SegmentInput) -> Rows:
     )  # fmt: skip
     narrow = torch.int16 if width < 2**15 else torch.int32
     moments = torch.empty(rows, most, MOMENTS, dtype=torch.float64, device=device)
-    found = Rows(
-        camera, moments, whole(rows, most, WHOLE), whole(rows),
-        whole(rows, width, dtype=narrow), whole(rows, width, dtype=narrow),
+    result = Rows(
+        camera, moments, integers(rows, most, INTEGERS), integers(rows),
+        integers(rows, width, dtype=narrow), integers(rows, width, dtype=narrow),
     )  # fmt: skip
-    lanes = min(power_of_two(rows), 256) if interpreted() else 32  # the interpreter takes as long for one as for many
+    lanes = min(power_of_two(rows), 256) if interpreted() else 32  # the interpreter's time does not depend on it
     launch(
         _scanline, (triton.cdiv(rows, lanes),), depth, camera, lengths2, bins,
-        found.moments, found.whole, found.count, found.owner, found.finished_index, rows, height, width,
+        result.moments, result.integers, result.count, result.owner, result.finished_index, rows, height, width,
         most,
         scale=float(limits.adaptive_thresh_scale), reference=float(limits.reference_focal),
         scaled=limits.fixed_slope, noise_floor=float(limits.noise_floor), noise_thresh=float(limits.noise_thresh),
         line_thresh=float(limits.line_thresh), max_depth=float(limits.depth_limit), gap=limits.occlusion_gap,
-        n_check=limits.n_check, sparse=limits.sparse, max_open=limits.max_open, places=power_of_two(limits.max_open),
+        n_check=limits.n_check, sparse=limits.sparse, max_open=limits.max_open, registers=power_of_two(limits.max_open),
         number=inputs.depth_bins, lanes=lanes, warps=1,
     )  # fmt: skip
-    return found
+    return result
 
 
 @triton.jit
@@ -89,7 +90,7 @@ def _bins(
     depth, camera, lengths2, bins, height, width,
     number: tl.constexpr, shortest: tl.constexpr, longest: tl.constexpr, chunk: tl.constexpr,
 ):  # fmt: skip
-    """The depth bin of every pixel, and the table of the bins' lengths, which every program walks through."""
+    """Compute the depth bin of every pixel, and the table of the bins' squared lengths."""
     b = tl.program_id(1).to(tl.int64)
     i = tl.program_id(0) * chunk + tl.arange(0, chunk)
     inside = i < height * width
@@ -110,14 +111,14 @@ def _bins(
 
 @triton.jit
 def _finish(
-    done, n, u_left, u_right, reach, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, whole, finished_index, count,
-    r, most, width, sparse: tl.constexpr,
+    done, n, u_left, u_right, reach, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, integers, finished_index,
+    count, r, most, width, sparse: tl.constexpr,
 ):  # fmt: skip
-    """Write the segments of the mask ``done`` [R, Q], one a row; returns the new number of the rows' segments."""
+    """Write the segments of the mask ``done`` [R, Q], at most one per row; return the rows' new numbers of segments."""
     keep = done & (n > sparse)
     pixels = tl.maximum(n, 1).to(tl.float64)
-    at = r[:, None] * most + count[:, None] + n * 0
-    out = moments + 8 * at
+    segment = r[:, None] * most + count[:, None] + n * 0
+    out = moments + 8 * segment
     tl.store(out, x_left + dx / pixels, mask=keep)
     tl.store(out + 1, z_left + dz / pixels, mask=keep)
     tl.store(out + 2, dxx - dx * dx / pixels, mask=keep)
@@ -126,7 +127,7 @@ def _finish(
     tl.store(out + 5, dx, mask=keep)
     tl.store(out + 6, dz, mask=keep)
     tl.store(out + 7, reach, mask=keep)
-    out = whole + 3 * at
+    out = integers + 3 * segment
     tl.store(out, n, mask=keep)
     tl.store(out + 1, u_left, mask=keep)
     tl.store(out + 2, u_right, mask=keep)
@@ -136,10 +137,10 @@ def _finish(
 
 @triton.jit
 def _scanline(
-    depth, camera, lengths2, bins, moments, whole, counts, owner, finished_index, rows, height, width, most,
+    depth, camera, lengths2, bins, moments, integers, counts, owner, finished_index, rows, height, width, most,
     scale: tl.constexpr, reference: tl.constexpr, scaled: tl.constexpr, noise_floor: tl.constexpr,
     noise_thresh: tl.constexpr, line_thresh: tl.constexpr, max_depth: tl.constexpr, gap: tl.constexpr,
-    n_check: tl.constexpr, sparse: tl.constexpr, max_open: tl.constexpr, places: tl.constexpr,
+    n_check: tl.constexpr, sparse: tl.constexpr, max_open: tl.constexpr, registers: tl.constexpr,
     number: tl.constexpr, lanes: tl.constexpr,
 ):  # fmt: skip
     r = (tl.program_id(0) * lanes + tl.arange(0, lanes)).to(tl.int64)
@@ -154,20 +155,20 @@ def _scanline(
     focal = tl.minimum(fx, fy)
     slope = slope_of(focal, scale, reference, scaled)
 
-    q = tl.arange(0, places)[None, :]
-    empty = tl.zeros([lanes, places], tl.float64)
+    q = tl.arange(0, registers)[None, :]
+    empty = tl.zeros([lanes, registers], tl.float64)
     x_left, z_left, x_right, z_right, w2 = empty, empty, empty, empty, empty
     dx, dz, dxx, dxz, dzz, reach = empty, empty, empty, empty, empty, empty
-    n = tl.zeros([lanes, places], tl.int32)
+    n = tl.zeros([lanes, registers], tl.int32)
     u_left, u_right, born = n, n, n
     started, count = tl.zeros([lanes], tl.int32), tl.zeros([lanes], tl.int32)
     for u in range(width):
-        at = r * width + u
-        z = tl.load(depth + at, mask=real_row, other=0.0).to(tl.float64)
+        pixel = r * width + u
+        z = tl.load(depth + pixel, mask=real_row, other=0.0).to(tl.float64)
         use = (z > 0) & (z <= exact(max_depth, z))
         z = tl.where(use, z, 0.0)
         x = (u - cx) / fx * z
-        k = tl.load(bins + at, mask=use, other=0).to(tl.int32)
+        k = tl.load(bins + pixel, mask=use, other=0).to(tl.int32)
         length2 = tl.load(lengths2 + b * number + k, mask=use, other=0.0)[:, None]
         t = slope * z * z
         tau_z = tl.minimum(tl.maximum(6.0 * t, exact(noise_floor, t)), exact(noise_thresh, t))[:, None]
@@ -182,13 +183,13 @@ def _scanline(
         fits = near & ((close & (n <= n_check)) | (straight & (n > n_check))) & used
         newest = tl.max(tl.where(fits, born, -1), 1)
         start = use & (newest < 0)
-        # A new segment takes a free place, or that of the oldest one, which is finished.
+        # A new segment takes a free register, or that of the oldest one, which is finished.
         age = tl.where(q < max_open, tl.where(n > 0, born, -1 - q), 2147483647)
         opened = start[:, None] & (age == tl.min(age, 1)[:, None])
         pushed = opened & (n > 0)
         if tl.max(tl.max(pushed.to(tl.int32), 1), 0) > 0:
             count = _finish(
-                pushed, n, u_left, u_right, reach, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, whole,
+                pushed, n, u_left, u_right, reach, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, integers,
                 finished_index, count, r, most, width, sparse,
             )  # fmt: skip
         target = opened | (fits & (born == newest[:, None]))
@@ -207,13 +208,13 @@ def _scanline(
         w2 = tl.where(target, ex * ex + y_factor * (ez * ez), w2)
         dx, dz = tl.where(target, dx + ex, dx), tl.where(target, dz + ez, dz)
         dxx, dxz, dzz = tl.where(target, xx, dxx), tl.where(target, xz, dxz), tl.where(target, zz, dzz)
-        of = tl.sum(tl.where(target, born, 0), 1)
-        tl.store(owner + at, tl.where(use, of, -1), mask=real_row)
+        start_index = tl.sum(tl.where(target, born, 0), 1)
+        tl.store(owner + pixel, tl.where(use, start_index, -1), mask=real_row)
     for _ in range(max_open):
         newest = tl.max(tl.where(n > 0, born, -1), 1)
         last = (n > 0) & (born == newest[:, None])
         count = _finish(
-            last, n, u_left, u_right, reach, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, whole,
+            last, n, u_left, u_right, reach, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, integers,
             finished_index, count, r, most, width, sparse,
         )  # fmt: skip
         n = tl.where(last, 0, n)

@@ -1,8 +1,8 @@
 """SPGF on a GPU: rows (``scanline``), then a program per stream joins the segments of successive rows.
 
-The active Gaussians are the lanes of one block, at most two for every segment that a row can hold: those that go on
-and those that a row adds. A segment is tested against all lanes at once. A Gaussian is pruned as soon as it ends, so
-what is kept goes straight to its slot of the mixture.
+Each lane of a block holds an active Gaussian. There are twice as many lanes as segments in a row: for the Gaussians of
+the row before and for new ones. A segment is tested against all lanes at once. A Gaussian that ends is either pruned or
+written to its slot of the mixture at once.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ufmstar_torch.kernels.triton.launch import launch, power_of_two
 from ufmstar_torch.kernels.triton.matrices import exact, floored, store_symmetric
 from ufmstar_torch.kernels.triton.scanline import Rows, scanlines, slope_of
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.segment import most_kept
+from ufmstar_torch.segment import max_gaussians
 from ufmstar_torch.segment_input import SegmentInput
 
 _PRUNE = {"none": 0, "both": 1, "either": 2}
@@ -29,7 +29,7 @@ _PRUNE = {"none": 0, "both": 1, "either": 2}
 
 @dataclass(frozen=True)
 class Floor:
-    """Lifts the eigenvalues of what is segmented, as ``step._segment`` does.
+    """Lower limit of the eigenvalues of segmented covariances, as in ``step._segment``.
 
     Attributes:
         near_plane: [m].
@@ -41,17 +41,17 @@ class Floor:
 
 
 def segment(inputs: SegmentInput) -> tuple[GaussianMixture, Tensor]:
-    """As :func:`ufmstar_torch.segment.segment`, float64 inside, with its capacity on an accelerator."""
+    """As :func:`ufmstar_torch.segment.segment`, computed in float64, with the capacity for accelerators."""
     mixture, read_labels = fit(inputs)
     return mixture, read_labels()
 
 
 def fit(inputs: SegmentInput, *, floor: Floor | None = None) -> tuple[GaussianMixture, Callable[[], Tensor]]:
-    """The Gaussians of B depth maps.
+    """Fit Gaussians to B depth maps.
 
     Args:
         inputs: checked.
-        floor: of the covariances; the mixture is float64 then. None = none, in the depth's dtype.
+        floor: of the covariances; the mixture is float64. None = no floor; the mixture has the depth's dtype.
 
     Returns:
         The mixture [B, C], and a function that writes and returns the labels [B, H, W] int64.
@@ -60,7 +60,7 @@ def fit(inputs: SegmentInput, *, floor: Floor | None = None) -> tuple[GaussianMi
     device = inputs.depth.device
     most = inputs.segments_per_row
     total = most * height
-    capacity = min(total, most_kept(inputs))
+    capacity = min(total, max_gaussians(inputs))
     channels = 0 if inputs.features is None else inputs.features.shape[1]
     rows = scanlines(inputs)
     dtype = inputs.depth.dtype if floor is None else torch.float64
@@ -71,7 +71,7 @@ def fit(inputs: SegmentInput, *, floor: Floor | None = None) -> tuple[GaussianMi
     lanes = power_of_two(2 * most)
     launch(
         _join, (b,),
-        rows.camera, rows.moments, rows.whole, rows.count,
+        rows.camera, rows.moments, rows.integers, rows.count,
         mixture.mean, mixture.covariance, mixture.weight, mixture.count, member, slot_of, height, most, capacity, total,
         rounded=inputs.depth.dtype == torch.float32, scale=float(limits.adaptive_thresh_scale),
         reference=float(limits.reference_focal), scaled=limits.fixed_slope, noise_floor=float(limits.noise_floor),
@@ -87,7 +87,7 @@ def fit(inputs: SegmentInput, *, floor: Floor | None = None) -> tuple[GaussianMi
 
 
 def _labelled(rows: Rows, member: Tensor, slot_of: Tensor, shape: torch.Size) -> Tensor:
-    """[B, H, W] int64 the slot of every pixel, -1 = none."""
+    """[B, H, W] int64 slot of every pixel, -1 = none."""
     b, height, width = shape
     out = torch.empty(b, height, width, dtype=torch.int64, device=member.device)
     launch(
@@ -121,7 +121,7 @@ def _label(owner, finished_index, member, slot_of, out, height, width, most, tot
 
 @triton.jit
 def _feature_means(features, slots, weight, out, pixels, capacity, channels, chunk: tl.constexpr):
-    """A program per Gaussian reads the labels of its image, so that the order of its sums is always the same."""
+    """A program per Gaussian reads all labels of its image, so that the order of summation is fixed."""
     b = tl.program_id(1).to(tl.int64)
     k = tl.program_id(0)
     n = tl.load(weight + b * capacity + k).to(tl.float64)
@@ -138,14 +138,14 @@ def _feature_means(features, slots, weight, out, pixels, capacity, channels, chu
 
 @triton.jit
 def _stored(x, single: tl.constexpr):
-    """x with the precision of float32, if it is to be stored so."""
+    """x, rounded to float32 if ``single``."""
     return x.to(tl.float32).to(tl.float64) if single else x
 
 
 @triton.jit
-def _loaded(moments, whole, at):
+def _loaded(moments, integers, segment):
     """Load a segment: its moments, squared length, number of pixels and interval (``scanline.Rows``)."""
-    m, w = moments + 8 * at, whole + 3 * at
+    m, w = moments + 8 * segment, integers + 3 * segment
     return (
         tl.load(m), tl.load(m + 1), tl.load(m + 2), tl.load(m + 3), tl.load(m + 4), tl.load(m + 5), tl.load(m + 6),
         tl.load(m + 7), tl.load(w), tl.load(w + 1), tl.load(w + 2),
@@ -154,7 +154,7 @@ def _loaded(moments, whole, at):
 
 @triton.jit
 def _join(
-    camera, moments, whole, counts, mean_o, covariance_o, weight_o, count_o, member, slot_of,
+    camera, moments, integers, counts, mean_o, covariance_o, weight_o, count_o, member, slot_of,
     height, most, capacity, total,
     rounded: tl.constexpr, scale: tl.constexpr, reference: tl.constexpr, scaled: tl.constexpr,
     noise_floor: tl.constexpr, angle2: tl.constexpr, min_pixels: tl.constexpr, min_rows: tl.constexpr,
@@ -171,20 +171,20 @@ def _join(
     lx, ly, lz, ox, oy, oz, px, py, pz, p2, reach = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
     n = tl.zeros([lanes], tl.int32)
     merged, u_left, u_right, since, last = n, n, n, n, n
-    born = n - 1  # a lane without a Gaussian
+    born = n - 1  # -1 = a lane without a Gaussian
     created, retained = 0, 0
-    ahead = _loaded(moments, whole, b * height * most)
+    prefetched = _loaded(moments, integers, b * height * most)
     for v in range(height):
         row = b * height + v
         ry = (v - cy) / fy
         following = (b * height + tl.minimum(v + 1, height - 1)) * most
         found = tl.load(counts + row)
         if found == 0:
-            ahead = _loaded(moments, whole, following)
+            prefetched = _loaded(moments, integers, following)
         for j in range(found):
-            hx, hz, hxx, hxz, hzz, hlx, hlz, h_reach, hn, h_left, h_right = ahead
-            # The next one is on its way while this one is tested.
-            ahead = _loaded(moments, whole, tl.where(j + 1 < found, row * most + j + 1, following))
+            hx, hz, hxx, hxz, hzz, hlx, hlz, h_reach, hn, h_left, h_right = prefetched
+            # Prefetch the next segment while this one is tested.
+            prefetched = _loaded(moments, integers, tl.where(j + 1 < found, row * most + j + 1, following))
             hy, hly = ry * hz, ry * hlz
 
             shared = tl.minimum(u_right, h_right) - tl.maximum(u_left, h_left)
@@ -247,7 +247,7 @@ def _join(
                 since, last, born = tl.where(free, v, since), tl.where(free, v, last), tl.where(free, created, born)
                 tl.store(member + row * most + j, created)
                 created += 1
-        # Gaussians that the row did not extend have ended; after the last row all have, in the order of their creation.
+        # Gaussians that the row did not extend end, and all after the last row. Slots follow the order of creation.
         gone = (born >= 0) & (tl.where(height - 1 - v == 0, -1, last) != v)
         if tl.sum(gone.to(tl.int32), 0) > 0:
             large, tall = n >= min_pixels, merged >= min_rows
@@ -258,20 +258,20 @@ def _join(
             else:
                 keep = gone & large & tall
             slot = lane * 0 - 1
-            left = keep
+            waiting = keep
             for _ in range(tl.sum(keep.to(tl.int32), 0)):
-                next_born = tl.min(tl.where(left, born, 2147483647), 0)
-                mine = left & (born == next_born)
-                slot = tl.where(mine, retained, slot)
-                left = left & ~mine
+                next_born = tl.min(tl.where(waiting, born, 2147483647), 0)
+                selected = waiting & (born == next_born)
+                slot = tl.where(selected, retained, slot)
+                waiting = waiting & ~selected
                 retained += 1
             tl.store(slot_of + b * total + born, slot, mask=gone)
             out = b * capacity + slot
             ratio = tl.where(n > 1, n - 1, 1).to(tl.float64)
-            some = n > 1
-            cxx, cxy = tl.where(some, sxx / ratio, 0.0), tl.where(some, sxy / ratio, 0.0)
-            cxz, cyy = tl.where(some, sxz / ratio, 0.0), tl.where(some, syy / ratio, 0.0)
-            cyz, czz = tl.where(some, syz / ratio, 0.0), tl.where(some, szz / ratio, 0.0)
+            several = n > 1
+            cxx, cxy = tl.where(several, sxx / ratio, 0.0), tl.where(several, sxy / ratio, 0.0)
+            cxz, cyy = tl.where(several, sxz / ratio, 0.0), tl.where(several, syy / ratio, 0.0)
+            cyz, czz = tl.where(several, syz / ratio, 0.0), tl.where(several, szz / ratio, 0.0)
             ax, ay, az = mx, my, mz
             if lifted:
                 ax, ay, az = _stored(ax, rounded), _stored(ay, rounded), _stored(az, rounded)
