@@ -113,7 +113,7 @@ def test_positions_that_cannot_be_mended_by_the_depths_scale(tour, spoil, option
 
 
 def test_unregistered_depth(tour):
-    """Depth of a camera 8 cm beside the colour camera, with another focal length."""
+    """The depth camera is mounted 8 cm from the colour camera and has another focal length."""
     K = np.loadtxt(tour / "K.txt")
     K_depth = K.copy()
     K_depth[0, 0], K_depth[1, 1] = 1.12 * K[0, 0], 1.12 * K[1, 1]

@@ -149,7 +149,7 @@ def test_why_images_are_skipped(model, caplog):
         assert live.statistics.skipped == {LATE: 1}
         for stamp, T in ((1.0, at(0)), (1.05, np.full((4, 4), np.nan)), (1.1, at(0)), (1.5, at(0))):
             live.push_pose(stamp, T)
-        for stamp in (0.9, 1.02, 1.07, 1.3):  # before all poses, twice beside a lost pose, in a gap
+        for stamp in (0.9, 1.02, 1.07, 1.3):  # before all poses, before and after a lost pose, in a gap
             live.push_image(stamp, PICTURE)
             assert live.wait_idle(20)
         for stamp in (1.3, 0.2):  # its stamp is not after the previous one

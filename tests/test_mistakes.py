@@ -16,9 +16,11 @@ from shared_data import require_shared
 import scenes
 from ufmstar_torch import AnchorConfig, SPGFConfig, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.eval.check.depth_image_fit import depth_image_fit, image_at_map, part_of_image
 from ufmstar_torch.eval.check.image_fit import depth_fit, image_fit, track_corners
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.frame import check_intrinsics
+from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
 from ufmstar_torch.models import load_network
 
 H, W = 48, 64
@@ -304,3 +306,28 @@ def test_in_how_many_clips_each_mistake_is_named():
         else:
             assert found[0] == len(RECORDINGS), mistake
             assert found[1] >= LATE.get(mistake, len(TOURS)), mistake
+
+
+@pytest.mark.slow
+def test_in_how_many_clips_maps_of_the_middle_are_named():
+    """FastDepth's maps, as they are and the middle 3/4 of them enlarged; ``-s`` prints the fits."""
+    network = load_network("fastdepth", require_shared("weights/fastdepth_nyu.onnx"))
+    named = {"right": 0, "middle": 0}
+    for name in (*RECORDINGS, *TOURS):
+        sequence, shown = followed(name)[0], {"right": [], "middle": []}
+        for i in np.unique(np.linspace(0, len(sequence) - 1, 12).astype(int)):
+            frame = sequence[int(i)]
+            x, K_map = network.preprocess(frame.image, frame.intrinsics)
+            depth, K_map = network(x).depth[0].numpy(), K_map.numpy()
+            image = image_at_map(frame.image, frame.intrinsics, K_map, depth.shape)
+            K_middle = K_map.copy()
+            K_middle[:2, :2] *= 4 / 3
+            shown["right"].append((image, depth))
+            shown["middle"].append((image, resample_nearest(depth, K_map, K_middle, depth.shape)))
+        for kind, frames in shown.items():
+            problem = part_of_image(frames)
+            print(name, kind, depth_image_fit(frames), problem)
+            named[kind] += "only the middle of the image" in problem
+            assert kind == "middle" or not problem, name
+    print(f"named: {named['middle']} of {len(RECORDINGS) + len(TOURS)}")
+    assert named["middle"] >= 6

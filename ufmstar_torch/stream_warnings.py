@@ -140,10 +140,11 @@ class StreamWarnings:
 
     def reset(self, streams: Sequence[int] | None = None) -> None:
         """Clear the statistics and the set of logged warnings; with ``streams``, only the statistics of these."""
+        self._continued = 0
         if streams is not None:
             self._tracks = {b: track for b, track in self._tracks.items() if b not in streams}
             return
-        self._calls = self._continued = 0
+        self._calls = 0
         self._logged = set[tuple[int, str]]()
         self._tracks = {}
 

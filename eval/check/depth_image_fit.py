@@ -18,9 +18,8 @@ _POINTS_PER_FRAME = 1000
 # 640 to the left and right, 2.5 cm at 0.7 m; half of it up and down).
 _ZOOMS = np.arange(0.86, 1.141, 0.02)
 _SHIFT, _SHIFT_STEP = 0.0375, 0.0047
-# Predicted maps are blurred. Right ones of four networks on 16 recordings and tours, with so many edges and so much
-# contrast, had a quality of at least .55; those of the middle 3/4 of the image at most .3, but for one, and zooms of
-# .86 to .92.
+# Predicted maps are blurred: they are judged only with so many edges and so much contrast. The largest quality, and the
+# least zoom, of maps that show a part of the image (``pytest -m slow -s tests/test_mistakes.py -k middle``).
 _PART, _PART_EDGES, _PART_CONTRAST, _PART_ZOOM = 0.35, 3000, 0.05, 0.06
 
 

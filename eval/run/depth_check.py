@@ -1,4 +1,4 @@
-"""The depth of a stream beside that of corners tracked in its images, for commands that write no frames."""
+"""Compares the depth of a stream with that of corners tracked in its images, for commands that store no frames."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ class DepthCheck(FrameSink):
         self._maps: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = {}
 
     def take(self, result: FrameResult) -> None:
-        """Keep the map of such a frame."""
+        """Keep the depth map if corners begin in this frame."""
         row = result.rows.get(UFM)
         if row is not None and result.frame is not None and result.index in self._first:
             self._maps[result.index] = row.depth.numpy(), row.valid.numpy(), row.intrinsics, result.frame.intrinsics
 
     def fit(self) -> DepthFit | None:
-        """The comparison; None with too little motion, or of poses that contradict the images."""
+        """Compare; None if the motion is too small, or if the poses contradict the images."""
         if self._job.image_fit is None or self._job.image_fit.problem:
             return None
 

@@ -1,7 +1,7 @@
 """Compiles code for the CPU (numba): kernels, which Python calls, and their parts, which only kernels call.
 
-Kernels are cached on disk. A part is compiled into the kernels that call it and has no interface of its own; called
-from Python it is a plain function.
+Kernels are cached on disk. A part is compiled into each kernel that calls it; called from Python it is a plain
+function.
 
 This is the only file that uses numba's private interfaces (``tests/test_warm_up.py`` fails where numba changes them).
 numba optimises each function, makes machine code of it, and repeats both in every function that calls it. Here only
