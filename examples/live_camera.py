@@ -29,7 +29,7 @@ def main(words: Sequence[str] | None = None) -> Any:
     options = parser.parse_args(words)
     network = load_network("fastdepth", options.weights)
     model = UncertainDepth(network, UfMStarConfig(on_bad_frame="skip"))
-    model.ufm.warm_up((224, 224))
+    model.warm_up()
     latest: list[LiveResult] = []  # only the newest result; OpenCV windows need the main thread
 
     def on_result(result: LiveResult) -> None:

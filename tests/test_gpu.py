@@ -13,7 +13,7 @@ from modules import same
 from walks import SPGF, walks
 
 import scenes
-from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch import AnchorConfig, DepthPrediction, PosteriorConfig, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.capture import Captured
 from ufmstar_torch.stream_warnings import EVERY
@@ -129,3 +129,33 @@ def test_networks_on_the_gpu_and_ufmstar_on_the_cpu():
         expected = plain(*(v.cpu() for v in frame))
         assert out.variance.device.type == "cpu"
         torch.testing.assert_close(out.variance, expected.variance, rtol=1e-5, atol=1e-8, equal_nan=True)
+
+
+class Wall(torch.nn.Module):
+    """Predicts a wall at 2 m that is textured slightly."""
+
+    def __init__(self):
+        super().__init__()
+        self.distance = torch.nn.Parameter(torch.tensor(2.0))
+
+    def forward(self, image):
+        return DepthPrediction(self.distance + 0.02 * image[:, 0])
+
+
+def test_anchors_of_images_on_the_gpu_reach_ufmstar_on_the_cpu():
+    texture = torch.randint(0, 256, (3, 96, 168), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    K = torch.tensor([[100.0, 0, 64], [0, 100, 48], [0, 0, 1]])
+    plain = UncertainDepth(Wall(), posterior=True)
+    split = UncertainDepth(Wall(), posterior=True, multiview_device="cpu").cuda()
+    split.warm_up((96, 128))
+    used = 0
+    for i in range(10):
+        image, pose = texture[None, ..., 4 * i : 4 * i + 128].contiguous(), torch.eye(4)
+        pose[0, 3] = 0.08 * i
+        expected, out = plain(image, pose, K), split(image.cuda(), pose, K)
+        used += int(expected.ufm.statistics.anchors_used.sum())
+        for name in ("variance", "posterior_depth", "posterior_variance"):
+            found = getattr(out.ufm, name)
+            assert found.device.type == "cpu"
+            torch.testing.assert_close(found, getattr(expected.ufm, name), rtol=1e-3, atol=1e-5, equal_nan=True)
+    assert used > 100

@@ -132,6 +132,20 @@ def test_agrees_with_the_oracle(backend, seed, config, height, width):
     assert_moments(occupied(pruned), tuple(value[keep] for value in moments(pieces)))
 
 
+def test_rows_of_few_and_of_many_segments_in_one_batch(backend):
+    """A GPU joins rows of few segments with one warp, and others with more."""
+    height, width, config = 4, 80, SPGFConfig(sparse=1, min_pixels=1, min_rows=1, scale_with_image=False)
+    stairs = (1 + 0.4 * (torch.arange(width) // 2)).to(torch.float64).expand(height, width)
+    depth = torch.stack([stairs, torch.full_like(stairs, 2.0)])
+    K = camera(60.0, 60.0, 40.0, 2.0).expand(2, 3, 3)
+    mixture, labels = backend.spgf(depth, K, config)
+    for b, count in ((0, 40), (1, 5)):
+        pieces, expected = run_oracle(depth[b], K[b], config)
+        assert len(pieces) == count
+        assert np.array_equal(labels[b].numpy(), expected)
+        assert_moments(occupied(mixture, b), moments(pieces))
+
+
 def test_streams_are_independent(backend):
     """Several scenes with different cameras at once equal single runs: depth bins and thresholds are per stream."""
     seeds, size = ((3, 5), (10, 14)) if backend.slow else ((3, 4, 5), (20, 26))

@@ -86,7 +86,7 @@ class LiveDepth:
 
     Args:
         model: an :class:`UncertainDepth` on one stream; from now on, only this object may call it. Call
-            ``model.ufm.warm_up((224, 224))`` first, or the first image waits for the compiler.
+            ``model.warm_up((480, 640))`` (of the images) first, or the first image waits for the compiler.
         on_result: called with each :class:`LiveResult` in the worker thread; the next image waits until it returns.
         intrinsics: of the images [px], [3, 3] or fx, fy, cx, cy; None = pass them to every ``push_image``.
         max_wait: longest wait for a pose after an image [s].

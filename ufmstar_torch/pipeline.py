@@ -21,6 +21,7 @@ from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.stateful import outliving
 from ufmstar_torch.stream_warnings import LOGGER
 from ufmstar_torch.ufmstar import UfMStar
+from ufmstar_torch.warm_up import camera_of, dense_anchors, require_size, warm_up
 
 _BLACK = {torch.uint8: 1, torch.float32: 1 / 255, torch.float64: 1 / 255}  # largest value of a black image
 
@@ -297,6 +298,43 @@ class UncertainDepth(NetworksInTurn):
         self._count(self._next + 1)
         return mean
 
+    def warm_up(
+        self,
+        size: tuple[int, int] = (480, 640),
+        *,
+        streams: int = 1,
+        progress: Callable[[int, int], object] | None = None,
+    ) -> None:
+        """Run the networks on noise, and compile all kernels or load them from disk. Images, evidence and state do not
+        change. Without this, the first images wait for the compiler and for the libraries of a GPU.
+
+        Args:
+            size: (H, W) of the images [px]; without networks, of the depth maps.
+            streams: B.
+            progress: as in :meth:`UfMStar.warm_up`.
+
+        Raises:
+            ValueError: as :meth:`UfMStar.warm_up`.
+        """
+        require_size(size, streams)
+        dense = self.landmarks is not None and self.landmarks.dense
+        if self.networks:
+            size = self._tried(size, streams)
+        ufm = UfMStar(self.ufm.config, dtype=self.ufm.mean.dtype, device=self.ufm.mean.device)
+        warm_up(ufm, size, streams, progress, [dense_anchors] if dense else [])
+
+    def _tried(self, size: tuple[int, int], streams: int) -> tuple[int, int]:
+        """Run every network twice on noise in images of ``size``; the size of their depth maps."""
+        device = next((p.device for p in self.networks.parameters()), torch.device("cpu"))
+        with torch.no_grad(), torch.random.fork_rng([device] if device.type == "cuda" else []):
+            noise = torch.randint(0, 256, (streams, 3, *size), dtype=torch.uint8, device=device)
+            image = noise / 255 if self.preprocess is None else noise
+            x, K = self.prepare(image, camera_of(size).to(torch.float64).expand(streams, 3, 3))
+            for _ in range(2):
+                maps = [self.member(x, K, n) for n in range(len(self.networks))]
+        height, width = maps[0].depth.shape[1:]
+        return height, width
+
     def _fused(
         self, predicted: _Predicted, valid: Array | None = None, anchors: Anchors | None = None
     ) -> UncertainPrediction:
@@ -323,6 +361,7 @@ class UncertainDepth(NetworksInTurn):
             config = self.ufm.config
             skip = config.on_bad_frame == "skip"
             anchors = self.landmarks.update(predicted.image, predicted.pose, K, config.rotation_tolerance, skip=skip)
+            anchors = anchors.to(predicted.prediction.depth.device)  # UfM*'s may be another than the image's
         try:
             moved = anchors is not None and self.preprocess not in (None, in_unit_range)
             yield require_anchors(anchors).moved(K, predicted.prediction.K) if moved else anchors

@@ -10,11 +10,15 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
+from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.kernels.select import compile_triangulation
 
 _DISTANCE = 2.0  # [m]
+_WALL, _FOCAL = (96, 128), 100.0  # [px] of the images of a wall
+_STEP, _FRAMES = 4, 8  # motion of the wall [px per frame], and number of frames
 _TOTAL = 3 * 7  # stages of a step, for two frames and an image average
 
 
@@ -50,14 +54,13 @@ def warm_up(
     Raises:
         ValueError: a size or number of streams that is not positive.
     """
-    if np.shape(size) != (2,) or min(*size, streams) < 1:
-        raise ValueError(f"size and streams must be positive, (H, W) and B, got {size!r} and {streams}")
+    require_size(size, streams)
     height, width = size
     config, device = module.config, module.mean.device
     distance = min(_DISTANCE, config.segment.depth_limit)
     depth = torch.full((streams, height, width), distance, device=device)
     pose = torch.eye(4)
-    K = torch.tensor([[float(width), 0, width / 2], [0, float(width), height / 2], [0, 0, 1]])
+    K = camera_of(size)
     features = depth.new_zeros(streams, config.features, height, width) if config.features else None
     aleatoric = depth if config.aleatoric_in_h else None
     corner = depth[:, 0, :1]
@@ -76,6 +79,29 @@ def warm_up(
         for function in also:
             function()
             stages.stage("")
+
+
+def require_size(size: object, streams: int) -> None:
+    """Raise a ValueError unless ``size`` is (H, W) and all three numbers are positive."""
+    if np.shape(size) != (2,) or min(*size, streams) < 1:
+        raise ValueError(f"size and streams must be positive, (H, W) and B, got {size!r} and {streams}")
+
+
+def camera_of(size: tuple[int, int]) -> Tensor:
+    """[3, 3] intrinsics [px] of a camera with images of ``size`` (H, W), 53 degrees wide."""
+    height, width = size
+    return torch.tensor([[float(width), 0, width / 2], [0, float(width), height / 2], [0, 0, 1]])
+
+
+def dense_anchors() -> None:
+    """Run the depth search of :class:`DenseEvidence` on images of a textured wall along which the camera moves."""
+    height, width = _WALL
+    wall = np.random.default_rng(0).integers(0, 256, (height, width + _STEP * _FRAMES, 3), dtype=np.uint8)
+    evidence, K = DenseEvidence(), np.array([[_FOCAL, 0, width / 2], [0, _FOCAL, height / 2], [0, 0, 1]])
+    for frame in range(_FRAMES):
+        T_world_cam = np.eye(4)
+        T_world_cam[0, 3] = frame * _STEP / _FOCAL * evidence.config.start_depth
+        evidence.update(wall[:, frame * _STEP : frame * _STEP + width].copy(), T_world_cam, K)
 
 
 @contextmanager

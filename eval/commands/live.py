@@ -174,6 +174,8 @@ def _run(
                     live.push_pose(event.stamp, event.T_world_cam)
                 if event.image is not None:
                     live.push_image(event.stamp, event.image, event.intrinsics)
+                if options.recorded and live.statistics.images == 1:
+                    live.wait_idle()  # the networks start, on a GPU for seconds; the recording's clock starts after it
             live.wait_idle()
     except (OSError, RuntimeError, TypeError, ValueError) as error:
         return live.statistics, error

@@ -64,21 +64,24 @@ class PoseFile:
 
 def replay(sequence: FrameSequence, speed: float = 1.0) -> Iterator[LiveEvent]:
     """Yield a recording's frames with their poses at their times, or at 30 frames/s without timestamps. ``speed`` 2 is
-    twice as fast, infinity does not wait. A frame that cannot be decoded is omitted."""
+    twice as fast, infinity does not wait. A frame that cannot be decoded is omitted. The clock starts when the caller
+    asks for the second frame."""
     stamps = [entry.timestamp for entry in sequence.entries]
     timed_stamps = [stamp for stamp in stamps if stamp is not None]
     timed = len(timed_stamps) == len(stamps) and all(a < b for a, b in pairwise(timed_stamps))
     times = np.array(timed_stamps) if timed else np.arange(len(sequence)) / _FPS
-    started = time.perf_counter()
+    started: float | None = None
+    first = 0.0
     for n, stamp in enumerate(times.tolist()):
         try:
             frame = sequence[n]
         except FrameError:
             continue
-        wait = (stamp - times[0]) / speed + started - time.perf_counter()
-        if wait > 0:
+        if started is not None and (wait := (stamp - first) / speed + started - time.perf_counter()) > 0:
             time.sleep(wait)
         yield LiveEvent(stamp, frame.image, frame.T_world_cam, frame.intrinsics)
+        if started is None:
+            started, first = time.perf_counter(), stamp
 
 
 def camera(index: int, poses: PoseFile) -> Iterator[LiveEvent]:

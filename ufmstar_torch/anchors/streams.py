@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
+from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, LandmarkSource
 from ufmstar_torch.anchors.sources import landmark_source
 from ufmstar_torch.camera import rotation_deviation
@@ -40,6 +41,7 @@ class StreamLandmarks:
 
     Attributes:
         needs_image: whether a source reads the images.
+        dense: whether a source is :class:`DenseEvidence`.
         last: landmarks of the last image of every stream.
 
     Raises:
@@ -51,6 +53,7 @@ class StreamLandmarks:
         self._sources = [landmark_source(source) for source in listed]
         self._before = self._states()
         self.needs_image = any(source.needs_image for source in self._sources)
+        self.dense = any(isinstance(source, DenseEvidence) for source in self._sources)
         self.last: list[Landmarks] = []
         self._contradicted = [0] * len(self._sources)  # successive images; -1 = warned
         self._lag_warned = set[int]()

@@ -1,7 +1,7 @@
 """SPGF on a GPU: rows (``scanline``), then a program per stream joins the segments of successive rows.
 
-Each lane of a block holds an active Gaussian. There are twice as many lanes as segments in a row: for the Gaussians of
-the row before and for new ones. A segment is tested against all lanes at once. A Gaussian that ends is either pruned or
+Each lane of a block holds an active Gaussian. There are as many lanes as segments in two rows: for the Gaussians of the
+row before and for new ones. A segment is tested against all lanes at once. A Gaussian that ends is either pruned or
 written to its slot of the mixture at once.
 """
 
@@ -18,13 +18,17 @@ from torch import Tensor
 
 from ufmstar_torch.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.kernels.triton.launch import launch, power_of_two
-from ufmstar_torch.kernels.triton.matrices import exact, floored, store_symmetric
+from ufmstar_torch.kernels.triton.matrices import exact, floored, load_symmetric, store_symmetric
 from ufmstar_torch.kernels.triton.scanline import Rows, scanlines, slope_of
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.segment import max_gaussians
 from ufmstar_torch.segment_input import SegmentInput
 
 _PRUNE = {"none": 0, "both": 1, "either": 2}
+_CHUNK = 32  # Gaussians of a program of ``_lift``
+_FEW = 32  # lanes of a warp
+# Below so many columns, ratios of whole numbers of columns differ by more than float32 rounds: 1/n - 1/(n + 1) > 2^-24.
+_SINGLE = 4096
 
 
 @dataclass(frozen=True)
@@ -69,17 +73,25 @@ def fit(inputs: SegmentInput, *, floor: Floor | None = None) -> tuple[GaussianMi
     slot_of = torch.empty(b, total, dtype=torch.int32, device=device)
     limits = inputs.config
     lanes = power_of_two(2 * most)
-    launch(
-        _join, (b,),
-        rows.camera, rows.moments, rows.integers, rows.count,
-        mixture.mean, mixture.covariance, mixture.weight, mixture.count, member, slot_of, height, most, capacity, total,
-        rounded=inputs.depth.dtype == torch.float32, scale=float(limits.adaptive_thresh_scale),
-        reference=float(limits.reference_focal), scaled=limits.fixed_slope, noise_floor=float(limits.noise_floor),
-        angle2=float(limits.angle_cosine) ** 2, min_pixels=limits.min_pixels, min_rows=limits.min_rows,
-        prune=_PRUNE[limits.prune], lifted=floor is not None,
-        near_plane=floor.near_plane if floor else 0.0, epsilon=floor.epsilon if floor else 0.0,
-        pixel_variance=PIXEL_VARIANCE, lanes=lanes, warps=max(1, min(8, lanes // 32)),
-    )  # fmt: skip
+    # A stream runs in the first launch that has enough lanes for its rows: one warp, which needs no barriers, in most.
+    for least, enough in ((0, lanes),) if lanes <= _FEW else ((0, _FEW), (_FEW, lanes)):
+        launch(
+            _join, (b,),
+            rows.camera, rows.moments, rows.integers, rows.count,
+            mixture.mean, mixture.covariance, mixture.weight, mixture.count, member, slot_of, height, most, capacity,
+            total,
+            rounded=floor is not None and inputs.depth.dtype == torch.float32,
+            scale=float(limits.adaptive_thresh_scale), reference=float(limits.reference_focal),
+            scaled=limits.fixed_slope, noise_floor=float(limits.noise_floor), angle2=float(limits.angle_cosine) ** 2,
+            min_pixels=limits.min_pixels, min_rows=limits.min_rows, prune=_PRUNE[limits.prune],
+            single=inputs.depth.shape[2] < _SINGLE, least=least, lanes=enough, warps=max(1, min(8, enough // 32)),
+        )  # fmt: skip
+    if floor is not None:
+        launch(
+            _lift, (triton.cdiv(capacity, _CHUNK), b), rows.camera, mixture.mean, mixture.covariance, mixture.weight,
+            capacity, near_plane=floor.near_plane, epsilon=floor.epsilon, pixel_variance=PIXEL_VARIANCE, chunk=_CHUNK,
+            warps=1,
+        )  # fmt: skip
     read_labels = partial(_labelled, rows, member, slot_of, inputs.depth.shape)
     if inputs.features is not None:
         _average(inputs.features, read_labels(), mixture)
@@ -143,6 +155,16 @@ def _stored(x, single: tl.constexpr):
 
 
 @triton.jit
+def _ratio(a, b, single: tl.constexpr):
+    """A number that orders the fractions a/b (0 <= a <= b) as they are, with equal numbers for equal fractions."""
+    if single:  # the bits of a float that is not negative have its order, and integers are compared faster
+        ratio = tl.div_rn(a.to(tl.float32), b.to(tl.float32)).to(tl.int32, bitcast=True)
+    else:
+        ratio = a.to(tl.float64) / b.to(tl.float64)
+    return ratio
+
+
+@triton.jit
 def _loaded(moments, integers, segment):
     """Load a segment: its moments, squared length, number of pixels and interval (``scanline.Rows``)."""
     m, w = moments + 8 * segment, integers + 3 * segment
@@ -153,19 +175,32 @@ def _loaded(moments, integers, segment):
 
 
 @triton.jit
+def _most_active(counts, height, lanes: tl.constexpr):
+    """Most segments in two successive rows; at least 1. No more Gaussians are active at a time."""
+    most = 1
+    for first in range(0, height, lanes):
+        v = first + tl.arange(0, lanes)
+        present = tl.load(counts + v, mask=v < height, other=0)
+        above = tl.load(counts + v - 1, mask=(v > 0) & (v < height), other=0)
+        most = tl.maximum(most, tl.max(present + above, 0))
+    return most
+
+
+@triton.jit
 def _join(
     camera, moments, integers, counts, mean_o, covariance_o, weight_o, count_o, member, slot_of,
     height, most, capacity, total,
     rounded: tl.constexpr, scale: tl.constexpr, reference: tl.constexpr, scaled: tl.constexpr,
     noise_floor: tl.constexpr, angle2: tl.constexpr, min_pixels: tl.constexpr, min_rows: tl.constexpr,
-    prune: tl.constexpr, lifted: tl.constexpr, near_plane: tl.constexpr, epsilon: tl.constexpr,
-    pixel_variance: tl.constexpr, lanes: tl.constexpr,
+    prune: tl.constexpr, single: tl.constexpr, least: tl.constexpr, lanes: tl.constexpr,
 ):  # fmt: skip
     b = tl.program_id(0).to(tl.int64)
     fx, fy, cy = tl.load(camera + 9 * b), tl.load(camera + 9 * b + 4), tl.load(camera + 9 * b + 5)
     focal = tl.minimum(fx, fy)
     slope = slope_of(focal, scale, reference, scaled)
     lane = tl.arange(0, lanes)
+    active = _most_active(counts + b * height, height, lanes)
+    rows = tl.where((active > least) & (active <= lanes), height, 0)
     zero = tl.zeros([lanes], tl.float64)
     mx, my, mz, sxx, sxy, sxz, syy, syz, szz = zero, zero, zero, zero, zero, zero, zero, zero, zero
     lx, ly, lz, ox, oy, oz, px, py, pz, p2, reach = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
@@ -174,11 +209,13 @@ def _join(
     born = n - 1  # -1 = a lane without a Gaussian
     created, retained = 0, 0
     prefetched = _loaded(moments, integers, b * height * most)
-    for v in range(height):
+    found_next = tl.load(counts + b * height)
+    for v in range(rows):
         row = b * height + v
         ry = (v - cy) / fy
-        following = (b * height + tl.minimum(v + 1, height - 1)) * most
-        found = tl.load(counts + row)
+        next_row = b * height + tl.minimum(v + 1, height - 1)
+        following = next_row * most
+        found, found_next = found_next, tl.load(counts + next_row)
         if found == 0:
             prefetched = _loaded(moments, integers, following)
         for j in range(found):
@@ -190,7 +227,7 @@ def _join(
             shared = tl.minimum(u_right, h_right) - tl.maximum(u_left, h_left)
             span = tl.maximum(u_right, h_right) - tl.minimum(u_left, h_left)
             over = (born >= 0) & (since < v) & (shared > 0)
-            rho = tl.where(over, shared.to(tl.float64) / tl.where(over, span, 1).to(tl.float64), 0.0)
+            rho = _ratio(tl.where(over, shared, 0), tl.where(over, span, 1), single)
             best = over & (rho == tl.max(rho, 0))
             oldest = tl.min(tl.where(best, born, 2147483647), 0)
 
@@ -272,18 +309,33 @@ def _join(
             cxx, cxy = tl.where(several, sxx / ratio, 0.0), tl.where(several, sxy / ratio, 0.0)
             cxz, cyy = tl.where(several, sxz / ratio, 0.0), tl.where(several, syy / ratio, 0.0)
             cyz, czz = tl.where(several, syz / ratio, 0.0), tl.where(several, szz / ratio, 0.0)
-            ax, ay, az = mx, my, mz
-            if lifted:
-                ax, ay, az = _stored(ax, rounded), _stored(ay, rounded), _stored(az, rounded)
-                cxx, cxy, cxz = _stored(cxx, rounded), _stored(cxy, rounded), _stored(cxz, rounded)
-                cyy, cyz, czz = _stored(cyy, rounded), _stored(cyz, rounded), _stored(czz, rounded)
-                across = tl.maximum(az, exact(near_plane, az)) / focal
-                least = tl.maximum(across * across * pixel_variance, epsilon * (cxx + cyy + czz))
-                cxx, cxy, cxz, cyy, cyz, czz = floored(cxx, cxy, cxz, cyy, cyz, czz, least)
-            tl.store(mean_o + 3 * out, ax, mask=keep)
-            tl.store(mean_o + 3 * out + 1, ay, mask=keep)
-            tl.store(mean_o + 3 * out + 2, az, mask=keep)
+            cxx, cxy, cxz = _stored(cxx, rounded), _stored(cxy, rounded), _stored(cxz, rounded)
+            cyy, cyz, czz = _stored(cyy, rounded), _stored(cyz, rounded), _stored(czz, rounded)
+            tl.store(mean_o + 3 * out, _stored(mx, rounded), mask=keep)
+            tl.store(mean_o + 3 * out + 1, _stored(my, rounded), mask=keep)
+            tl.store(mean_o + 3 * out + 2, _stored(mz, rounded), mask=keep)
             store_symmetric(covariance_o + 9 * out, cxx, cxy, cxz, cyy, cyz, czz, keep)
             tl.store(weight_o + out, n.to(tl.float64), mask=keep)
             tl.store(count_o + out, (n * 0 + 1).to(tl.int64), mask=keep)
             born = tl.where(gone, -1, born)
+
+
+@triton.jit
+def _lift(
+    camera, mean, covariance, weight, capacity,
+    near_plane: tl.constexpr, epsilon: tl.constexpr, pixel_variance: tl.constexpr, chunk: tl.constexpr,
+):  # fmt: skip
+    """Raise the eigenvalues of the covariances in place, as ``step._segment``."""
+    b = tl.program_id(1).to(tl.int64)
+    focal = tl.minimum(tl.load(camera + 9 * b), tl.load(camera + 9 * b + 4))
+    k = tl.program_id(0) * chunk + tl.arange(0, chunk)
+    inside = k < capacity
+    k = b * capacity + k
+    occupied = tl.load(weight + k, mask=inside, other=0.0) > 0
+    if tl.max(occupied.to(tl.int32), 0) > 0:
+        z = tl.load(mean + 3 * k + 2, mask=occupied, other=1.0)
+        xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * k, 1, occupied)
+        across = tl.maximum(z, exact(near_plane, z)) / focal
+        least = tl.maximum(across * across * pixel_variance, epsilon * (xx + yy + zz))
+        xx, xy, xz, yy, yz, zz = floored(xx, xy, xz, yy, yz, zz, least)
+        store_symmetric(covariance + 9 * k, xx, xy, xz, yy, yz, zz, occupied)
