@@ -10,8 +10,9 @@ import torch
 
 from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig, kernels
 from ufmstar_torch.anchors import Anchors
-from ufmstar_torch.eval.engine.warm_up import dense_anchors
-from ufmstar_torch.kernels.select import compile_triangulation
+from ufmstar_torch.anchors.dense import DenseEvidence
+from ufmstar_torch.anchors.tracker import LandmarkTracker
+from ufmstar_torch.warm_up import along_wall
 
 NEAR = UfMStarConfig(backend="numba", regression="neighbourhood")
 EXACT = UfMStarConfig(backend="numba")
@@ -39,8 +40,8 @@ if __name__ == "__main__":
     if sys.argv[1] == "float32":
         two_frames(NEAR, torch.float32)
         two_frames(EXACT, torch.float32)
-        compile_triangulation()
-        dense_anchors()
+        along_wall(LandmarkTracker())
+        along_wall(DenseEvidence())
     else:  # anchors first, so that only one of the two processes compiles the kernels without a dtype
         two_frames(EXACT.replace(anchors=AnchorConfig(), posterior=PosteriorConfig()), torch.float64)
         two_frames(NEAR, torch.float64)

@@ -26,6 +26,7 @@ from ufmstar_torch.eval.run import rerun_log
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.live import PoseFile, growing_folder, json_lines, replay
 from ufmstar_torch.eval.tour import export_tour
+from ufmstar_torch.live import LiveDepth
 
 __all__ = ["stand_in"]
 
@@ -212,6 +213,21 @@ def test_a_recording_live(ufmstar, tmp_path):
         assert text in err
         assert "weights_only" not in err, "torch's advice is to run the code"
         assert not (tmp_path / "ran").exists()
+
+
+def test_a_recording_waits_for_a_network_that_starts_slowly(ufmstar, monkeypatch):
+    """As on a GPU, whose libraries take seconds: longer than this recording."""
+    process, started = LiveDepth._process, []
+
+    def slow_at_first(*words):
+        if not started:
+            started.append(time.sleep(2))
+        return process(*words)
+
+    monkeypatch.setattr(LiveDepth, "_process", slow_at_first)
+    code, out, err = ufmstar(TOUR, "--speed", "0.25", "--json")
+    assert code == 0, err
+    assert len(out.splitlines()) >= 3  # 2 without the wait: the first image and the last
 
 
 def test_lines_on_standard_input_live(ufmstar, tmp_path, monkeypatch):

@@ -9,13 +9,15 @@ import json
 import os
 import subprocess
 import sys
+from typing import ClassVar
 
 import numpy as np
 import pytest
-from numba.core import caching, codegen, compiler, event, typed_passes, untyped_passes
+import torch
+from modules import same
+from numba.core import caching, codegen, compiler, typed_passes, untyped_passes
 
-from ufmstar_torch import UfMStar
-from ufmstar_torch.eval.engine import warm_up as commands
+from ufmstar_torch import DepthPrediction, UfMStar, UncertainDepth
 from ufmstar_torch.kernels import compile_cpu
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, part
 from ufmstar_torch.warm_up import warm_up
@@ -35,6 +37,22 @@ with event.install_recorder("numba:compile") as late:
     for _ in range(2):
         out = ufm(depth, pose, torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]))
 print(json.dumps({"names": sorted(names), "late": len(late.buffer), "steps": steps, "sum": out.variance.sum().item()}))
+"""
+
+LATE = """
+import json, sys
+from numba.core.dispatcher import Dispatcher
+from ufmstar_torch.anchors.sources import landmark_source
+from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.warm_up import along_wall
+used, compiled = [], Dispatcher.compile
+Dispatcher.compile = lambda self, types: used.append(self.py_func.__name__) or compiled(self, types)
+frames, source = list(open_sequence("tour:3?frames=12&size=96x128")), landmark_source(sys.argv[1])
+used.clear()
+along_wall(landmark_source(sys.argv[1]))
+wall = len(used)
+found = [len(source.update(f.image, f.T_world_cam, f.intrinsics).pixel) for f in frames]
+print(json.dumps({"found": sum(found) > 100, "wall": wall > 2, "late": used[wall:]}))
 """
 
 
@@ -110,11 +128,32 @@ def test_no_garbage_is_collected_while_kernels_are_compiled():
     assert not any(during)
 
 
-def test_what_a_command_compiles_beforehand_is_compiled_once():
-    commands.dense_anchors()
-    with event.install_recorder("numba:compile") as compiled:
-        commands.dense_anchors()
-    assert not compiled.buffer
+@pytest.mark.parametrize("kind", ["corners", "dense"])
+def test_a_source_of_landmarks_needs_no_kernel_after_the_wall(kind):
+    """On images of a room, with rotation, another focal length and depth edges; in a process without kernels."""
+    done = subprocess.run([sys.executable, "-c", LATE, kind], capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == {"found": True, "wall": True, "late": []}
+
+
+def test_warm_up_leaves_networks_images_and_state_as_they_are():
+    class Noisy(torch.nn.Module):
+        sizes: ClassVar = []
+
+        def forward(self, image):
+            self.sizes.append(tuple(image.shape))
+            return DepthPrediction(2 + torch.rand_like(image[:, 0]))
+
+    model = UncertainDepth([Noisy(), Noisy()], posterior=True)
+    before, random = {k: v.clone() for k, v in model.state_dict().items()}, torch.get_rng_state()
+    done = []
+    model.warm_up((32, 48), streams=2, progress=lambda *counts: done.append(counts))
+    assert Noisy.sizes == [(2, 3, 32, 48)] * 4  # every member twice
+    assert done[-1] == (22, 22)  # two frames, a mean and the search
+    assert torch.equal(torch.get_rng_state(), random)
+    assert all(same(v, before[k]) for k, v in model.state_dict().items())
+    UncertainDepth(None).warm_up((32, 48))
+    with pytest.raises(ValueError, match=r"\(H, W\) and B, got 224"):
+        model.warm_up(224)
 
 
 @pytest.mark.slow

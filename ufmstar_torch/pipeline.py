@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import torch
@@ -21,7 +22,7 @@ from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.stateful import outliving
 from ufmstar_torch.stream_warnings import LOGGER
 from ufmstar_torch.ufmstar import UfMStar
-from ufmstar_torch.warm_up import camera_of, dense_anchors, require_size, warm_up
+from ufmstar_torch.warm_up import along_wall, camera_of, require_size, warm_up
 
 _BLACK = {torch.uint8: 1, torch.float32: 1 / 255, torch.float64: 1 / 255}  # largest value of a black image
 
@@ -317,11 +318,11 @@ class UncertainDepth(NetworksInTurn):
             ValueError: as :meth:`UfMStar.warm_up`.
         """
         require_size(size, streams)
-        dense = self.landmarks is not None and self.landmarks.dense
+        searching = () if self.landmarks is None else self.landmarks.searching
         if self.networks:
             size = self._tried(size, streams)
         ufm = UfMStar(self.ufm.config, dtype=self.ufm.mean.dtype, device=self.ufm.mean.device)
-        warm_up(ufm, size, streams, progress, [dense_anchors] if dense else [])
+        warm_up(ufm, size, streams, progress, [partial(along_wall, kind()) for kind in searching])
 
     def _tried(self, size: tuple[int, int], streams: int) -> tuple[int, int]:
         """Run every network twice on noise in images of ``size``; the size of their depth maps."""

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.dense import DenseEvidence
-from ufmstar_torch.kernels.select import compile_triangulation
+from ufmstar_torch.anchors.tracker import LandmarkTracker
 
 _DISTANCE = 2.0  # [m]
-_WALL, _FOCAL = (96, 128), 100.0  # [px] of the images of a wall
-_STEP, _FRAMES = 4, 8  # motion of the wall [px per frame], and number of frames
+_WALL, _SQUARE = (96, 128), 4  # [px] images of a wall, and its squares, by one of which the camera moves
+_FRAMES = 8  # of the wall
 _TOTAL = 3 * 7  # stages of a step, for two frames and an image average
 
 
@@ -74,14 +74,12 @@ def warm_up(
         for _ in range(2):  # the fusion needs a mixture, from the second frame on
             module(depth, pose, K, aleatoric, features=features, **({} if anchors is None else {"anchors": anchors}))
         module.mean_uncertainty(depth, pose, K, aleatoric, features=features, pixels=1)
-        if config.anchors is not None:
-            compile_triangulation()
         for function in also:
             function()
             stages.stage("")
 
 
-def require_size(size: object, streams: int) -> None:
+def require_size(size: tuple[int, int], streams: int) -> None:
     """Raise a ValueError unless ``size`` is (H, W) and all three numbers are positive."""
     if np.shape(size) != (2,) or min(*size, streams) < 1:
         raise ValueError(f"size and streams must be positive, (H, W) and B, got {size!r} and {streams}")
@@ -93,15 +91,15 @@ def camera_of(size: tuple[int, int]) -> Tensor:
     return torch.tensor([[float(width), 0, width / 2], [0, float(width), height / 2], [0, 0, 1]])
 
 
-def dense_anchors() -> None:
-    """Run the depth search of :class:`DenseEvidence` on images of a textured wall along which the camera moves."""
+def along_wall(evidence: LandmarkTracker | DenseEvidence) -> None:
+    """Compile the kernels of a new source of landmarks: run it on a camera's way along a textured wall."""
     height, width = _WALL
-    wall = np.random.default_rng(0).integers(0, 256, (height, width + _STEP * _FRAMES, 3), dtype=np.uint8)
-    evidence, K = DenseEvidence(), np.array([[_FOCAL, 0, width / 2], [0, _FOCAL, height / 2], [0, 0, 1]])
+    squares = np.random.default_rng(0).integers(0, 256, (height // _SQUARE, width // _SQUARE + _FRAMES, 3), np.uint8)
+    wall, K = squares.repeat(_SQUARE, 0).repeat(_SQUARE, 1), camera_of(_WALL).double().numpy()
     for frame in range(_FRAMES):
         T_world_cam = np.eye(4)
-        T_world_cam[0, 3] = frame * _STEP / _FOCAL * evidence.config.start_depth
-        evidence.update(wall[:, frame * _STEP : frame * _STEP + width].copy(), T_world_cam, K)
+        T_world_cam[0, 3] = frame * _SQUARE / width * evidence.config.start_depth
+        evidence.update(wall[:, frame * _SQUARE :][:, :width].copy(), T_world_cam, K)
 
 
 @contextmanager

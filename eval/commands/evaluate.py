@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 
 import torch
 
-from ufmstar_torch.anchors.sources import DENSE
 from ufmstar_torch.eval.bench.measure import EFFICIENCY, Plan, measure_job
 from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, option, reader, usage_errors
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
@@ -205,7 +204,7 @@ def _evaluate(options: EvalOptions) -> int:
             anchors = {row.setting.anchors for row in rows}
             posterior = any(row.setting.posterior for row in rows)
             config = started(DEFAULTS, anchors=anchors != {""}, posterior=posterior)
-            warm_up_command(config, bars.show, dense=DENSE in anchors)
+            warm_up_command(config, bars.show, anchors)
         if sys.stderr.isatty():
             how["progress"] = bars.show
         outcome = evaluate_suite(job, shard=options.part, **how, stop=stop, report=bars.say)

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ufmstar_torch.anchors.sources import CORNERS, DENSE
 from ufmstar_torch.eval.check.image_fit import image_fit, track_corners
 from ufmstar_torch.eval.commands.depth import NetworkOptions, UfMOptions
 from ufmstar_torch.eval.commands.options import MachineOptions, option, positional, reader, usage_errors
@@ -216,8 +217,8 @@ def _model(options: LiveOptions) -> UncertainDepth:
         multiview_device="cpu",  # for one camera faster than a GPU
     ).to(options.device)
     with Bars() as bars:
-        dense = config.anchors is not None and anchors in (False, "dense")
-        warm_up_command(model.ufm.config, bars.show, dense=dense)
+        named = CORNERS if anchors is True else anchors or DENSE  # without --anchors, those of --posterior
+        warm_up_command(model.ufm.config, bars.show, [] if config.anchors is None else [named])
     if options.state is not None and options.state.exists():
         try:
             with options.state.open("rb") as file:

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.anchors.sources import DENSE
 from ufmstar_torch.eval.engine.progress import Progress, ProgressSink
 from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
@@ -83,8 +82,7 @@ def _frames(folder: RunFolder, progress: Show, stop: Stop) -> None:
 
 def warm_up_job(job: RunJob, progress: Show) -> None:
     """Compile a job's kernels before its first frame."""
-    dense = job.config.anchors is not None and job.landmarks == DENSE
-    warm_up_command(job.config, progress, dense=dense)
+    warm_up_command(job.config, progress, [] if job.config.anchors is None else [job.landmarks])
 
 
 def _ending(folder: RunFolder) -> tuple[str, str]:

@@ -14,6 +14,7 @@ from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, LandmarkSource
 from ufmstar_torch.anchors.sources import landmark_source
+from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.camera import rotation_deviation
 from ufmstar_torch.frame import FRAME_FAULTS, intrinsics_fault, pose_fault
 
@@ -41,7 +42,7 @@ class StreamLandmarks:
 
     Attributes:
         needs_image: whether a source reads the images.
-        dense: whether a source is :class:`DenseEvidence`.
+        searching: types of the sources that search the images, and compile kernels for it.
         last: landmarks of the last image of every stream.
 
     Raises:
@@ -53,7 +54,8 @@ class StreamLandmarks:
         self._sources = [landmark_source(source) for source in listed]
         self._before = self._states()
         self.needs_image = any(source.needs_image for source in self._sources)
-        self.dense = any(isinstance(source, DenseEvidence) for source in self._sources)
+        kinds = {type(source) for source in self._sources}
+        self.searching = tuple(kind for kind in (LandmarkTracker, DenseEvidence) if kind in kinds)
         self.last: list[Landmarks] = []
         self._contradicted = [0] * len(self._sources)  # successive images; -1 = warned
         self._lag_warned = set[int]()

@@ -147,14 +147,3 @@ def _has_triton(device_type: str) -> bool:
         warnings.warn("triton needs compute capability 8.0; the slower torch reference serves", stacklevel=4)
         return False
     return True
-
-
-def compile_triangulation() -> None:
-    """Compile the triangulation of tracked corners."""
-    import numpy as np
-
-    from ufmstar_torch.kernels.triangulate_cpu import triangulate
-
-    poses = np.stack([np.eye(4)] * 2)
-    poses[1, 0, 3] = 1.0
-    triangulate(np.array([[[0.5, 0.0], [-0.5, 0.0]]]), np.ones((1, 2), np.bool_), poses, np.eye(3))
