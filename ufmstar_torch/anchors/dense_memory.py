@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.anchors.epipolar import median
+from ufmstar_torch.anchors.epipolar import MEDIAN_SQUARE, median
 from ufmstar_torch.anchors.saved_state import SavedState
 
 # A landmark is measured again when the camera has moved by the share _DUE of its depth, times 1 plus the number of
@@ -19,8 +19,6 @@ _DUE, _LONGEST = 0.04, 4
 _SIGMAS, _SHARE = 3.5, 0.01
 # Running estimate ``apart``: least number of measurements for an update, first value, and steps of the bisection.
 _ENOUGH, _FIRST_APART, _STEPS = 10, 0.01**2, 8
-# The median of the square of a standard normal variable.
-_MEDIAN_SQUARE = 0.4549
 # Failures in a row, beyond the number of confirmations, after which a landmark is deleted.
 _FAILURES = 3
 
@@ -200,10 +198,10 @@ class Memory(SavedState):
 def _beyond(square: NDArray[np.float64], variance: NDArray[np.float64]) -> float:
     """Variance to add to the stated ones so that the normalised squared differences have the median of a normal one."""
     low, high = 1e-7, 0.3**2
-    if median(square / (variance + low)) <= _MEDIAN_SQUARE:
+    if median(square / (variance + low)) <= MEDIAN_SQUARE:
         return 0.0
     for _ in range(_STEPS):
         middle = float(np.sqrt(low * high))
-        too_small = median(square / (variance + middle)) > _MEDIAN_SQUARE
+        too_small = median(square / (variance + middle)) > MEDIAN_SQUARE
         low, high = (middle, high) if too_small else (low, middle)
     return high

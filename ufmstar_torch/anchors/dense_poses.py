@@ -26,15 +26,13 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.anchors.epipolar import median
+from ufmstar_torch.anchors.epipolar import MEDIAN_SQUARE, median
 from ufmstar_torch.anchors.saved_state import SavedState
 from ufmstar_torch.kernels.dense_cpu import Measured, Views
 from ufmstar_torch.kernels.poses_cpu import CAMERA, POSE, Shown, Solution, linearised, solved
 
 # Least number of matches for an update of the running estimates.
 _ENOUGH = 10
-# The median of the square of a standard normal variable.
-_MEDIAN_SQUARE = 0.4549
 # [px] Standard deviation of a position by errors of the refined poses: first value and lower limit.
 _FIRST, _LEAST = 0.1, 0.003
 # The variance of a pixel is _PATCH times that of its match times the mean squared residual of its views, in which the
@@ -197,11 +195,11 @@ class PoseErrors(SavedState):
     ) -> None:
         if len(residual) < _ENOUGH:
             return
-        unexplained = (_medians(across_residual, shows) / _MEDIAN_SQUARE - _medians(noise, shows)).clip(_LEAST**2)
+        unexplained = (_medians(across_residual, shows) / MEDIAN_SQUARE - _medians(noise, shows)).clip(_LEAST**2)
         for share, newest, count in zip(shares, unexplained, shows.sum(0), strict=True):
             if count >= _ENOUGH:
                 self._unexplained[share] = self._faded(self._unexplained[share], newest)
-        self._disagreement = self._faded(self._disagreement, median(residual) / _MEDIAN_SQUARE)
+        self._disagreement = self._faded(self._disagreement, median(residual) / MEDIAN_SQUARE)
 
     def _camera_prior(self, width: int) -> NDArray[np.float64]:
         """[4, 4] prior covariance of the camera's errors."""

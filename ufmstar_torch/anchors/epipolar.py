@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 NEAREST = 1e-3
 # Limit of the inverse depth, as a share of that at which a point reaches the earlier camera's focal plane.
 _AHEAD = 0.98
+# The median of the square of a standard normal variable.
+MEDIAN_SQUARE = 0.4549
 
 
 def off_lines(

@@ -41,9 +41,7 @@ from torch import Tensor
 from ufmstar_torch.anchors.anchors import AnchorInput
 from ufmstar_torch.fixed_order import total
 
-# Entries of a row of sums.
-COUNT, BIAS, EXCESS = 0, 1, 2
-SUMS = 3
+SUMS = 3  # entries of a row of sums: w, w r and w e
 # A wrong track differs from its neighbours. An anchor is used if at least SUPPORT of its NEIGHBOURS nearest anchors in
 # the image have a similar ratio g/d. The frame's median is no reference: a network may be wrong by another factor on
 # each surface, and anchors must detect a small region that differs from the rest.
