@@ -27,19 +27,16 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from ufmstar_torch.models.checkpoints import channels_of, fill, load_state_dict_file
 from ufmstar_torch.models.dropout import DecoderDropout
-from ufmstar_torch.models.network import Backbone, DepthNetwork, require_image
+from ufmstar_torch.models.network import INITIAL_DEPTH, MULTIPLE, Backbone, DepthNetwork, require_image
 from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec, providers_for
 from ufmstar_torch.models.onnx_weights import read_convolutions
 from ufmstar_torch.models.outputs import METRIC, OutputSpec, PlainSpec, ProgramSpec
 from ufmstar_torch.models.preprocess import Preprocess
 
-MULTIPLE = 32  # [px] five halvings
 # Strides of the encoder's stem and 13 blocks.
 _STRIDES = (2, 1, 2, 1, 2, 1, 2, 1, 1, 1, 1, 1, 2, 1)
 # Decoder layer -> the encoder block (at 1/8, 1/4, 1/2 of the resolution) added to its doubled output.
 _SKIPS = {1: 5, 2: 3, 3: 1}
-# [m] Depth that an untrained network predicts: typical of rooms, and positive, so that a ReLU has a gradient.
-INITIAL_DEPTH = 2.5
 # [1] Largest difference between ONNX Runtime's depth and the network's, over the largest depth, that is rounding.
 _AGREEMENT = 1e-3
 # The last activation, and its input for INITIAL_DEPTH.

@@ -18,8 +18,7 @@ from ufmstar_torch.checked import Checked
 from ufmstar_torch.models.dropout import DecoderDropout
 from ufmstar_torch.models.heads import resized
 from ufmstar_torch.models.hugging_face import Checkpoint, HuggingFaceDepth, HuggingFaceSpec, read_checkpoint
-from ufmstar_torch.models.monodepth2 import INITIAL_DEPTH
-from ufmstar_torch.models.network import Backbone, in_eval_mode
+from ufmstar_torch.models.network import INITIAL_DEPTH, Backbone, in_eval_mode
 from ufmstar_torch.models.outputs import as_map
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction, takes_intrinsics

@@ -20,11 +20,10 @@ from torch import Tensor, nn
 
 from ufmstar_torch.models.checkpoints import channels_of, fill, load_state_dict_file
 from ufmstar_torch.models.dropout import DecoderDropout
-from ufmstar_torch.models.network import Backbone, fits, require_image
+from ufmstar_torch.models.network import INITIAL_DEPTH, MULTIPLE, Backbone, fits, require_image
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.optional import optional
 
-MULTIPLE = 32  # [px] five halvings
 SMALLEST = 64  # [px] reflection padding needs maps of more than one pixel
 LEVELS = 5
 LAYERS = (18, 34, 50)
@@ -34,8 +33,6 @@ DECODER_WIDTHS = (16, 32, 64, 128, 256)
 # ImageNet's colour statistics, for RGB in [0, 1].
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-# [m] Approximate depth that an untrained network predicts: typical of rooms.
-INITIAL_DEPTH = 2.5
 
 
 class ResNetEncoder(nn.Module):

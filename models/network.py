@@ -17,6 +17,10 @@ from ufmstar_torch.prediction import DepthPrediction, stated_range, states_confi
 if TYPE_CHECKING:
     from ufmstar_torch.models.outputs import OutputSpec
 
+MULTIPLE = 32  # [px] FastDepth and Monodepth2 halve the image five times
+# [m] Depth that an untrained network predicts: typical of rooms, and positive, so that a ReLU has a gradient.
+INITIAL_DEPTH = 2.5
+
 
 class DepthNetwork(nn.Module, ABC):
     """A monocular network that predicts metric depth.

@@ -11,10 +11,9 @@ from ufmstar_torch.checked import Checked, choice, number, section
 from ufmstar_torch.models.batch_ensemble import INIT_STD, BatchEnsemble
 from ufmstar_torch.models.heads import HEADS, UncertaintyNetwork, with_head
 from ufmstar_torch.models.module_backbone import ModuleBackbone, ModuleSpec
-from ufmstar_torch.models.network import Backbone, fits
+from ufmstar_torch.models.network import MULTIPLE, Backbone, fits
 from ufmstar_torch.models.preprocess import Preprocess
 
-_MULTIPLE = 32  # [px] both architectures halve the image five times
 _SMALLEST = {"fastdepth": 32, "monodepth2": 64}  # [px]
 # Fields of one architecture; the others require their defaults, so that specs of the same network are equal.
 _ONLY = {"widths": "fastdepth", "norm": "fastdepth", "positive": "fastdepth"}
@@ -81,8 +80,8 @@ class NetworkSpec(Checked):
             raise ValueError("NetworkSpec.module must describe the network of architecture 'module'")
         size, smallest = self.size, _SMALLEST.get(self.architecture, 1)
         whole = type(size) is tuple and len(size) == 2 and all(type(side) is int for side in size)
-        if not whole or not fits(*size, 1 if is_module else _MULTIPLE, smallest):
-            expected = f"multiples of {_MULTIPLE} px from {smallest} px on"
+        if not whole or not fits(*size, 1 if is_module else MULTIPLE, smallest):
+            expected = f"multiples of {MULTIPLE} px from {smallest} px on"
             raise ValueError(f"NetworkSpec.size must be (height, width) in {expected}, got {size!r}")
         for f in fields(self):
             if _ONLY.get(f.name, self.architecture) != self.architecture and getattr(self, f.name) != f.default:
