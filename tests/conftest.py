@@ -78,20 +78,18 @@ TRITON = (
 )  # fmt: skip
 
 
-@pytest.fixture(scope="session", params=["torch", "numba", pytest.param("triton", marks=TRITON)])
-def backend(request: pytest.FixtureRequest):
-    """Every backend of ``backends.py``."""
+COMPILED = ("numba", pytest.param("triton", marks=TRITON))
+
+
+def _backend(request: pytest.FixtureRequest):
     from backends import make_backend
 
     return make_backend(request.param)
 
 
-@pytest.fixture(scope="session", params=["numba", pytest.param("triton", marks=TRITON)])
-def compiled_backend(request: pytest.FixtureRequest):
-    """Every backend but the reference."""
-    from backends import make_backend
-
-    return make_backend(request.param)
+# Every backend of ``backends.py``, and every backend but the reference.
+backend = pytest.fixture(scope="session", params=["torch", *COMPILED])(_backend)
+compiled_backend = pytest.fixture(scope="session", params=COMPILED)(_backend)
 
 
 @pytest.fixture(scope="session")
@@ -133,6 +131,28 @@ def ufmstar(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
         return code, printed.out, printed.err
 
     return call
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory: pytest.TempPathFactory):
+    """A generic sequence of 6 frames, 48x64, and its rendered scene. Tests must not change it."""
+    from layouts import write_generic
+
+    return write_generic(tmp_path_factory.mktemp("scene"))
+
+
+@pytest.fixture(scope="session")
+def path(scene) -> Path:
+    """The folder of :func:`scene`."""
+    return scene[0]
+
+
+@pytest.fixture(scope="session")
+def sequence(path: Path):
+    """The opened sequence of :func:`scene`."""
+    from ufmstar_torch.eval.sequences import open_sequence
+
+    return open_sequence(path)
 
 
 @pytest.fixture(scope="session")

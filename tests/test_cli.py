@@ -21,12 +21,6 @@ from ufmstar_torch.eval.engine import load as sources
 from ufmstar_torch.models import Preprocess
 
 
-@pytest.fixture(scope="module")
-def path(tmp_path_factory):
-    """A generic sequence of 6 frames, 48x64. Tests must not change it."""
-    return write_generic(tmp_path_factory.mktemp("scene"))[0]
-
-
 @pytest.fixture
 def brightness(monkeypatch, tmp_path):
     """Make ``--model any --weights FILE`` load a :class:`Brightness` whose gain is the file's content.

@@ -35,17 +35,6 @@ def crash():
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """A generic sequence of 6 frames, 48x64, and its rendered scene. Tests must not change it."""
-    return write_generic(tmp_path_factory.mktemp("scene"))
-
-
-@pytest.fixture
-def path(scene):
-    return scene[0]
-
-
-@pytest.fixture(scope="module")
 def uninterrupted(scene, tmp_path_factory):
     """The outputs of an undisturbed run of two alternating networks."""
     out = tmp_path_factory.mktemp("uninterrupted") / "out"

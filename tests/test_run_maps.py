@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from layouts import write_depth_png, write_generic
+from layouts import write_depth_png
 from runs import Brightness, job_of, networks, own_depth_job
 
 from ufmstar_torch import cli
@@ -17,17 +17,6 @@ from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
 from ufmstar_torch.eval.tour import export_tour
 from ufmstar_torch.models import Preprocess
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """A generic sequence of 6 frames, 48x64, and its rendered scene. Tests must not change it."""
-    return write_generic(tmp_path_factory.mktemp("scene"))
-
-
-@pytest.fixture
-def path(scene):
-    return scene[0]
 
 
 def test_maps_of_another_size_get_their_intrinsics(scene, tmp_path):

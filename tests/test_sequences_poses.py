@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from layouts_more import rigid
 from scipy.spatial.transform import Rotation, Slerp
 
 from ufmstar_torch.eval.sequences.poses import associate, read_pose, read_trajectory
@@ -22,12 +23,6 @@ def write(tmp_path, text):
     return path
 
 
-def expected(R, t):
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, t
-    return T
-
-
 @pytest.mark.parametrize(
     ("line", "timestamp"),
     [
@@ -41,7 +36,7 @@ def expected(R, t):
 )
 def test_every_format_gives_the_same_pose(tmp_path, line, timestamp):
     trajectory = read_trajectory(write(tmp_path, f"# a comment\n\n{line}  # and another\n"))
-    np.testing.assert_allclose(trajectory.T_world_cam, [expected(R_QUARTER_Z, [1, 2, 3])], atol=1e-15)
+    np.testing.assert_allclose(trajectory.T_world_cam, [rigid(R_QUARTER_Z, [1, 2, 3])], atol=1e-15)
     if timestamp is None:
         assert trajectory.timestamps is None
     else:

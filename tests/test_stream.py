@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from layouts import write_generic
 from runs import Brightness, networks
 from tiny_suite import CPU, row
 
@@ -20,11 +19,11 @@ from ufmstar_torch.eval.engine.progress import ProgressSink
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream, Stopped
 from ufmstar_torch.eval.methods.setting import Setting
-from ufmstar_torch.eval.sequences import FrameError, open_sequence
+from ufmstar_torch.eval.sequences import FrameError
 from ufmstar_torch.eval.sequences.frame import in_memory
 from ufmstar_torch.eval.tour.sequence import open_tour
 
-FRAMES = 6
+FRAMES = 6  # of the fixture sequence
 
 
 class Recorded(FrameSink):
@@ -42,11 +41,6 @@ class Recorded(FrameSink):
 
     def end(self):
         self.calls.append((self.name, "end", None))
-
-
-@pytest.fixture(scope="module")
-def sequence(tmp_path_factory):
-    return open_sequence(write_generic(tmp_path_factory.mktemp("stream"), frames=FRAMES)[0])
 
 
 @pytest.fixture(scope="module")

@@ -33,13 +33,8 @@ def networks(network_files):
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory):
-    return write_generic(tmp_path_factory.mktemp("evaluate"), frames=FRAMES)[0]
-
-
-@pytest.fixture(scope="module")
-def sequence(path):
-    return open_sequence(path)
+def sequence(tmp_path_factory):
+    return open_sequence(write_generic(tmp_path_factory.mktemp("evaluate"), frames=FRAMES)[0])
 
 
 def members_of(text):

@@ -22,11 +22,6 @@ def networks(network_files):
 
 
 @pytest.fixture(scope="module")
-def sequence(tmp_path_factory):
-    return open_sequence(write_generic(tmp_path_factory.mktemp("examples"), frames=6)[0])
-
-
-@pytest.fixture(scope="module")
 def folder(networks, sequence, tmp_path_factory):
     folder = tmp_path_factory.mktemp("out")
     evaluate(sequence, ROWS, networks, sinks=[ExampleWriter(folder, frames=2)])
