@@ -7,7 +7,9 @@ The inputs of the head are the input of the network's last convolution, and the 
 from __future__ import annotations
 
 import math
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -70,25 +72,18 @@ class ModuleSpec(Checked):
             )
         read: dict[str, int] = {}
 
-        def note(name: str, value: Any) -> None:
+        def note(name: str, _: nn.Module, inputs: tuple[Any, ...], by_name: dict[str, Any]) -> None:
+            value = next(iter((*inputs, *by_name.values())), None)
             if part in (None, name) and isinstance(value, Tensor) and value.dim() == 4:
                 read.pop(name, None)  # to keep the order of the last calls
                 read[name] = value.shape[1]
 
-        hooks = [
-            m.register_forward_pre_hook(
-                lambda _, x, by_name, name=n: note(name, next(iter((*x, *by_name.values())), None)), with_kwargs=True
-            )
-            for n, m in named.items()
-        ]
         image = preprocess.apply_image(torch.full((1, 3, *_PROBE), 128, dtype=torch.uint8))
         first = next(network.parameters(), image)
-        try:
-            with in_eval_mode(network):
-                output = network(image.to(first.device, first.dtype))
-        finally:
-            for hook in hooks:
-                hook.remove()
+        with ExitStack() as hooks, in_eval_mode(network):
+            for name, module in named.items():
+                hooks.enter_context(module.register_forward_pre_hook(partial(note, name), with_kwargs=True))
+            output = network(image.to(first.device, first.dtype))
         source = about.pop("source", type(network).__name__)
         if _is_features(output):
             return cls(source, preprocess, None, output.shape[1], **about)
@@ -156,12 +151,8 @@ class ModuleBackbone(Backbone):
 
         # The hook exists during a call only: copies of the network or its layers must not contain it.
         part = self.network.get_submodule(self.part) if self.part else None
-        hooks = [] if part is None else [part.register_forward_pre_hook(replace, with_kwargs=True)]
-        try:
+        with nullcontext() if part is None else part.register_forward_pre_hook(replace, with_kwargs=True):
             output = self.network(image)
-        finally:
-            for hook in hooks:
-                hook.remove()
         if self.part is None:
             if not _is_features(output):
                 raise ValueError("the network must return features [B, C, h, w], as its specification states")
