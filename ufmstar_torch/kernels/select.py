@@ -74,7 +74,7 @@ def select_check(name: str, device_type: str) -> CheckKernel:
 
 
 def select_anchors(name: str, device_type: str) -> AnchorKernels:
-    """The kernels of the anchors' evidence; arguments and errors as :func:`select_step`."""
+    """Kernels of the anchors' evidence; arguments as :func:`select_step`. Raises ValueError: "numba" off the CPU."""
     if _compiled(name, device_type):
         from ufmstar_torch.kernels import anchors_cpu as fast
 
@@ -114,8 +114,8 @@ def _on_gpu(name: str, device_type: str) -> bool:
 
 
 def select_posterior(name: str, device_type: str) -> PosteriorUpdate:
-    """The posterior's update for a device, on the host for an accelerator; arguments and errors as
-    :func:`select_step`."""
+    """The posterior's update for a device, on the host for an accelerator; arguments as :func:`select_step`. Raises
+    ValueError: "numba" off the CPU."""
     compiled = _compiled(name, device_type)
     if not compiled and (name == "torch" or device_type in ("cpu", "meta")):
         return update_posterior
