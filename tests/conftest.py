@@ -172,6 +172,14 @@ def network_files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 @pytest.fixture(scope="session")
+def networks(network_files):
+    """The loaded networks of :func:`network_files`, 3 samples each."""
+    from tiny_suite import base_network
+
+    return {base: base_network(text, samples=3) for base, text in network_files.items()}
+
+
+@pytest.fixture(scope="session")
 def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sequence to train on. Tests must not change it."""
     from trainings import write_frames

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image, ImageEnhance
+from test_preprocess import blob, centroid, project
 from torch import Tensor
 
 import scenes
@@ -28,11 +29,6 @@ CHANGES = {
 }
 
 
-def project(point: Tensor, intrinsics: Tensor) -> Tensor:
-    x = intrinsics @ point
-    return x[:2] / x[2]
-
-
 def seen_by_new_camera(point: Tensor, change: Change, zoom: str) -> Tensor:
     """The point [3] in the augmented camera's frame, computed from the documented steps: roll, mirror, zoom."""
     c, s = np.cos(change.angle), np.sin(change.angle)
@@ -43,19 +39,6 @@ def seen_by_new_camera(point: Tensor, change: Change, zoom: str) -> Tensor:
     return torch.tensor([x, y, z / change.scale if zoom == "depth" else z], dtype=torch.float64)
 
 
-def blob(centre: Tensor) -> Tensor:
-    """[3, H, W] a Gaussian blob at ``centre`` (u, v)."""
-    v, u = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in SIZE), indexing="ij")
-    gauss = torch.exp(-0.5 * (((u - centre[0]) / SIGMA) ** 2 + ((v - centre[1]) / SIGMA) ** 2))
-    return gauss.expand(3, -1, -1)
-
-
-def centroid(image: Tensor) -> Tensor:
-    mass = image.sum(0)
-    v, u = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in SIZE), indexing="ij")
-    return torch.stack([(mass * u).sum(), (mass * v).sum()]) / mass.sum()
-
-
 @pytest.mark.parametrize("zoom", ["depth", "focal"])
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
 @pytest.mark.parametrize("pixel", [(80.0, 60.0), (65.0, 72.0), (96.0, 48.0)], ids=str)
@@ -63,10 +46,10 @@ def test_a_point_is_seen_where_the_new_intrinsics_project_it(pixel, change, zoom
     """Image, depth and K' of one known 3D point agree; the blob's centre of mass to .02 px."""
     point = torch.linalg.solve(K, torch.tensor([*pixel, 1.0], dtype=torch.float64)) * 2.5
     depth = torch.full(SIZE, 2.5, dtype=torch.float64)
-    image, new_depth, new_K = apply_geometry(blob(torch.tensor(pixel)), depth, K, change, zoom)
+    image, new_depth, new_K = apply_geometry(blob(*SIZE, torch.tensor(pixel), torch.full((2,), SIGMA))[0], depth, K, change, zoom)
     present = seen_by_new_camera(point, change, zoom)
-    where = project(present, new_K)
-    torch.testing.assert_close(centroid(image), where, rtol=0, atol=0.02)
+    where = project(present, new_K[None])
+    torch.testing.assert_close(centroid(image[None]), where, rtol=0, atol=0.02)
     column, row = where.round().long().tolist()
     assert new_depth[row, column].item() == pytest.approx(present[2].item(), abs=1e-12)
 

@@ -6,6 +6,7 @@ import copy
 
 import torch
 from onnx_files import small_network
+from test_monodepth2 import seeded
 from tiny_networks import Linear
 from torch import Tensor, nn
 
@@ -20,10 +21,6 @@ from ufmstar_torch.models import (
 from ufmstar_torch.models.dropout import SAMPLES
 
 P = 0.2
-
-
-def seeded(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 def with_dropout(p: float = P) -> FastDepth:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from layouts import truncate, write_generic, write_image
-from tiny_suite import CPU, base_network, evaluate, row, same
+from tiny_suite import CPU, evaluate, row, same
 
 from ufmstar_torch.eval.engine.predictions import CacheError, PredictionCache, frame_digest, sequence_digest
 from ufmstar_torch.eval.sequences import open_sequence
@@ -22,11 +22,6 @@ PATH, CONTENT = Path("network", "sequence", "frame-7@all.npz"), "c" * 64
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
     return write_generic(tmp_path_factory.mktemp("cache"), frames=4)[0]
-
-
-@pytest.fixture(scope="module")
-def networks(network_files):
-    return {base: base_network(network_files[base], samples=3) for base in {one.method.base for one in ROWS}}
 
 
 def maps(seed=0):

@@ -28,11 +28,6 @@ FRAMES = 5
 
 
 @pytest.fixture(scope="module")
-def networks(network_files):
-    return {base: base_network(text, samples=3) for base, text in network_files.items()}
-
-
-@pytest.fixture(scope="module")
 def sequence(tmp_path_factory):
     return open_sequence(write_generic(tmp_path_factory.mktemp("evaluate"), frames=FRAMES)[0])
 

@@ -17,11 +17,6 @@ ROWS = [row("UfM*-Aleatoric"), row("Aleatoric"), row("DepthOnly"), row("UfM-Alea
 
 
 @pytest.fixture(scope="module")
-def networks(network_files):
-    return {base: base_network(network_files[base]) for base in ("aleatoric", "depth_only")}
-
-
-@pytest.fixture(scope="module")
 def folder(networks, sequence, tmp_path_factory):
     folder = tmp_path_factory.mktemp("out")
     evaluate(sequence, ROWS, networks, sinks=[ExampleWriter(folder, frames=2)])

@@ -112,11 +112,6 @@ def test_a_noisy_pose_is_a_pose(degrees, metres, seed, index):
 # ---- networks ----
 
 
-@pytest.fixture(scope="module")
-def loaded(network_files):
-    return {base: base_network(text, samples=4) for base, text in network_files.items()}
-
-
 def test_a_choice_as_it_is_typed():
     choice = NetworkChoice.parse("ensemble=trained:a/m0.safetensors,m1.safetensors#3")
     assert (choice.base, choice.model) == ("ensemble", "trained")
@@ -127,10 +122,10 @@ def test_a_choice_as_it_is_typed():
     assert NetworkChoice.parse("depth_only=ground-truth").size is None
 
 
-def test_turns_of_members_and_of_samples(loaded):
-    assert [loaded["ensemble"].turn(i) for i in range(5)] == [0, 1, 2, 0, 1]
-    assert [loaded["batch_ensemble"].turn(i) for i in range(5)] == [0, 1, 2, 0, 1]
-    assert [loaded["mc_dropout"].turn(i) for i in range(5)] == [0] * 5, "one sample of every image"
+def test_turns_of_members_and_of_samples(networks):
+    assert [networks["ensemble"].turn(i) for i in range(5)] == [0, 1, 2, 0, 1]
+    assert [networks["batch_ensemble"].turn(i) for i in range(5)] == [0, 1, 2, 0, 1]
+    assert [networks["mc_dropout"].turn(i) for i in range(5)] == [0] * 5, "one sample of every image"
 
 
 @pytest.mark.parametrize(
@@ -152,11 +147,11 @@ def test_a_network_that_is_not_what_its_base_is_about(network_files, base, of, t
         base_network(network_files[of].replace(of, base, 1))
 
 
-def test_members_one_by_one_and_from_several_files(network_files, loaded, tmp_path):
+def test_members_one_by_one_and_from_several_files(network_files, networks, tmp_path):
     file = network_files["ensemble"].partition(":")[2]
     alone = base_network(f"aleatoric=trained:{file}#2")
     assert alone.identity["files"][0]["member"] == 2
-    together, other = loaded["ensemble"], base_network(f"ensemble=trained:{file}#2,{file}#0")
+    together, other = networks["ensemble"], base_network(f"ensemble=trained:{file}#2,{file}#0")
     image = torch.rand(1, 3, 32, 64, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
         depths = [network(image).depth for network in together.networks]
@@ -170,12 +165,12 @@ def test_members_one_by_one_and_from_several_files(network_files, loaded, tmp_pa
     assert base_network(f"aleatoric=trained:{named}").identity["files"][0]["member"] is None
 
 
-def test_digests_tell_networks_apart(network_files, loaded):
+def test_digests_tell_networks_apart(network_files, networks):
     file = network_files["mc_dropout"].partition(":")[2]
     file_of_members = network_files["ensemble"].partition(":")[2]
     different = [
-        *loaded.values(),
-        base_network(network_files["mc_dropout"], samples=3),
+        *networks.values(),
+        base_network(network_files["mc_dropout"], samples=4),
         base_network(f"aleatoric=trained:{file}"),
         base_network(f"aleatoric=trained:{file_of_members}#1"),
         base_network(f"aleatoric=trained:{file_of_members}#2"),
@@ -183,9 +178,9 @@ def test_digests_tell_networks_apart(network_files, loaded):
         base_network("depth_only=ground-truth:32x64"),
     ]
     assert len({network.digest for network in different}) == len(different)
-    assert base_network(network_files["evidential"]).digest == loaded["evidential"].digest
+    assert base_network(network_files["evidential"]).digest == networks["evidential"].digest
     as_depth = base_network(network_files["aleatoric"].replace("aleatoric", "depth_only", 1))
-    assert as_depth.digest == loaded["aleatoric"].digest, "it is the same network"
+    assert as_depth.digest == networks["aleatoric"].digest, "it is the same network"
 
 
 def test_files_that_are_not_there(tmp_path):

@@ -98,22 +98,17 @@ def test_two_views_side_by_side_in_closed_form():
     assert not triangulate(pixel[:, ::-1], np.ones((1, 2), dtype=bool), T, K).ahead[0], "behind the cameras"
 
 
-@pytest.fixture(scope="module")
-def tour():
-    return walk()
-
-
-def test_every_reason_for_no_landmark(tour):
-    tracker, frame = LandmarkTracker(), tour[0]
+def test_every_reason_for_no_landmark():
+    tracker, frame = LandmarkTracker(), walk()[0]
     arguments = frame.T_world_cam, frame.intrinsics
     assert tracker.update(frame.image, *arguments).none == "no corner followed from the frame before"
     assert tracker.update(frame.image, *arguments).none == "no parallax, or no track that fits the poses"
     assert tracker.update(0 * frame.image, *arguments).none == "no corner followed from the frame before"
 
 
-def test_anchors_lie_on_the_depth_map(tour):
+def test_anchors_lie_on_the_depth_map():
     tracker = LandmarkTracker()
-    for frame in tour[:8]:
+    for frame in walk()[:8]:
         result = tracker.update(frame.image, frame.T_world_cam, frame.intrinsics)
     small = resize_intrinsics(torch.from_numpy(frame.intrinsics), (180, 240), (90, 120))
     anchors = result.anchors(frame.intrinsics, small, capacity=300)
