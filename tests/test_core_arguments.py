@@ -183,7 +183,6 @@ REFUSED = {
     "a size as preprocess": (
         lambda: model(IMAGE, network=nn.Conv2d(3, 1, 1), preprocess=(8, 8)), TypeError, r"preprocess must .*\(8, 8\)"
     ),
-    "one side to compile for": (lambda: UfMStar().warm_up(224), ValueError, r"\(H, W\) and B, got 224"),
     "a pose of coarse numbers": (
         lambda: ufm(DEPTH, far(torch.float32), K), ValueError, "pose .* its dtype is exact to 1 cm .*expected float64"
     ),

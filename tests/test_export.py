@@ -122,9 +122,7 @@ def test_transforms_are_read_back(finished):
         assert not depth[:20].any()
 
 
-def test_what_is_no_run_is_named(finished, tmp_path, capfd):
-    assert cli.main(["export", str(tmp_path), "--to", "mcap"]) == 2
-    assert "no output of `ufmstar run`" in capfd.readouterr().err
+def test_the_size_of_a_voxel_is_positive(finished, capfd):
     assert cli.main(["export", str(finished[0]), "--to", "cloud", "--voxel", "0"]) == 2
     assert "--voxel must be positive" in capfd.readouterr().err
 

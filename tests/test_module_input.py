@@ -51,7 +51,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: settings({"segment": {"min_pixel": 7}}), "min_pixel"),
     (lambda: UfMStarConfig(segment=None), "segment"),  # type: ignore[arg-type]
     (lambda: UfMStarConfig(merge=1.0), "merge"),  # type: ignore[arg-type]
-    (lambda: UfMStarConfig(posterior=PosteriorConfig()), "posterior"),
+    (lambda: UfMStarConfig(posterior=PosteriorConfig()), "posterior needs anchors"),
     (lambda: UfMStarConfig(confidence=ConfidenceConfig()), "confidence needs anchors"),
     (lambda: UfMStarConfig().with_values({"merge": 0.5}), "merge"),
     (lambda: UfMStarConfig().with_values({"merge.los": 0.5}), "los"),

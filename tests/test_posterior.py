@@ -433,8 +433,3 @@ def test_streams_are_independent():
         one = alone(depth[:1], T, K, anchors=Anchors(anchors.pixel[:1], anchors.depth[:1], anchors.variance[:1]))
         torch.testing.assert_close(both.posterior()[0][:1], one.posterior()[0], rtol=1e-5, atol=0, equal_nan=True)
     assert torch.equal(torch.where(both.valid, depth, 0)[1], both.posterior()[0][1].nan_to_num())
-
-
-def test_posterior_needs_anchors():
-    with pytest.raises(ValueError, match="posterior needs anchors"):
-        UfMStarConfig(posterior=PosteriorConfig())
