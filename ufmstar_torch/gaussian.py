@@ -221,23 +221,6 @@ def barycenter(
     raise RuntimeError(f"the barycenter moved by {float(moved):.1e} of its trace after {iterations} iterations")
 
 
-def pointwise_disagreement(points: Tensor) -> Tensor:
-    """m_p [...] [m^2] = tr Sigma, the spread of J views' estimates of one point (section "Pointwise multiview
-    disagreement"), with the divisor J - 1. UfM measures it; UfM*'s counterpart is :func:`wasserstein_variance`.
-
-    Args:
-        points: [..., J, 3] [m], in one frame.
-
-    Raises:
-        ValueError: another shape, or fewer than two views.
-    """
-    if points.dim() < 2 or points.shape[-1] != 3 or points.shape[-2] < 2:
-        raise ValueError(f"points must be [..., J, 3] of J >= 2 views, got {tuple(points.shape)}")
-    values = points.double()
-    offset = values - values.mean(-2, keepdim=True)
-    return (offset.square().sum((-1, -2)) / (points.shape[-2] - 1)).to(points.dtype)
-
-
 def wasserstein_variance(mean: Tensor, covariance: Tensor, weight: Tensor) -> Tensor:
     """m_g [...] [m^2], the weighted mean of W2^2 from each of J Gaussians to their barycenter (Eq. gmv_exact).
 
