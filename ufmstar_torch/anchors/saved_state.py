@@ -10,8 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-# Limit of the coordinates, counts and information values of a state.
-LARGEST = 1e12
+from ufmstar_torch.frame import LARGEST
 
 
 def saved_image(state: Mapping[str, Tensor], name: str) -> NDArray[np.uint8]:
