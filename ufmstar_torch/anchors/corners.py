@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.anchors.epipolar import median
-from ufmstar_torch.optional import optional
+from ufmstar_torch.anchors.landmarks import opencv
 
 # Lucas-Kanade on patches 8 px wide and 16 px high, over four octaves of at most ten iterations. OpenCV processes eight
 # pixels of a row at once and the rest one by one, so that patches of 11 x 11 px take a third longer. On six rendered
@@ -80,8 +80,7 @@ def _ratio_at(
     before: NDArray[np.uint8], after: NDArray[np.uint8], position: NDArray[np.float64], found: NDArray[np.float64]
 ) -> float:
     """Ratio of brightness around tracked corners, their median."""
-    cv2 = optional("cv2", "landmarks of images need OpenCV", "'ufmstar-torch[eval]'")
-
+    cv2 = opencv()
     means = []
     for image, corners in ((before, position), (after, found)):
         u, v = np.rint(corners).astype(np.int64).T
@@ -111,8 +110,7 @@ def _there_and_back(
     levels: int, back_tolerance: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:  # fmt: skip
     """As :func:`follow`, from a ``first`` guess of the positions, over ``levels`` octaves beyond the first."""
-    cv2 = optional("cv2", "landmarks of images need OpenCV", "'ufmstar-torch[eval]'")
-
+    cv2 = opencv()
     # The first flag replaces the difference of the patches, which takes a separate pass, by the patch's eigenvalue.
     # Neither is used.
     flags = cv2.OPTFLOW_LK_GET_MIN_EIGENVALS | cv2.OPTFLOW_USE_INITIAL_FLOW
@@ -141,8 +139,7 @@ def find(gray: NDArray[np.uint8], count: int, spacing: float, followed: NDArray[
     Returns:
         [n, 2] positions (u, v), the strongest first [px].
     """
-    cv2 = optional("cv2", "landmarks of images need OpenCV", "'ufmstar-torch[eval]'")
-
+    cv2 = opencv()
     # Searching a large image at half its size takes a tenth of the time. The position of a corner need not be exact,
     # only the same from frame to frame.
     factor = 2 if gray.shape[1] >= _HALVED_FROM else 1

@@ -25,11 +25,10 @@ from ufmstar_torch.anchors.dense_keyframes import Keyframes
 from ufmstar_torch.anchors.dense_memory import Memory
 from ufmstar_torch.anchors.dense_poses import Fit, PoseErrors
 from ufmstar_torch.anchors.epipolar import median
-from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, OtherCameraError, checked
+from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, OtherCameraError, checked, opencv
 from ufmstar_torch.anchors.saved_state import SavedState
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.checked import Checked, number
-from ufmstar_torch.optional import optional
 
 if TYPE_CHECKING:
     from ufmstar_torch.kernels.dense_cpu import Search, Views
@@ -355,8 +354,7 @@ def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], ND
     """Reduce an image to at most ``width``; return [3, 3] the mapping of the pixels of ``gray`` to its pixels, too."""
     if gray.shape[1] <= width:
         return gray, np.eye(3)
-    cv2 = optional("cv2", "landmarks of images need OpenCV", "'ufmstar-torch[eval]'")
-
+    cv2 = opencv()
     size = (width, max(round(gray.shape[0] * width / gray.shape[1]), 1))
     small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
     along, down = size[0] / gray.shape[1], size[1] / gray.shape[0]
@@ -366,7 +364,7 @@ def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], ND
 
 def _halved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Average blocks of two by two pixels; an odd last row or column is dropped."""
-    cv2 = optional("cv2", "landmarks of images need OpenCV", "'ufmstar-torch[eval]'")
+    cv2 = opencv()
     height, width = image.shape[0] // 2, image.shape[1] // 2
     return np.asarray(cv2.resize(image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA))
 

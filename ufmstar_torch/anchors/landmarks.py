@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,6 +15,8 @@ from torch import Tensor
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.optional import optional
 
+# Imports cv2.
+opencv = partial(optional, "cv2", "landmarks of images need OpenCV", "'ufmstar-torch[eval]'")
 # Why an image has no landmark.
 REPEATED = "the image is the one before again, with another pose"
 
@@ -144,6 +147,5 @@ def checked(image: NDArray | None, T_world_cam: NDArray, K: NDArray) -> tuple[ND
         raise ValueError("K must be a finite 3x3 matrix with positive focal lengths [px]")
     if image.ndim == 2:
         return np.ascontiguousarray(image), T, K
-    cv2 = optional("cv2", "landmarks of images need OpenCV", "'ufmstar-torch[eval]'")
-
+    cv2 = opencv()
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), dtype=np.uint8), T, K
