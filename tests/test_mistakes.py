@@ -14,8 +14,10 @@ from scipy.spatial.transform import Rotation
 from shared_data import require_shared
 
 import scenes
-from ufmstar_torch import AnchorConfig, SPGFConfig, UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch import AnchorConfig, DepthPrediction, SPGFConfig, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.anchors.landmarks import Landmarks
+from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.eval.check.depth_image_fit import depth_image_fit, image_at_map, part_of_image
 from ufmstar_torch.eval.check.image_fit import depth_fit, image_fit, track_corners
 from ufmstar_torch.eval.sequences import open_sequence
@@ -46,6 +48,90 @@ def warnings_on_walk(caplog, change=lambda T: T, config=CONFIG, anchors=None, fr
         options = {} if config.anchors is None else {"anchors": anchors}
         out = ufm(depth, poses, torch.tensor(K), **options)
     return caplog.messages, out.statistics
+
+
+def on_surfaces(change=lambda pixel, depth: (pixel, depth)):
+    """For every pose of the walk, 40 anchors on the rendered surfaces, after a change of their pixels and depths."""
+    rng, walk = np.random.default_rng(0), []
+    for T in WALK:
+        v, u = (rng.integers(0, size, (2, 40)) for size in (H, W))
+        pixel, depth = change(np.stack([u, v], -1).astype(float), scenes.render(T, K, H, W)[v, u])
+        walk.append(Anchors(*(torch.tensor(value) for value in (pixel, depth, 1e-4 * depth**2))))
+    return walk
+
+
+WRONG_ANCHORS = {
+    "normalised": (lambda p, d: (p / (W, H), d), "all 40 anchors lie within 1 px of the image's corner: are their pix"),
+    "rows before columns": (lambda p, d: (p[..., ::-1].copy(), d), r"and none with rows and columns exchanged"),
+    "of a larger image": (lambda p, d: (4 * p, d), r"outside the 64 x 48 image: are their pixels those of an image of"),
+    "of another scale": (lambda p, d: (p, 5 * d), r"in 8 frames the anchors' median depth was 5 times the predicted"),
+    "in millimetres": (lambda p, d: (p, 1000 * d), "40 of 40 anchors are off from the predicted depth by more than"),
+}
+
+
+@pytest.mark.parametrize("mistake", WRONG_ANCHORS)
+def test_anchors_in_wrong_pixels_or_units_are_named_once_a_stream(caplog, mistake):
+    change, words = WRONG_ANCHORS[mistake]
+    ufm, right = (UfMStar(CONFIG.replace(anchors=AnchorConfig())) for _ in range(2))
+    for T, anchors in zip(WALK, on_surfaces(), strict=True):
+        right(torch.tensor(scenes.render(T, K, H, W)).repeat(2, 1, 1), T, K, anchors=anchors)
+    assert not caplog.messages
+    for T, anchors in zip(WALK, on_surfaces(change), strict=True):
+        ufm(torch.tensor(scenes.render(T, K, H, W)).repeat(2, 1, 1), T, K, anchors=anchors)
+    assert sorted(text[:8] for text in caplog.messages if re.search(words, text)) == ["stream 0", "stream 1"]
+
+
+VIDEO = "tour:7?size=120x160&frames=40"
+WRONG_VIDEO = {
+    "right": lambda i, f, n: (n[i].T_world_cam, f.intrinsics),
+    "world-to-camera": lambda i, f, n: (np.linalg.inv(f.T_world_cam), f.intrinsics),
+    "OpenGL axes": lambda i, f, n: (f.T_world_cam @ np.diag([1.0, -1, -1, 1]), f.intrinsics),
+    "late by 3 images": lambda i, f, n: (n[max(i - 3, 0)].T_world_cam, f.intrinsics),
+    "K of another image": lambda i, f, n: (f.T_world_cam, f.intrinsics * [[0.7, 1, 0.7], [1, 0.7, 0.7], [1, 1, 1]]),
+}
+
+
+@cache
+def video():
+    return list(open_sequence(VIDEO))
+
+
+@pytest.mark.parametrize("mistake", WRONG_VIDEO)
+def test_poses_that_contradict_the_images_are_named_without_anchors(caplog, mistake):
+    """Also where every image is a batch, and the first image is black."""
+    model = UncertainDepth(lambda image: 2 + image[:, 0], CONFIG)
+    for i, frame in enumerate(video()):
+        T, intrinsics = WRONG_VIDEO[mistake](i, frame, video())
+        model(np.stack([frame.image] * 2), T, intrinsics)
+    found = [text for text in caplog.messages if "poses contradict the images" in text or "the poses seem" in text]
+    assert len(found) == (mistake != "right"), caplog.messages
+
+
+def test_images_are_compared_with_poses_at_the_beginning_alone(monkeypatch):
+    looked = []
+    monkeypatch.setattr(LandmarkTracker, "update", lambda self, *frame: looked.append(1) or Landmarks.skipped("none"))
+    for model, count in (
+        (UncertainDepth(lambda image: 2 + image[:, 0], CONFIG, check_poses=3), 3),
+        (UncertainDepth(lambda image: 2 + image[:, 0], CONFIG, check_poses=0), 0),
+        (UncertainDepth(lambda image: 2 + image[:, 0].abs(), CONFIG, preprocess=None), 0),  # no bytes, not in [0, 1]
+    ):
+        looked.clear()
+        for frame in video()[:5]:
+            image = frame.image if model.preprocess else torch.tensor(frame.image).permute(2, 0, 1) / 64.0 - 2
+            model(image, frame.T_world_cam, frame.intrinsics)
+        assert len(looked) == count
+    with pytest.raises(ValueError, match="check_poses must be a number of images of at least 0, got -1"):
+        UncertainDepth(lambda image: image[:, 0], check_poses=-1)
+
+
+def test_floats_up_to_255_are_named(caplog):
+    class Network(torch.nn.Module):
+        def forward(self, image):
+            return DepthPrediction(2 + image[:, 0] / 255)
+
+    model, frame = UncertainDepth(Network(), CONFIG), video()[0]
+    model(torch.tensor(frame.image).permute(2, 0, 1).float(), frame.T_world_cam, frame.intrinsics)
+    assert [text for text in caplog.messages if "the first image has floats up to 2" in text]
 
 
 @pytest.mark.parametrize("factor", [100, 1000])
@@ -118,6 +204,14 @@ SPOILT = {
     "another camera": (
         lambda i, d, T: (d, T, K @ np.diag([1 + 0.5 * (i % 2), 1, 1]), {}),
         "the focal length changed from frame to frame .*every camera is a stream of its own",
+    ),
+    "inverted valid": (
+        lambda i, d, T: (d, T, K, {"valid": torch.arange(H * W).reshape(H, W) % W < 5}),
+        r"only 7.8% of the pixels are used: is valid inverted\? True = use",
+    ),
+    "a network that saturates": (
+        lambda i, d, T: (np.minimum(d, 2.5), T, K, {}),
+        r"the depth of \d\d% of the pixels is 2.5 m in every frame: if the network cannot predict more",
     ),
 }  # fmt: skip
 

@@ -12,7 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from ufmstar_torch.anchors.anchors import Anchors, require_anchors
+from ufmstar_torch.anchors.pose_check import PoseCheck
 from ufmstar_torch.anchors.streams import SourceLike, StreamLandmarks
+from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.arguments import Array, CameraLike, ImageLike, as_image, as_intrinsics, as_pose, as_tensor
 from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
 from ufmstar_torch.networks_in_turn import NetworksInTurn, Preprocess, in_unit_range, modules_of, shared_preprocess
@@ -25,6 +27,7 @@ from ufmstar_torch.ufmstar import UfMStar
 from ufmstar_torch.warm_up import along_wall, camera_of, require_size, warm_up
 
 _BLACK = {torch.uint8: 1, torch.float32: 1 / 255, torch.float64: 1 / 255}  # largest value of a black image
+_BRIGHT = 8.0  # largest value of a normalised image, by a wide margin
 
 
 @dataclass(frozen=True)
@@ -113,6 +116,8 @@ class UncertainDepth(NetworksInTurn):
             :class:`~ufmstar_torch.anchors.landmarks.LandmarkSource`; for several streams, a list with one source for
             each. Saved and reset with the state. None: anchors may be passed with each image.
         recalibration: a map of V, applied last (``Recalibration.from_json(FILE)``); None = no map.
+        check_poses: number of first images that are compared with their poses by tracked corners, 5 to 15 ms each; a
+            warning is logged if they contradict each other. 0 = none.
         multiview_device: device of UfM* and of the results; None = the networks' device. "cpu", the paper's split, is
             faster for one camera with the networks on a GPU. :meth:`stream` runs both devices at the same time.
 
@@ -145,6 +150,7 @@ class UncertainDepth(NetworksInTurn):
         preprocess: Preprocess | Literal["own"] | None = "own",
         anchors: SourceLike | list[SourceLike] | tuple[SourceLike, ...] | None = None,
         recalibration: Recalibration | None = None,
+        check_poses: int = 40,
         multiview_device: torch.device | str | None = None,
     ) -> None:
         members, preprocess = ([], None) if networks is None else self.accepted(networks, preprocess)
@@ -171,6 +177,10 @@ class UncertainDepth(NetworksInTurn):
         if anchors is not None and self.ufm.config.anchors is None:
             raise ValueError("anchors go with UfMStarConfig(anchors=AnchorConfig())")
         self.landmarks = None if anchors is None else StreamLandmarks(anchors)
+        searching = self.landmarks is not None and self.landmarks.searching  # these sources compare poses themselves
+        if not isinstance(check_poses, int) or check_poses < 0:
+            raise ValueError(f"check_poses must be a number of images of at least 0, got {check_poses!r}")
+        self._pose_check = PoseCheck(0 if searching else check_poses)
         self.mode = mode
         self.multiview_device = None if multiview_device is None else torch.device(multiview_device)
         self.register_buffer("image_index", torch.zeros((), dtype=torch.int64))
@@ -318,7 +328,8 @@ class UncertainDepth(NetworksInTurn):
             ValueError: as :meth:`UfMStar.warm_up`.
         """
         require_size(size, streams)
-        searching = () if self.landmarks is None else self.landmarks.searching
+        searching = (LandmarkTracker,) if self._pose_check.left else ()
+        searching = searching if self.landmarks is None else (*searching, *self.landmarks.searching)
         if self.networks:
             size = self._tried(size, streams)
         ufm = UfMStar(self.ufm.config, dtype=self.ufm.mean.dtype, device=self.ufm.mean.device)
@@ -356,6 +367,7 @@ class UncertainDepth(NetworksInTurn):
         if predicted.ready is not None:
             predicted.ready.synchronize()
         K = predicted.intrinsics
+        self._pose_check.compare(predicted.image, predicted.pose, K, self.ufm.config.rotation_tolerance)
         if self.landmarks is not None:
             if anchors is not None:
                 raise ValueError("anchors come from the source that UncertainDepth was made with: pass none")
@@ -392,6 +404,9 @@ class UncertainDepth(NetworksInTurn):
         first = self._next == 0 and not ahead and picture.is_cpu and picture.dtype in _BLACK
         if first and float(picture.max()) <= _BLACK[picture.dtype]:
             LOGGER.warning("the first image is black: was it divided by 255 twice, or cast to whole numbers?")
+        if first and picture.is_floating_point() and float(picture.max()) > _BRIGHT and float(picture.min()) >= 0:
+            brightest = f"the first image has floats up to {float(picture.max()):g}"
+            LOGGER.warning("%s: pass bytes, or floats in [0, 1], unless the network expects this", brightest)
         if not isinstance(image, Tensor):  # a tensor's device is the caller's choice
             picture = picture.to(next((p.device for p in self.networks.parameters()), picture.device))
         member = None if self.mode == "full" else self.turn(self._next + ahead)
@@ -421,6 +436,7 @@ class UncertainDepth(NetworksInTurn):
             self.landmarks.reset(mask)
         if streams is None:
             self._count(0)
+        self._pose_check.reset()
 
     def _count(self, images: int) -> None:
         """Set the number of processed images, as a number for the alternation and as a buffer for ``state_dict``."""

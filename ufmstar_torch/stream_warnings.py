@@ -31,6 +31,9 @@ _ALTERNATING, _NEARER = 6, 5.0
 # A batch that holds successive frames of one video: least streams, successive calls, and the largest distance between
 # successive frames over the step of the first stream (1/B for a uniform motion).
 _BATCH, _CONTINUED, _SUCCESSIVE = 3, 3, 0.5
+# Shares of pixels: of valid ones, below which ``valid`` may be inverted; of those with the largest depth, if it is the
+# same in every frame.
+_SPARSE, _SATURATED = 0.1, 0.2
 # Stride of the depth maps' rows in these checks.
 _ROWS = 8
 # On an accelerator, reading the counts synchronises: only every so many frames, and not while a graph is recorded.
@@ -60,6 +63,8 @@ class _Track:
     alternating: int = 0  # successive frames that returned to the position before the last
     same: int = 0  # successive changes of the pose with an unchanged depth map
     still: int = 0  # successive frames with an unchanged pose
+    farthest: float = 0.0  # largest depth of the last frame
+    saturated: int = 0  # successive changes of the pose with the same largest depth
     depth: Tensor | None = None  # depth map at the first of the ``still`` frames
 
     def follow(
@@ -78,6 +83,7 @@ class _Track:
             if self.same == _FRAMES:
                 yield "depth", f"the depth map was the same in {_FRAMES + 1} frames of a moving camera: is it updated?"
             yield from self._alternate(T, step)
+            yield from self._saturate(depth)
             sudden = self.steps >= _FRAMES and step > _JUMP * self.largest
             if sudden and step > _AWAY * _mean(depth, total):
                 text = f"the camera jumped by {step:.3g} m, after steps of at most {self.largest:.3g} m. Another "
@@ -95,6 +101,16 @@ class _Track:
         if self.alternating == _ALTERNATING:
             text = "the poses go back and forth between two places: every camera is a stream of its own (a batch)"
             yield "alternating", text
+
+    def _saturate(self, depth: Tensor) -> Iterator[tuple[str, str]]:
+        largest = float(depth.max())
+        self.saturated = self.saturated + 1 if largest == self.farthest > 0 else 0
+        self.farthest = largest
+        if self.saturated == _FRAMES:
+            share = float((depth == largest).sum() / (depth > 0).sum())
+            if share > _SATURATED:
+                text = f"the depth of {share:.0%} of the pixels is {largest:g} m in every frame: if the network cannot "
+                yield "saturated", text + "predict more, as in the sky, set valid to False there"
 
     def _stay(self, depth: Tensor) -> Iterator[tuple[str, str]]:
         self.still += 1
@@ -220,6 +236,9 @@ def _left_out(
                 f"pixels are left out: {parted}Are A and E variances [m^2], not logarithms, which may be negative, and "
             )
             yield b, "range", text + "does the network state its largest depth (segment.max_depth)?"
+        elif seen >= _FRAMES and 0 < valid < _SPARSE * frame.size[0] * frame.size[1]:
+            share = valid / (frame.size[0] * frame.size[1])
+            yield b, "sparse", f"only {share:.1%} of the pixels are used: is valid inverted? True = use"
         elif not positive and not components and seen >= _FRAMES:
             text = f"none of {seen} frames has a pixel with a positive and finite depth where valid is True"
             yield b, "empty", text + ": nothing is compared between views"

@@ -214,11 +214,13 @@ def _model(options: LiveOptions) -> UncertainDepth:
         samples=source.passes if len(source.networks) == 1 and chosen.mode == "full" else None,
         anchors=None if anchors is False else landmarks_of(anchors, None),
         recalibration=options.uncertainty.load_recalibration(config, chosen.weights, source),
+        check_poses=0 if options.recorded else 40,  # those of a recording are compared before
         multiview_device="cpu",  # for one camera faster than a GPU
     ).to(options.device)
     with Bars() as bars:
         named = CORNERS if anchors is True else anchors or DENSE  # without --anchors, those of --posterior
-        warm_up_command(model.ufm.config, bars.show, [] if config.anchors is None else [named])
+        searched = [*([] if config.anchors is None else [named]), *([] if options.recorded else [CORNERS])]
+        warm_up_command(model.ufm.config, bars.show, searched)
     if options.state is not None and options.state.exists():
         try:
             with options.state.open("rb") as file:

@@ -86,7 +86,7 @@ class Anchors:
             usable = usable & require_mask("valid", valid, [(b, n)])
         safe = torch.where(usable[..., None], points, torch.ones_like(points))
         pixel = apply(K.expand(b, 3, 3)[:, None], safe)[..., :2] / safe[..., 2:]
-        usable = usable & _inside(pixel, size)
+        usable = usable & inside(pixel, size)
         zero = torch.zeros_like(z)
         return cls(
             torch.where(usable[..., None], pixel, torch.zeros_like(pixel)),
@@ -176,9 +176,7 @@ def check_anchors(anchors: Anchors, frame: FrameInput, network_variances: Sequen
     depth = require_float("anchors.depth", anchors.depth, shape, frame.depth).detach().double()
     variance = require_float("anchors.variance", anchors.variance, shape, frame.depth).detach().double()
     # Standard deviations are compared, as the square of a large depth overflows.
-    usable = (
-        (depth > 0) & (depth < torch.inf) & (variance >= 0) & (variance.sqrt() < depth) & _inside(pixel, frame.size)
-    )
+    usable = (depth > 0) & (depth < torch.inf) & (variance >= 0) & (variance.sqrt() < depth) & inside(pixel, frame.size)
     if anchors.valid is not None:
         usable = usable & require_mask("anchors.valid", anchors.valid, shape, frame.depth)
     for name in ("pose_error", "shared", "scale"):
@@ -232,7 +230,7 @@ def require_anchors(anchors: object) -> Anchors:
     return anchors
 
 
-def _inside(pixel: Tensor, size: tuple[int, int]) -> Tensor:
+def inside(pixel: Tensor, size: tuple[int, int]) -> Tensor:
     """[B, N] True where the pixel nearest to a position [B, N, 2] lies in an image of ``size`` (H, W)."""
     u, v = pixel.round().unbind(-1)
     return (u >= 0) & (u < size[1]) & (v >= 0) & (v < size[0])

@@ -6,15 +6,16 @@ of the components less the stream's. The stream's means are added at every pixel
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.anchors import FARTHEST_OFF, AnchorInput, check_anchors
+from ufmstar_torch.anchors.anchors import AnchorInput, check_anchors
+from ufmstar_torch.anchors.doubts import AnchorDoubts
 from ufmstar_torch.anchors.evidence import SUMS, Evidence, inliers, means, observe
 from ufmstar_torch.camera import unproject_at
 from ufmstar_torch.config import UfMStarConfig
@@ -114,7 +115,7 @@ class AnchorFrame(FrameExtension):
         anchors: of the frame, checked, or None.
         config: with ``anchors``.
         kernels: implementation of each part.
-        warn: called with the anchors of every frame.
+        warn: called after a frame with anchors.
 
     Attributes:
         frame, anchors: as above.
@@ -124,7 +125,7 @@ class AnchorFrame(FrameExtension):
 
     def __init__(
         self, frame: FrameInput, anchors: AnchorInput | None, config: UfMStarConfig, kernels: AnchorKernels,
-        warn: Callable[[AnchorInput], None],
+        warn: Callable[[], object] = lambda: None,
     ) -> None:  # fmt: skip
         self.frame, self.anchors, self._warn = frame, anchors, warn
         self._config, self._kernels = config, kernels
@@ -158,7 +159,7 @@ class AnchorFrame(FrameExtension):
         count, rejected = (none, none) if anchors is None else (anchors.valid.sum(1), anchors.rejected)
         measured = out.statistics.pose_error
         if anchors is not None:
-            self._warn(anchors)
+            self._warn()
             measured = anchors.pose_error
         counts = replace(
             out.statistics, anchors=count, anchors_used=self._used, anchors_rejected=rejected, pose_error=measured
@@ -191,7 +192,7 @@ class AnchorExtension(Extension):
 
     def __init__(self, config: UfMStarConfig, kernels: Callable[[str, str], AnchorKernels]) -> None:
         self._config, self._kernels = config, kernels
-        self._warned = set[int]()
+        self._doubts = AnchorDoubts()
 
     def by_component(
         self, streams: int, slots: int, dtype: torch.dtype, device: torch.device | str
@@ -224,21 +225,12 @@ class AnchorExtension(Extension):
             TypeError, ValueError: as :func:`check_anchors`.
         """
         kernels = self._kernels(self._config.backend, frame.depth.device.type)
-        anchors = None if argument is None else check_anchors(argument, frame, network_variances)
-        return AnchorFrame(frame, anchors, self._config, kernels, self._warn)
-
-    def _warn(self, anchors: AnchorInput) -> None:
-        """Warn once per stream if most anchors are off by more than a factor of 100. Only on the CPU: elsewhere, the
-        check would synchronise with the device."""
-        if anchors.contradiction is None or anchors.rejected is None or not anchors.contradiction.is_cpu:
-            return
-        for b in set(anchors.contradiction.nonzero().flatten().tolist()) - self._warned:
-            self._warned.add(b)
-            logging.getLogger("ufmstar_torch").warning(
-                "stream %d: %d of %d anchors are off from the predicted depth by more than a factor of %g; the "
-                "variance is increased. Check that depth, poses and anchors are in metres (logged once)",
-                *(b, int(anchors.rejected[b]), int(anchors.rejected[b] + anchors.valid[b].sum()), FARTHEST_OFF),
-            )
+        if argument is None:
+            return AnchorFrame(frame, None, self._config, kernels)
+        anchors = check_anchors(argument, frame, network_variances)
+        return AnchorFrame(
+            frame, anchors, self._config, kernels, partial(self._doubts.judge, argument, anchors, frame.size)
+        )
 
 
 def _evidence(tensors: Tensors) -> Evidence:

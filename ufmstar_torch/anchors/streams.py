@@ -24,12 +24,13 @@ _CAUSES = (
     "the video is not frozen (logged once)"
 )
 _TIMES = (
-    "Anchors are corrected for this offset, UfM*'s comparison of views is not: check the times of poses and images "
+    "UfM*'s comparison of views is not corrected for this offset, as anchors are: check the times of poses and images "
     "(logged once)"
 )
 # A str may name a file, too. It is not in the type, so that type checkers detect misspelt names of sources.
 SourceLike = Literal["corners", "dense"] | Path | LandmarkSource
-_CONTRADICTIONS = 8  # successive images that contradict their poses before a warning; a blurred one affects several
+# Successive images that contradict their poses, or have a time offset, before a warning; a blurred one affects several.
+_SUCCESSIVE = 8
 _LARGEST_LAG = 0.5  # [images] time offset of the poses up to which there is no warning
 _FIELDS = ("pixel", "depth", "variance", "valid", "pose_error", "shared", "scale")
 
@@ -58,7 +59,7 @@ class StreamLandmarks:
         self.searching = tuple(kind for kind in (LandmarkTracker, DenseEvidence) if kind in kinds)
         self.last: list[Landmarks] = []
         self._contradicted = [0] * len(self._sources)  # successive images; -1 = warned
-        self._lag_warned = set[int]()
+        self._late = [0] * len(self._sources)  # likewise, images with a time offset
 
     def update(
         self,
@@ -110,8 +111,10 @@ class StreamLandmarks:
             raise
         self._before, self.last = before, result
         for i, landmarks in enumerate(result):
-            if abs(landmarks.lag) > _LARGEST_LAG and i not in self._lag_warned:
-                self._lag_warned.add(i)
+            late = abs(landmarks.lag) > _LARGEST_LAG and not landmarks.contradicted
+            self._late[i] = self._late[i] + 1 if late and self._late[i] >= 0 else min(self._late[i], 0)
+            if self._late[i] == _SUCCESSIVE:
+                self._late[i] = -1
                 offset = f"{abs(landmarks.lag):.1f} images {'late' if landmarks.lag > 0 else 'early'}"
                 _LOG.warning("stream %d: the poses seem %s. %s", i, offset, _TIMES)
             if self._contradicted[i] < 0:
@@ -119,9 +122,9 @@ class StreamLandmarks:
             self._contradicted[i] = (
                 self._contradicted[i] + 1 if landmarks.contradicted or landmarks.none == REPEATED else 0
             )
-            if self._contradicted[i] == _CONTRADICTIONS:
+            if self._contradicted[i] == _SUCCESSIVE:
                 self._contradicted[i] = -1
-                _LOG.warning("stream %d: %s; no depth is used. %s", i, landmarks.none, _CAUSES)
+                _LOG.warning("stream %d: %s. %s", i, landmarks.none, _CAUSES)
         capacity = max(len(landmarks.depth) for landmarks in result)
         by_stream = [landmarks.anchors(K[i].numpy(), K[i], capacity) for i, landmarks in enumerate(result)]
         fields = (torch.cat([getattr(anchors, name) for anchors in by_stream]) for name in _FIELDS)

@@ -1,0 +1,81 @@
+"""Warnings about anchors in wrong pixels or units: each once per stream, to the logger ``ufmstar_torch``."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections import Counter
+from collections.abc import Iterator
+
+import torch
+
+from ufmstar_torch.anchors.anchors import FARTHEST_OFF, AnchorInput, Anchors, inside
+
+_LOG = logging.getLogger("ufmstar_torch")
+_FEW = 8  # least anchors of a frame that are judged
+# Largest share of anchors outside the image: a crop to a square leaves out a quarter of a 4:3 image. Least share
+# outside before rows and columns may be exchanged.
+_OUTSIDE, _EXCHANGED = 0.6, 0.05
+# Largest median ratio of the anchors' and the predicted depth, in successive judged frames: networks err by .6 to 1.5.
+_RATIO, _SUCCESSIVE = 4.0, 8
+
+
+# Frames that are all judged, and the interval of those after them: a frame takes .1 ms.
+_FIRST, _EVERY = 64, 16
+
+
+class AnchorDoubts:
+    """Judges the anchors of a video's frames. Only on the CPU: elsewhere, this would synchronise with the device."""
+
+    def __init__(self) -> None:
+        self._calls = 0
+        self._logged = set[tuple[int, str]]()
+        self._off = Counter[int]()  # by stream, successive frames with depths of another scale
+
+    def judge(self, anchors: Anchors, checked: AnchorInput, size: tuple[int, int]) -> None:
+        """Warn of implausible anchors [B, N] of a frame of ``size`` (H, W), given to the step and as checked."""
+        self._calls += 1
+        seldom = self._calls > _FIRST and self._calls % _EVERY
+        if seldom or not checked.valid.is_cpu or not checked.valid.shape[1]:
+            return
+        for b, kind, text in (*self._pixels(anchors, size), *self._depths(checked)):
+            if (b, kind) not in self._logged:
+                self._logged.add((b, kind))
+                _LOG.warning("stream %d: %s (logged once)", b, text)
+
+    def _pixels(self, anchors: Anchors, size: tuple[int, int]) -> Iterator[tuple[int, str, str]]:
+        height, width = size
+        pixel = anchors.pixel.detach()
+        use = pixel.isfinite().all(-1) & (anchors.depth > 0)
+        use = use if anchors.valid is None else use & anchors.valid
+        within = inside(pixel, size) & use
+        exchanged = (inside(pixel.flip(-1), size) & use).sum(1).tolist()
+        farthest = torch.where(use, pixel.amax(-1), 0).amax(1).tolist()
+        for b, (count, seen) in enumerate(zip(use.sum(1).tolist(), within.sum(1).tolist(), strict=True)):
+            if count < _FEW:
+                continue
+            if farthest[b] <= 1 and min(size) > 2:
+                text = f"all {count} anchors lie within 1 px of the image's corner: are their pixels normalised? They "
+                yield b, "pixels", text + f"are columns and rows (u, v) of the {width} x {height} image"
+            elif seen < (1 - _EXCHANGED) * count and exchanged[b] == count:
+                text = f"{count - seen} of {count} anchors lie outside the {width} x {height} image, and none with "
+                yield b, "pixels", text + "rows and columns exchanged: anchors.pixel is (u, v), the column first"
+            elif seen < (1 - _OUTSIDE) * count:
+                text = f"{count - seen} of {count} anchors lie outside the {width} x {height} image: are their pixels "
+                yield b, "pixels", text + "those of an image of another size?"
+
+    def _depths(self, checked: AnchorInput) -> Iterator[tuple[int, str, str]]:
+        valid, none = checked.valid, torch.nan
+        ratios = torch.where(valid, checked.depth / checked.predicted, none).nanmedian(1).values.tolist()
+        for b, (ratio, count) in enumerate(zip(ratios, valid.sum(1).tolist(), strict=True)):
+            if checked.contradiction is not None and checked.rejected is not None and checked.contradiction[b] > 0:
+                off = int(checked.rejected[b])
+                text = f"{off} of {off + count} anchors are off from the predicted depth by more than a factor of "
+                text += f"{FARTHEST_OFF:g}; the variance is increased"
+                yield b, "far", text + ". Check that depth, poses and anchors are in metres"
+            if count < _FEW or math.isnan(ratio):
+                continue
+            self._off[b] = self._off[b] + 1 if max(ratio, 1 / ratio) > _RATIO else 0
+            if self._off[b] == _SUCCESSIVE:
+                text = f"in {_SUCCESSIVE} frames the anchors' median depth was {ratio:.2g} times the predicted one; "
+                yield b, "scale", text + "the variance is increased. Are depth, poses and anchors in metres?"
