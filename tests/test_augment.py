@@ -46,7 +46,8 @@ def test_a_point_is_seen_where_the_new_intrinsics_project_it(pixel, change, zoom
     """Image, depth and K' of one known 3D point agree; the blob's centre of mass to .02 px."""
     point = torch.linalg.solve(K, torch.tensor([*pixel, 1.0], dtype=torch.float64)) * 2.5
     depth = torch.full(SIZE, 2.5, dtype=torch.float64)
-    image, new_depth, new_K = apply_geometry(blob(*SIZE, torch.tensor(pixel), torch.full((2,), SIGMA))[0], depth, K, change, zoom)
+    source = blob(*SIZE, torch.tensor(pixel), torch.full((2,), SIGMA))[0]
+    image, new_depth, new_K = apply_geometry(source, depth, K, change, zoom)
     present = seen_by_new_camera(point, change, zoom)
     where = project(present, new_K[None])
     torch.testing.assert_close(centroid(image[None]), where, rtol=0, atol=0.02)

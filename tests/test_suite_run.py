@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
 import shutil
-import signal
 from dataclasses import replace
 
 import numpy as np
@@ -180,31 +177,6 @@ def test_another_sequence_of_the_name_is_refused(tmp_path):
         go(job, resume=True)
 
 
-# Python 3.12 warns of forks in a process with threads; the child uses no other thread's state.
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-def test_a_kill_loses_the_sequence_at_work_alone(rooms, tmp_path, whole):
-    def before(name, done):
-        if (name, done) == ("birch", 2):
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    job = job_on(rooms, tmp_path / "out")
-    child = multiprocessing.get_context("fork").Process(target=go, args=(job, Stub(before)))
-    child.start()
-    child.join(60)
-    assert child.exitcode == -signal.SIGKILL
-    assert {path.split("/")[2] for path in stored_results(job.out)} == {"ash"}
-    folder = job.folder.sequence_folder(job.items[1])
-    begun, mine = folder / ".A.pt.0123456789ab.tmp", folder / ".mine.tmp"
-    for file in (begun, mine):
-        file.write_text("x")
-    stub = Stub()
-    assert go(job, stub, resume=True)[0].complete
-    assert [name for name, _ in stub.asked] == ["birch", "cedar"]
-    assert (begun.exists(), mine.exists()) == (False, True), "temporary files of a killed process are removed"
-    assert stored_results(job.out) == whole
-
-
 def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, whole, monkeypatch):
     job, saved, write = job_on(rooms, tmp_path / "out"), [], Record.save
 
@@ -219,7 +191,12 @@ def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, who
         go(job)
     monkeypatch.undo()
     assert len(stored_results(job.out)) == 6
+    folder = job.folder.sequence_folder(job.items[1])
+    begun, mine = folder / ".A.pt.0123456789ab.tmp", folder / ".mine.tmp"
+    for file in (begun, mine):
+        file.write_text("x")
     stub = Stub()
     go(job, stub, resume=True)
     assert [(name, len(rows)) for name, rows in stub.asked] == [("birch", 2), ("cedar", 4)]
+    assert (begun.exists(), mine.exists()) == (False, True), "temporary files of a killed process are removed"
     assert stored_results(job.out) == whole

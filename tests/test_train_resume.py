@@ -1,4 +1,4 @@
-"""A killed, stopped or failed training continues from its last epoch, with all finished results."""
+"""A stopped or failed training continues from its last epoch, with all finished results (killed: test_kills.py)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from forked import CONTEXT, start
+from forked import CONTEXT
 from trainings import RECIPE, logged, tiny_job, with_network
 
 from ufmstar_torch.eval.run.folder import FolderError
@@ -17,7 +17,7 @@ from ufmstar_torch.models.checkpoints import read_safetensors
 from ufmstar_torch.train import ResumeError
 from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO
 from ufmstar_torch.train.fit import fit
-from ufmstar_torch.train.member import RESULT, WEIGHTS
+from ufmstar_torch.train.member import WEIGHTS
 
 # Sums depend on the number of threads, and the compared processes have one.
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -61,25 +61,7 @@ def stop_after(steps):
     return lambda: next(count) >= steps
 
 
-# ---- killed ----
-
-
-def _killed(job):
-    """A training that is killed after step 5 of 9; its last checkpoint is from step 3."""
-    ask = stop_after(5)
-    fit(job, asked=lambda: ask() and os.kill(os.getpid(), signal.SIGKILL))
-
-
-@pytest.mark.slow
-def test_killed_in_the_middle_of_an_epoch_it_repeats_the_epoch_bit_for_bit(frames, uninterrupted, tmp_path):
-    process = start(_killed, tiny_job(frames, tmp_path / "out", DROPOUT))
-    process.join(200)
-    assert process.exitcode == -signal.SIGKILL
-    assert stored(tmp_path / "out")["global_step"] == 3
-    assert not (tmp_path / "out" / "member_0" / RESULT).exists()
-    summary = fit(tiny_job(frames, tmp_path / "out", DROPOUT), resume=True)
-    assert summary["stopped"] is None
-    assert_same_result(tmp_path / "out", uninterrupted)
+# ---- stopped ----
 
 
 @pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import io
 import json
 import math
 import os
@@ -17,7 +16,6 @@ import torch
 from PIL import Image
 from runs import read_summary
 
-from ufmstar_torch import atomic
 from ufmstar_torch.eval.run.files import to_json, write_atomic, write_json_atomic
 from ufmstar_torch.eval.run.writers import encode_length_png, frame_file, read_frame, write_frame
 from ufmstar_torch.eval.sequences.images import read_depth
@@ -41,10 +39,6 @@ def write(folder, name, maps):
     file = frame_file(folder, name)
     file.parent.mkdir(exist_ok=True)
     write_frame(file, maps)
-
-
-def full_disk(*_, **__):
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 # ---- PNGs ----
@@ -95,24 +89,6 @@ def test_refusals(tmp_path, name):
 
 
 # ---- a full disk ----
-
-
-def test_write_fails_in_the_middle_of_a_file(tmp_path, monkeypatch):
-    write(tmp_path, "a", frame(0))
-    before = tree(tmp_path)
-
-    class TinyDisk(io.FileIO):
-        def write(self, data):
-            if self.tell() + len(data) > 300:
-                super().write(bytes(data)[:100])
-                full_disk()
-            return super().write(data)
-
-    monkeypatch.setattr(atomic, "open", TinyDisk, raising=False)
-    for name in ("a", "b"):  # overwriting a finished frame, then a new one
-        with pytest.raises(OSError, match="No space left"):
-            write(tmp_path, name, frame(1))
-    assert tree(tmp_path) == before
 
 
 def test_an_interrupt_leaves_no_partial_file(tmp_path):
