@@ -1,11 +1,10 @@
-"""The selection of kernels, and properties of all kernels: threads, warnings, registers."""
+"""The selection of kernels, and properties of all kernels: threads, registers."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
-import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -94,12 +93,6 @@ def test_tensors_move_and_nothing_else_is_copied():
     assert on_meta.config is segment_input.config
     assert moved(segment_input.config, "meta") is segment_input.config
     assert torch.equal(on_host(lambda at: at.depth + 1)(segment_input), segment_input.depth + 1)
-
-
-def test_importing_the_package_leaves_the_warnings_alone():
-    before = list(warnings.filters)
-    __import__("ufmstar_torch.kernels.regress_cpu")
-    assert list(warnings.filters) == before
 
 
 @pytest.mark.slow

@@ -293,8 +293,7 @@ def by_hand(scene, members, mode="alternate"):
     return np.stack(depth)
 
 
-@pytest.mark.parametrize("mode", ["alternate", "full"])
-@pytest.mark.parametrize("method", ["aleatoric", "batch_ensemble"])
+@pytest.mark.parametrize(("mode", "method"), [("alternate", "batch_ensemble"), ("full", "aleatoric")])
 def test_a_run_with_all_members_of_two_files(ufmstar, scene, tmp_path, mode, method):
     spec = spec_of(method)
     networks = make_networks(spec, 3)
