@@ -11,6 +11,7 @@ import layouts
 import layouts_more
 import numpy as np
 import pytest
+from pages import blocks
 from shared_data import require_shared
 
 from ufmstar_torch.cli import main
@@ -218,7 +219,7 @@ def test_every_command_and_piece_of_code_on_the_page_runs(tmp_path, monkeypatch,
     write_page_files(tmp_path)
     monkeypatch.chdir(tmp_path)
     text = PAGE.read_text()
-    commands = re.findall(r"^ufmstar (data .*)$", "\n".join(re.findall(r"```bash\n(.*?)```", text, re.DOTALL)), re.M)
+    commands = re.findall(r"^ufmstar (data .*)$", "\n".join(blocks(text, "bash")), re.M)
     assert len(commands) == 4
     printed = {}
     for words in commands:
@@ -229,6 +230,6 @@ def test_every_command_and_piece_of_code_on_the_page_runs(tmp_path, monkeypatch,
         "leave --poses world-to-camera out",
         "--truth-scale 0.001",
     ]
-    for code in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+    for code in blocks(text):
         exec(compile(code, PAGE.name, "exec"), {})
     assert capsys.readouterr().out.splitlines() == ["7 scannet []", "[('scene0000_00', 'scannet')]"]

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from pages import blocks
 
 import scenes
 from ufmstar_torch.camera import resize_intrinsics
@@ -16,10 +16,6 @@ from ufmstar_torch.eval.commands.run import read
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "anchors.md"
 H, W = 48, 64
 TOO_FAR = 1.25
-
-
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
 
 
 def seen_points(truth, K, v, u):
@@ -67,7 +63,7 @@ def two_cameras():
 
 def test_every_piece_of_code_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    track, two_sources, next_start = blocks("python")
+    track, two_sources, next_start = blocks(PAGE.read_text())
     scope = {"video": list(video())}
     exec(compile(track, PAGE.name, "exec"), scope)
     assert scope["out"].statistics.anchors_used.item() > 0
@@ -96,7 +92,7 @@ def test_every_piece_of_code_runs(tmp_path, monkeypatch, capsys):
 
 
 def test_the_flag_on_the_page_is_one():
-    (command,) = [block for block in blocks("bash") if block.startswith("ufmstar run")]
+    (command,) = [block for block in blocks(PAGE.read_text(), "bash") if block.startswith("ufmstar run")]
     options = read(command.split()[2:])
     assert options.uncertainty.anchors is True
     assert options.network.model == "fastdepth"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import pytest
 import torch
 from depth_anything_files import write_depth_anything, write_other
 from onnx_files import small_network, write_fastdepth
+from pages import blocks
 from test_monodepth2 import classifier_weights, published_decoder, write_published
 from torch import nn
 
@@ -18,10 +18,6 @@ from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.monodepth2 import DECODER_WIDTHS
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "networks.md"
-
-
-def blocks() -> list[str]:
-    return re.findall(r"```python\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
 
 
 def write_files(folder: Path) -> None:
@@ -62,9 +58,10 @@ def test_every_piece_of_code_runs(
     write_files(tmp_path)
     monkeypatch.chdir(tmp_path)
     scope = camera()
-    for code in blocks():
+    codes = blocks(PAGE.read_text())
+    for code in codes:
         exec(compile(code, PAGE.name, "exec"), scope)
-    assert len(blocks()) >= 4
+    assert len(codes) >= 4
     printed = capsys.readouterr().out
     assert "140 tensors; left as they were: ('head.bias', 'head.weight')" in printed
     assert scope["depth"].shape == (2, 518, 518)

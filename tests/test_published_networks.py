@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from depth_anything_files import write_depth_anything, write_other
+from pages import blocks
 
 from ufmstar_torch import ConfidenceConfig, UncertainDepth
 from ufmstar_torch import models as package
@@ -159,7 +160,7 @@ def test_a_reconstruction_is_a_recording(name: str) -> None:
         "intrinsic": K.expand(1, 3, 3, 3),
         "scene": Scene(depth, conf, T),
     }
-    (code,) = (code for code in re.findall(r"```python\n(.*?)```", SECTION, flags=re.DOTALL) if "frames" in code)
+    (code,) = (code for code in blocks(SECTION) if "frames" in code)
     scope: dict[str, Any] = {"torch": torch, **names}
     setup, loop = code.split("for ", 1)
     exec(setup, scope)

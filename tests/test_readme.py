@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from pages import blocks
 from scipy.spatial.transform import Rotation
 
 import scenes
@@ -16,12 +17,8 @@ ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
-
-
 def test_the_example_runs(tmp_path, monkeypatch, capsys):
-    (code,) = blocks("python")
+    (code,) = blocks(README)
     assert len([line for line in code.splitlines() if line.strip()]) <= 15
     depths, poses, K = scenes.sequence(3, 48, 64, 0.05)
     pictures = [np.repeat(np.nan_to_num(d * 40).clip(0, 255).astype(np.uint8)[..., None], 3, 2) for d in depths]
@@ -40,7 +37,7 @@ def test_the_example_runs(tmp_path, monkeypatch, capsys):
 
 
 def test_both_commands_are_one_line_each():
-    main, tests, recording = blocks("bash")
+    main, tests, recording = blocks(README, "bash")
     assert all(len(block.strip().splitlines()) == 1 for block in (main, tests, recording))
     assert main.strip().endswith("ufmstar demo"), "the main job needs no file of the user"
     assert "ufmstar run" in recording
