@@ -8,14 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from layouts import truncate, write_generic, write_scannet, write_tum
-from training_data import PLAIN, TINY
+from training_data import TINY
 
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.tour import export_tour
-from ufmstar_torch.train import SampleDataset, SequenceFrames, tour_frames
+from ufmstar_torch.train import SequenceFrames, tour_frames
 from ufmstar_torch.train.data import sources
 from ufmstar_torch.train.data_config import DataConfig, Part
 from ufmstar_torch.train.sequence_data import open_rgbd
@@ -61,17 +60,6 @@ def test_depth_with_a_camera_of_its_own_is_seen_by_the_images(tmp_path):
     raw = SequenceFrames([sequence]).load(2)
     np.testing.assert_array_equal(raw.depth, truth_at(sequence[2], raw.intrinsics, (121, 162)))
     np.testing.assert_array_equal(raw.intrinsics, sequence.intrinsics)
-
-
-def test_a_broken_image_of_a_sequence_is_named_or_skipped(tmp_path):
-    path, _ = write_generic(tmp_path)
-    frames = SequenceFrames([open_sequence(path)])
-    truncate(path / "images" / "9.png", 0.4)
-    with pytest.raises(FrameError, match=r"walk/9: .*9\.png"):
-        frames.load(2)
-    dataset = SampleDataset(frames, PLAIN, on_bad_file="skip")
-    assert torch.equal(dataset[2]["image"], dataset[3]["image"])
-    assert dataset.bad_files() == ("walk/9",)
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.2])
