@@ -97,20 +97,6 @@ CHOICES = {
 }
 
 
-@pytest.mark.parametrize("backend", ["torch", "numba"])
-def test_a_first_frame_reads_as_chosen(backend):
-    depth, pose, intrinsics = frame(0)
-    read = {}
-    for choice, values in CHOICES.items():
-        ufm = UfMStar(CONFIG.replace(unmeasured=choice, backend=backend, **values))
-        out = ufm(depth, pose, intrinsics)
-        assert int(out.statistics.unmeasured[0]) == int(out.statistics.valid_pixels[0]) == int(out.valid.sum())
-        read[choice] = out.variance[out.valid]
-    assert bool((read["paper"] == 0).all())
-    np.testing.assert_allclose(read["relative"].numpy(), (0.2 * depth[out.valid].numpy()) ** 2, rtol=1e-5)
-    assert bool(read["nan"].isnan().all())
-
-
 def test_a_point_far_from_everything_reads_as_chosen():
     far = torch.full((1, 1, 3), 500.0)
     for choice, expected in (("paper", 0.0), ("relative", float("nan")), ("nan", float("nan"))):
