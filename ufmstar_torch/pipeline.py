@@ -14,7 +14,6 @@ from torch import Tensor, nn
 from ufmstar_torch.anchors.anchors import Anchors, require_anchors
 from ufmstar_torch.anchors.pose_check import PoseCheck
 from ufmstar_torch.anchors.streams import SourceLike, StreamLandmarks
-from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.arguments import Array, CameraLike, ImageLike, as_image, as_intrinsics, as_pose, as_tensor
 from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
 from ufmstar_torch.networks_in_turn import NetworksInTurn, Preprocess, in_unit_range, modules_of, shared_preprocess
@@ -116,8 +115,8 @@ class UncertainDepth(NetworksInTurn):
             :class:`~ufmstar_torch.anchors.landmarks.LandmarkSource`; for several streams, a list with one source for
             each. Saved and reset with the state. None: anchors may be passed with each image.
         recalibration: a map of V, applied last (``Recalibration.from_json(FILE)``); None = no map.
-        check_poses: number of first images that are compared with their poses by tracked corners, 5 to 15 ms each; a
-            warning is logged if they contradict each other. 0 = none.
+        check_poses: number of first images, of the first stream, that are compared with their poses and intrinsics by
+            tracked corners, 2 ms each; a warning names another reading that fits much better. 0 = none.
         multiview_device: device of UfM* and of the results; None = the networks' device. "cpu", the paper's split, is
             faster for one camera with the networks on a GPU. :meth:`stream` runs both devices at the same time.
 
@@ -328,8 +327,7 @@ class UncertainDepth(NetworksInTurn):
             ValueError: as :meth:`UfMStar.warm_up`.
         """
         require_size(size, streams)
-        searching = (LandmarkTracker,) if self._pose_check.left else ()
-        searching = searching if self.landmarks is None else (*searching, *self.landmarks.searching)
+        searching = () if self.landmarks is None else self.landmarks.searching
         if self.networks:
             size = self._tried(size, streams)
         ufm = UfMStar(self.ufm.config, dtype=self.ufm.mean.dtype, device=self.ufm.mean.device)
@@ -367,7 +365,7 @@ class UncertainDepth(NetworksInTurn):
         if predicted.ready is not None:
             predicted.ready.synchronize()
         K = predicted.intrinsics
-        self._pose_check.compare(predicted.image, predicted.pose, K, self.ufm.config.rotation_tolerance)
+        self._pose_check.compare(predicted.image, predicted.pose, K)
         if self.landmarks is not None:
             if anchors is not None:
                 raise ValueError("anchors come from the source that UncertainDepth was made with: pass none")

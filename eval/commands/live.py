@@ -219,8 +219,7 @@ def _model(options: LiveOptions) -> UncertainDepth:
     ).to(options.device)
     with Bars() as bars:
         named = CORNERS if anchors is True else anchors or DENSE  # without --anchors, those of --posterior
-        searched = [*([] if config.anchors is None else [named]), *([] if options.recorded else [CORNERS])]
-        warm_up_command(model.ufm.config, bars.show, searched)
+        warm_up_command(model.ufm.config, bars.show, [] if config.anchors is None else [named])
     if options.state is not None and options.state.exists():
         try:
             with options.state.open("rb") as file:

@@ -77,7 +77,7 @@ def run_table(summary: Mapping[str, Any]) -> str:
     lines += [f"skipped {count}: {reason}" for reason, count in summary["frames"]["skipped"].items()]
     lines += [f"left out {count}: {reason}" for reason, count in summary["sequence"]["left_out"].items()]
     if (fit := summary["image_fit"]) is not None and not fit["problem"]:
-        lines.append(f"poses disagree with the images by {fit['error']:.1f} px (good poses: below 1)")
+        lines.append(f"poses disagree with the images by {fit['error']:.1f} px (limit: {fit['limit']:.1f})")
     if (depth := summary["depth_fit"]) is not None and not depth["problem"]:
         lines.append(
             f"depth is {depth['ratio']:.2g} times that of tracked corners, rank correlation {depth['order']:.2f}"

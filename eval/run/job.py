@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.anchors.landmarks import LandmarkSource
+from ufmstar_torch.anchors.pose_fit import FollowedCorners, ImageFit
 from ufmstar_torch.anchors.sources import landmark_source
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.check.image_fit import FollowedCorners, ImageFit, image_fit, track_corners
+from ufmstar_torch.eval.check.image_fit import image_fit, track_corners
 from ufmstar_torch.eval.engine.anchors import AnchorSource, Tracks
 from ufmstar_torch.eval.engine.estimators import Gaussians
 from ufmstar_torch.eval.engine.judge import UFM, RunMetrics

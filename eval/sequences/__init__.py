@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from ufmstar_torch.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from ufmstar_torch.conventions import CONVENTIONS as CONVENTIONS
     from ufmstar_torch.eval.sequences.depth_folder import DepthFolder as DepthFolder
     from ufmstar_torch.eval.sequences.frame import Frame as Frame
     from ufmstar_torch.eval.sequences.frame import FrameError as FrameError
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from ufmstar_torch.eval.sequences.layout import Found as Found
     from ufmstar_torch.eval.sequences.layout import find_sequences as find_sequences
     from ufmstar_torch.eval.sequences.open import open_sequence as open_sequence
-    from ufmstar_torch.eval.sequences.poses import CONVENTIONS as CONVENTIONS
     from ufmstar_torch.eval.sequences.poses import read_trajectory as read_trajectory
     from ufmstar_torch.trajectory import Trajectory as Trajectory
     from ufmstar_torch.trajectory import interpolate_pose as interpolate_pose

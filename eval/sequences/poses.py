@@ -1,4 +1,4 @@
-"""Poses: conventions, reading of trajectories in the common text formats, association by timestamp.
+"""Poses: reading of trajectories in the common text formats, association by timestamp.
 
 All poses are camera-to-world. The number of columns of a line defines the format:
 
@@ -15,9 +15,7 @@ All poses are camera-to-world. The number of columns of a line defines the forma
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -32,28 +30,6 @@ _QUATERNION_TOLERANCE = 0.02
 _SAME_PLACE, _SAME_DIRECTION = 0.01, 2.0
 # printf on Windows writes NaN and infinity as 1.#IND, 1.#QNAN, 1.#INF.
 _WINDOWS_NON_FINITE = re.compile(r"[+-]?1\.?#(IND|QNAN|SNAN|INF)\d*", re.IGNORECASE)
-
-# Columns are our camera axes in a camera frame with x forward, y right, z down, or x right, y up, z backward.
-_NED_FROM_CAMERA = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-_OPENGL_FROM_CAMERA = np.diag([1.0, -1, -1, 1])
-
-
-class Convention(NamedTuple):
-    """A convention of poses: its description, and the conversion of poses [..., 4, 4] to ours."""
-
-    description: str
-    convert: Callable[[np.ndarray], np.ndarray]
-
-
-OURS = "camera-to-world"
-CONVENTIONS = {
-    OURS: Convention("camera-to-world, x right, y down, z forward", lambda T: T),
-    "world-to-camera": Convention("world-to-camera (inverted)", np.linalg.inv),
-    "ned": Convention("camera-to-world with NED axes (x forward, y right, z down)", lambda T: T @ _NED_FROM_CAMERA),
-    "opengl": Convention(
-        "camera-to-world with OpenGL axes (x right, y up, z backward)", lambda T: T @ _OPENGL_FROM_CAMERA
-    ),
-}
 
 
 def in_metres(T_world_cam: np.ndarray, scale: float) -> np.ndarray:

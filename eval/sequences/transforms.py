@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from ufmstar_torch.conventions import CONVENTIONS
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import UNKNOWN
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Size, Skipped
 from ufmstar_torch.eval.sequences.images import IMAGE_SUFFIXES, depth_loader, image_size, read_color
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import CONVENTIONS
 from ufmstar_torch.stream_warnings import LOGGER
 
 FILE = "transforms.json"

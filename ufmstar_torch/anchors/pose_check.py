@@ -1,44 +1,70 @@
-"""Comparison of a video's first images with their poses: corners, tracked in the images, must follow their epipolar
-lines.
+"""Comparison of a video's first images with their poses and intrinsics (``pose_fit``), while they come.
 
 Wrong axes, the inverse pose, a late trajectory and the intrinsics of another image make UfM*'s disagreement large
-without an error. They show within some 40 images, also to a user who asks for no anchors.
+without an error. This names them also to a user who asks for no anchors.
 """
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.anchors.streams import StreamLandmarks
+from ufmstar_torch.anchors.landmarks import checked
+from ufmstar_torch.anchors.pose_fit import UNCHANGED, Cameras, CornerTrack, FollowedCorners, pose_fit
+from ufmstar_torch.anchors.streams import as_bytes
+from ufmstar_torch.stream_warnings import LOGGER
 
 
 class PoseCheck:
-    """Compares the first images of a batch's first stream with their poses, and warns once if they contradict.
+    """Compares the first images of a batch's first stream with their cameras, after half of them and after all, and
+    warns if another reading of the cameras fits much better.
 
     Args:
-        images: number of images to compare; 0 = none. Without OpenCV, none is compared.
+        images: number of images to compare; 0 = none.
 
-    Attributes:
-        left: number of images still to compare. 0 after images that are neither bytes nor floats in [0, 1], or of
-            another size.
+    Images that are neither bytes nor floats in [0, 1] end the comparison, and so does a missing OpenCV.
     """
 
     def __init__(self, images: int) -> None:
-        self._corners, self.left = StreamLandmarks("corners"), images if find_spec("cv2") else 0
-
-    def compare(self, image: Tensor, pose: Tensor, intrinsics: Tensor, rotation_tolerance: float) -> None:
-        """Compare the next image [B, 3, H, W] with its pose [B, 4, 4] or [4, 4] and K [B, 3, 3] or [3, 3]."""
-        if not self.left:
-            return
-        self.left -= 1
-        T, K = (value if value.dim() == 2 else value[0] for value in (pose, intrinsics))
-        try:
-            self._corners.update(image[:1], T, K, rotation_tolerance)
-        except ValueError:  # no image, or one of another size
-            self.left = 0
+        self._left, self._half = images, images // 2
+        self.reset()
 
     def reset(self) -> None:
-        """Forget the last image: another video begins."""
-        self._corners.reset()
+        """Forget the images: another video begins."""
+        self._track: CornerTrack | None = None
+        self._corners: list[FollowedCorners] = []
+        self._cameras: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+
+    def compare(self, image: Tensor, pose: Tensor, intrinsics: Tensor) -> None:
+        """Add the next image [B, 3, H, W] with its pose [B, 4, 4] or [4, 4] and K [B, 3, 3] or [3, 3]."""
+        if not self._left:
+            return
+        T, K = (value.detach().reshape(-1, *value.shape[-2:])[0].cpu().double().numpy() for value in (pose, intrinsics))
+        try:
+            gray, T, K = checked(as_bytes(image[:1])[0].permute(1, 2, 0).cpu().numpy(), T, K)
+        except (ModuleNotFoundError, ValueError):  # an impossible camera is an error of UfM*
+            self._left = 0
+            return
+        self._cameras.append((T, K))
+        index = len(self._cameras) - 1
+        if self._track is None or not self._track.add(index, gray):
+            self._end_track()
+            self._track = CornerTrack(index, gray)
+        self._left -= 1
+        if self._left in (self._half, 0):
+            self._judge(gray.shape[1])
+
+    def _end_track(self) -> None:
+        self._corners += [] if self._track is None else self._track.pairs
+
+    def _judge(self, width: int) -> None:
+        self._end_track()
+        self._track = None
+        T_world_cam, K = (np.stack(values) for values in zip(*self._cameras, strict=True))
+        fit = pose_fit(Cameras(T_world_cam, K), width, self._corners)
+        if fit is not None and fit.reading != UNCHANGED:
+            LOGGER.warning("stream 0: %s", fit.problem)
+            self._left = 0
+        if not self._left:
+            self.reset()

@@ -24,7 +24,7 @@ _CAUSES = (
     "the video is not frozen (logged once)"
 )
 _TIMES = (
-    "UfM*'s comparison of views is not corrected for this offset, as anchors are: check the times of poses and images "
+    "Anchors are corrected for this offset, UfM*'s comparison of views is not: check the times of poses and images "
     "(logged once)"
 )
 # A str may name a file, too. It is not in the type, so that type checkers detect misspelt names of sources.
@@ -90,7 +90,7 @@ class StreamLandmarks:
         b = len(self._sources) if image is None else len(image)
         if b != len(self._sources):
             raise ValueError(f"anchors must name a source for each of the {b} streams, got {len(self._sources)}")
-        images = None if image is None else _bytes(image).permute(0, 2, 3, 1).contiguous().cpu().numpy()
+        images = None if image is None else as_bytes(image).permute(0, 2, 3, 1).contiguous().cpu().numpy()
         T = pose.detach().double().expand(b, 4, 4).cpu().numpy()
         K = intrinsics.detach().double().expand(b, 3, 3).cpu()
         before, faults = self._states(), [0] * b
@@ -124,7 +124,7 @@ class StreamLandmarks:
             )
             if self._contradicted[i] == _SUCCESSIVE:
                 self._contradicted[i] = -1
-                _LOG.warning("stream %d: %s. %s", i, landmarks.none, _CAUSES)
+                _LOG.warning("stream %d: %s; no depth is used. %s", i, landmarks.none, _CAUSES)
         capacity = max(len(landmarks.depth) for landmarks in result)
         by_stream = [landmarks.anchors(K[i].numpy(), K[i], capacity) for i, landmarks in enumerate(result)]
         fields = (torch.cat([getattr(anchors, name) for anchors in by_stream]) for name in _FIELDS)
@@ -179,7 +179,7 @@ def _faults(pose: Tensor, K: Tensor, size: tuple[float, ...], tolerance: float) 
     return torch.where(pose_faults > 0, pose_faults, intrinsics_fault(K, size)).tolist()
 
 
-def _bytes(image: Tensor) -> Tensor:
+def as_bytes(image: Tensor) -> Tensor:
     """[B, 3, H, W] as uint8.
 
     Raises:
