@@ -119,7 +119,7 @@ def test_images_are_compared_with_poses_at_the_beginning_alone(monkeypatch):
     added = []
     monkeypatch.setattr(CornerTrack, "add", lambda self, index, gray: added.append(index) or True)
     for model, indices in (
-        (UncertainDepth(lambda image: 2 + image[:, 0], CONFIG, check_poses=4), [1, 3]),  # compared after two and after four
+        (UncertainDepth(lambda image: 2 + image[:, 0], CONFIG, check_poses=4), [1, 3]),  # judged after 2 and 4
         (UncertainDepth(lambda image: 2 + image[:, 0], CONFIG, check_poses=0), []),
         (UncertainDepth(lambda image: 3 + image[:, 0], CONFIG, preprocess=None), []),  # normalised images
         (UncertainDepth(lambda image: 2 + image[:, 0], CONFIG, anchors="corners", posterior=True), []),
