@@ -34,7 +34,7 @@ def geodesic(mean_k, cov_k, mean_c, cov_c, lam):
 
 
 def overlap_squared(mean_a, cov_a, mean_b, cov_b):
-    """d^2 of docs/algorithm.md: squared depth difference, averaged over the image overlap of both Gaussians."""
+    """d^2 of ``disagreement="overlap"``: squared depth difference, averaged over the overlap of both in the image."""
 
     def profile(mean, cov):
         x, y, z = mean

@@ -52,6 +52,7 @@ def test_eval_and_report_show_them(walk, tmp_path, capfd):
     assert "within_2_sigma" in (tmp_path / "out" / "report.html").read_text()
     settings = json.loads((tmp_path / "out" / "eval.json").read_text())["settings"]
     assert settings["plugin"] == [PLUGIN]
+    assert evaluate("tour:5?frames=3&size=48x64", tmp_path / "tour", "--no-report") == 0
 
 
 def test_the_reader_is_everywhere(walk, tmp_path):

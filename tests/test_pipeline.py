@@ -13,7 +13,7 @@ from ufmstar_torch import DepthPrediction, UfMStar, UfMStarConfig, UncertainDept
 from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.models import Preprocess
-from ufmstar_torch.networks_in_turn import NetworksInTurn, combine
+from ufmstar_torch.networks_in_turn import NetworksInTurn, combine, weights_mark
 
 H, W = 30, 40
 CONFIG = UfMStarConfig(segment=SPGF, unmeasured="paper")
@@ -154,6 +154,41 @@ def test_state_continues_and_resets():
     assert torch.equal(second(image(3), POSES[3], K).variance, expected[3])
     whole.reset()
     assert whole(image(0), POSES[0], K).member == 0
+
+
+def test_a_state_holds_no_weights_and_names_other_networks(caplog):
+    first = UncertainDepth([Scaled(1.0), Scaled(1.1)], CONFIG)
+    for i in range(3):
+        first(image(i), POSES[i], K)
+    state = first.state_dict()
+    assert not [name for name in state if name.startswith("networks.")]
+    same_networks = UncertainDepth([Scaled(1.0), Scaled(1.1)], CONFIG)
+    same_networks.load_state_dict(state)
+    assert not caplog.messages
+    others = UncertainDepth([Scaled(1.0), Scaled(1.2)], CONFIG)
+    others.load_state_dict({**state, "networks.1.factor": torch.tensor(9.0)})  # as states were saved before
+    assert [network.factor.item() for network in others.networks] == [1.0, pytest.approx(1.2)]
+    assert int(others.ufm.frames) == 3
+    assert caplog.messages == [
+        "the state was saved with other networks: it holds their disagreement; reset() begins anew"
+    ]
+    with pytest.raises(RuntimeError, match="image_index must be a whole number"):
+        others.load_state_dict({**state, "image_index": torch.tensor(-1)})
+    assert [network.factor.item() for network in others.networks] == [1.0, pytest.approx(1.2)]
+
+
+@pytest.mark.parametrize("where", [0, -1])
+def test_networks_that_run_a_file_differ_with_its_content(tmp_path, where):
+    (tmp_path / "a").write_bytes(bytes(200_000))
+    changed = bytearray(200_000)
+    changed[where] = 1
+    (tmp_path / "b").write_bytes(changed)
+    marks = []
+    for name in "aab":
+        network = nn.Identity()
+        network.path = str(tmp_path / name)
+        marks.append(weights_mark(network))
+    assert marks[0] == marks[1] != marks[2]
 
 
 def test_stream_and_a_device_for_the_multiview_part_change_no_bit():

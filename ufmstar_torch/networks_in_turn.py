@@ -8,13 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Self
+from zlib import crc32
 
 import torch
 from torch import Tensor, nn
 
 from ufmstar_torch.prediction import DepthPrediction, infer, stated_range, states_confidence
 
+_PART = 2**16  # [bytes] of a file's beginning and end
 # image [B, 3, H, W], intrinsics [B, 3, 3] -> network image and the intrinsics of that image
 Preprocess = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
@@ -146,6 +149,24 @@ def shared_preprocess(networks: Sequence[nn.Module]) -> Preprocess:
             f"networks must have the same preprocess, got {attributes}: pass one to UncertainDepth(preprocess=...)"
         )
     return attributes[0] if attributes else in_unit_range
+
+
+def weights_mark(networks: nn.Module) -> int:
+    """A checksum that changes with the weights: of 16 entries of every tensor of the state, and of the first and last
+    64 kB of files that networks run (their attribute ``path``)."""
+    mark = 0
+    for module in networks.modules():
+        path = getattr(module, "path", None)
+        if isinstance(path, str) and Path(path).is_file():
+            with Path(path).open("rb") as file:
+                mark = crc32(file.read(_PART), mark)
+                file.seek(max(Path(path).stat().st_size - _PART, 0))
+                mark = crc32(file.read(), mark)
+    for value in networks.state_dict().values():
+        if value.numel():
+            entries = value.detach().take(torch.linspace(0, value.numel() - 1, 16).long().to(value.device))
+            mark = crc32(entries.cpu().contiguous().view(torch.uint8).numpy().tobytes(), mark)
+    return mark
 
 
 def in_unit_range(image: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:

@@ -16,7 +16,14 @@ from ufmstar_torch.anchors.pose_check import PoseCheck
 from ufmstar_torch.anchors.streams import SourceLike, StreamLandmarks
 from ufmstar_torch.arguments import Array, CameraLike, ImageLike, as_image, as_intrinsics, as_pose, as_tensor
 from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
-from ufmstar_torch.networks_in_turn import NetworksInTurn, Preprocess, in_unit_range, modules_of, shared_preprocess
+from ufmstar_torch.networks_in_turn import (
+    NetworksInTurn,
+    Preprocess,
+    in_unit_range,
+    modules_of,
+    shared_preprocess,
+    weights_mark,
+)
 from ufmstar_torch.output import FrameStatistics, MeanUncertainty, UfMStarOutput
 from ufmstar_torch.prediction import DepthPrediction
 from ufmstar_torch.recalibrate import Recalibration
@@ -26,6 +33,7 @@ from ufmstar_torch.ufmstar import UfMStar
 from ufmstar_torch.warm_up import along_wall, camera_of, require_size, warm_up
 
 _BLACK = {torch.uint8: 1, torch.float32: 1 / 255, torch.float64: 1 / 255}  # largest value of a black image
+_MARK = "weights_mark"  # in a state: ``weights_mark``
 _BRIGHT = 8.0  # largest value of a normalised image, by a wide margin
 
 
@@ -184,6 +192,8 @@ class UncertainDepth(NetworksInTurn):
         self.multiview_device = None if multiview_device is None else torch.device(multiview_device)
         self.register_buffer("image_index", torch.zeros((), dtype=torch.int64))
         self._next = 0
+        self.register_state_dict_post_hook(_without_weights)
+        self.register_load_state_dict_pre_hook(_with_own_weights)
 
     def accepted(
         self, networks: object, preprocess: Preprocess | Literal["own"] | None
@@ -468,7 +478,8 @@ class UncertainDepth(NetworksInTurn):
         self._next = int(self.image_index)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """``nn.Module.load_state_dict``, but atomic: if it raises, networks, state and landmarks are unchanged.
+        """Restore the state of a video, of :meth:`state_dict`. The networks' weights are no part of it; if they differ
+        from those at saving, a warning is logged. Atomic: if it raises, state and landmarks are unchanged.
 
         Raises:
             RuntimeError: the state is incomplete, of other networks or sources, or invalid.
@@ -479,6 +490,25 @@ class UncertainDepth(NetworksInTurn):
         except BaseException:
             super().load_state_dict(before)
             raise
+
+
+def _without_weights(module: nn.Module, state_dict: dict[str, Any], prefix: str, _: object) -> None:
+    """Replace the networks' weights in a state, which is saved often, by their checksum."""
+    assert isinstance(module, UncertainDepth)
+    for key in [key for key in state_dict if key.startswith(f"{prefix}networks.")]:
+        del state_dict[key]
+    state_dict[f"{prefix}{_MARK}"] = torch.tensor(weights_mark(module.networks))
+
+
+def _with_own_weights(module: nn.Module, state_dict: dict[str, Any], prefix: str, *_: object) -> None:
+    """Replace the checksum in a state by the module's own weights; warns if they are others."""
+    assert isinstance(module, UncertainDepth)
+    mark = state_dict.pop(f"{prefix}{_MARK}", None)
+    if mark is not None and int(mark) != weights_mark(module.networks):
+        LOGGER.warning("the state was saved with other networks: it holds their disagreement; reset() begins anew")
+    for key in [key for key in state_dict if key.startswith(f"{prefix}networks.")]:
+        del state_dict[key]
+    state_dict.update({f"{prefix}networks.{name}": value for name, value in module.networks.state_dict().items()})
 
 
 def maps_of(prediction: DepthPrediction, ufm: UfMStar) -> dict[str, Any]:

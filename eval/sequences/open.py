@@ -52,7 +52,7 @@ def open_sequence(path: str | Path, layout: str = "auto", **options: Any) -> Fra
     """
     chosen = Options(layout=layout, **options)
     if str(path).startswith("tour:"):
-        if refused := [name for name in chosen.changed() if name != "poses"]:
+        if refused := [name for name in chosen.changed() if name not in ("poses", "plugin")]:
             raise ValueError(f"{path!r} takes no {', '.join(refused)}: a tour's options stand in its name")
         # Imported here, because that package imports this one.
         return convert_poses(import_module("ufmstar_torch.eval.tour.sequence").open_tour(str(path)), chosen.poses)
