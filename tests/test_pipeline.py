@@ -191,6 +191,49 @@ def test_networks_that_run_a_file_differ_with_its_content(tmp_path, where):
     assert marks[0] == marks[1] != marks[2]
 
 
+class Foreign(nn.Module):
+    """A network whose state also holds values that are no dense tensors, as quantised layers and offloaded ones."""
+
+    def __init__(self, first: float) -> None:
+        super().__init__()
+        self.register_buffer("first", torch.tensor([first, 0.0]))
+        self.register_buffer("eighth", torch.ones(3).to(torch.float8_e4m3fn))
+        self.register_buffer("offloaded", torch.ones(3, device="meta"))
+        self.register_buffer("sparse", torch.eye(3).to_sparse())
+        self.register_buffer("quantised", torch.quantize_per_tensor(torch.ones(3), 0.1, 0, torch.qint8))
+
+    def get_extra_state(self):
+        return {"scale": 1}
+
+    def set_extra_state(self, state):
+        assert state == {"scale": 1}
+
+    def forward(self, image):
+        return DepthPrediction(image[:, 0])
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
+def test_networks_with_states_of_any_kind_are_saved(caplog):
+    model = UncertainDepth(Foreign(1.0), CONFIG)
+    model(image(0), POSES[0], K)
+    state = model.state_dict()
+    UncertainDepth(Foreign(1.0), CONFIG).load_state_dict(state)
+    assert not caplog.messages
+    UncertainDepth(Foreign(2.0), CONFIG).load_state_dict(state)
+    assert caplog.messages
+
+
+def test_weights_of_a_large_layer_are_marked_by_its_first_and_last_entries():
+    """Above 2^24, float32 cannot hold every index."""
+    layer = nn.Module()
+    layer.register_buffer("weight", torch.zeros(2**24 + 8, dtype=torch.bool))
+    marks = [weights_mark(layer)]
+    for at in (0, -1):
+        layer.weight[at] = True
+        marks.append(weights_mark(layer))
+    assert len(set(marks)) == 3
+
+
 def test_stream_and_a_device_for_the_multiview_part_change_no_bit():
     members = [Scaled(1.0), Scaled(1.1), Scaled(0.9)]
     plain = UncertainDepth(members, CONFIG)

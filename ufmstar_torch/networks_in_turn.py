@@ -152,8 +152,8 @@ def shared_preprocess(networks: Sequence[nn.Module]) -> Preprocess:
 
 
 def weights_mark(networks: nn.Module) -> int:
-    """A checksum that changes with the weights: of 16 entries of every tensor of the state, and of the first and last
-    64 kB of files that networks run (their attribute ``path``)."""
+    """A checksum that changes with the weights: of 16 entries of every dense tensor of the state, and of the first and
+    last 64 kB of files that networks run (their attribute ``path``)."""
     mark = 0
     for module in networks.modules():
         path = getattr(module, "path", None)
@@ -163,9 +163,13 @@ def weights_mark(networks: nn.Module) -> int:
                 file.seek(max(Path(path).stat().st_size - _PART, 0))
                 mark = crc32(file.read(), mark)
     for value in networks.state_dict().values():
-        if value.numel():
-            entries = value.detach().take(torch.linspace(0, value.numel() - 1, 16).long().to(value.device))
-            mark = crc32(entries.cpu().contiguous().view(torch.uint8).numpy().tobytes(), mark)
+        # Quantised layers also hold other values, and offloaded layers hold tensors without entries.
+        dense = type(value) in (Tensor, nn.Parameter) and value.layout == torch.strided and not value.is_quantized
+        if dense and not value.is_meta and value.numel():
+            index = [n * (value.numel() - 1) // 15 for n in range(16)]
+            stored = value.detach() if value.element_size() > 1 else value.detach().view(torch.uint8)
+            entries = stored.take(torch.tensor(index, device=value.device))
+            mark = crc32(entries.cpu().view(torch.uint8).numpy().tobytes(), mark)
     return mark
 
 
