@@ -172,8 +172,9 @@ def test_a_state_holds_no_weights_and_names_other_networks(caplog):
     assert caplog.messages == [
         "the state was saved with other networks: it holds their disagreement; reset() begins anew"
     ]
-    with pytest.raises(RuntimeError, match="image_index must be a whole number"):
-        others.load_state_dict({**state, "image_index": torch.tensor(-1)})
+    for name in ("image_index", "weights_mark"):
+        with pytest.raises(RuntimeError, match=f"UncertainDepth:\n\t{name} must be a whole number of at least 0"):
+            others.load_state_dict({**state, name: torch.tensor(-1)})
     assert [network.factor.item() for network in others.networks] == [1.0, pytest.approx(1.2)]
 
 

@@ -33,7 +33,7 @@ from ufmstar_torch.ufmstar import UfMStar
 from ufmstar_torch.warm_up import along_wall, camera_of, require_size, warm_up
 
 _BLACK = {torch.uint8: 1, torch.float32: 1 / 255, torch.float64: 1 / 255}  # largest value of a black image
-_MARK = "weights_mark"  # in a state: ``weights_mark``
+_MARK = "weights_mark"  # key of the checksum of the networks' weights in a state
 _BRIGHT = 8.0  # largest value of a normalised image, by a wide margin
 
 
@@ -193,7 +193,6 @@ class UncertainDepth(NetworksInTurn):
         self.register_buffer("image_index", torch.zeros((), dtype=torch.int64))
         self._next = 0
         self.register_state_dict_post_hook(_without_weights)
-        self.register_load_state_dict_pre_hook(_with_own_weights)
 
     def accepted(
         self, networks: object, preprocess: Preprocess | Literal["own"] | None
@@ -459,9 +458,12 @@ class UncertainDepth(NetworksInTurn):
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
         landmark_prefix = f"{prefix}landmarks."
+        mark = self._with_own_weights(state_dict, prefix)
         try:
+            if mark is not None:
+                _require_count(mark, _MARK)
             if f"{prefix}image_index" in state_dict:
-                _require_count(state_dict[f"{prefix}image_index"])
+                _require_count(state_dict[f"{prefix}image_index"], "image_index")
             self.ufm.accepted(state_dict, f"{prefix}ufm.")
             if self.landmarks is not None:
                 self.landmarks.load_state(
@@ -474,8 +476,17 @@ class UncertainDepth(NetworksInTurn):
         except ValueError as error:
             args[-1].append(str(error))
             return
+        if mark is not None and int(mark) != weights_mark(self.networks):
+            LOGGER.warning("the state was saved with other networks: it holds their disagreement; reset() begins anew")
         super()._load_from_state_dict(state_dict, prefix, *args)
         self._next = int(self.image_index)
+
+    def _with_own_weights(self, state_dict: dict[str, Tensor], prefix: str) -> Tensor | None:
+        """Replace the checksum in a state, or weights, by the module's own weights; the checksum, or None."""
+        for key in [key for key in state_dict if key.startswith(f"{prefix}networks.")]:
+            del state_dict[key]
+        state_dict.update({f"{prefix}networks.{name}": value for name, value in self.networks.state_dict().items()})
+        return state_dict.pop(f"{prefix}{_MARK}", None)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """Restore the state of a video, of :meth:`state_dict`. The networks' weights are no part of it; if they differ
@@ -500,17 +511,6 @@ def _without_weights(module: nn.Module, state_dict: dict[str, Any], prefix: str,
     state_dict[f"{prefix}{_MARK}"] = torch.tensor(weights_mark(module.networks))
 
 
-def _with_own_weights(module: nn.Module, state_dict: dict[str, Any], prefix: str, *_: object) -> None:
-    """Replace the checksum in a state by the module's own weights; warns if they are others."""
-    assert isinstance(module, UncertainDepth)
-    mark = state_dict.pop(f"{prefix}{_MARK}", None)
-    if mark is not None and int(mark) != weights_mark(module.networks):
-        LOGGER.warning("the state was saved with other networks: it holds their disagreement; reset() begins anew")
-    for key in [key for key in state_dict if key.startswith(f"{prefix}networks.")]:
-        del state_dict[key]
-    state_dict.update({f"{prefix}networks.{name}": value for name, value in module.networks.state_dict().items()})
-
-
 def maps_of(prediction: DepthPrediction, ufm: UfMStar) -> dict[str, Any]:
     """The arguments of :meth:`UfMStar.forward` from a prediction: depth, A, E, and the confidence if used."""
     maps = {
@@ -521,10 +521,10 @@ def maps_of(prediction: DepthPrediction, ufm: UfMStar) -> dict[str, Any]:
     return maps | ({"confidence": prediction.confidence} if ufm.takes("confidence") else {})
 
 
-def _require_count(value: object) -> None:
-    """Raise a ValueError unless ``value`` is a number of images."""
+def _require_count(value: object, name: str) -> None:
+    """Raise a ValueError unless ``value`` is a whole number of at least 0."""
     if not isinstance(value, Tensor) or value.dtype != torch.int64 or value.dim() or bool(value < 0):
-        raise ValueError(f"image_index must be a whole number of images, got {value}")
+        raise ValueError(f"{name} must be a whole number of at least 0, got {value}")
 
 
 def _copied(values: dict[str, Tensor], device: torch.device | None) -> tuple[dict[str, Any], torch.cuda.Event | None]:
