@@ -15,7 +15,7 @@ from shared_data import require_shared
 
 import scenes
 from ufmstar_torch import AnchorConfig, DepthPrediction, SPGFConfig, UfMStar, UfMStarConfig, UncertainDepth
-from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.anchors import Anchors, landmarks
 from ufmstar_torch.anchors.pose_check import PoseCheck
 from ufmstar_torch.anchors.pose_fit import CornerTrack
 from ufmstar_torch.eval.check.depth_image_fit import depth_image_fit, image_at_map, part_of_image
@@ -135,6 +135,36 @@ def test_images_are_compared_with_poses_at_the_beginning_alone(monkeypatch):
     assert added == [1, 2, 1]
     with pytest.raises(ValueError, match="check_poses must be a number of images of at least 0, got -1"):
         UncertainDepth(lambda image: image[:, 0], check_poses=-1)
+
+
+@pytest.mark.parametrize("lost", [np.nan, 0.0])
+def test_images_without_a_pose_are_not_compared(caplog, lost):
+    """Tracking was lost, and poses are NaN or 0; later images are compared."""
+    model = UncertainDepth(lambda image: 2 + image[:, 0], CONFIG.replace(on_bad_frame="skip"), check_poses=30)
+    for i, frame in enumerate(video()):
+        model(frame.image, np.linalg.inv(frame.T_world_cam) if i > 2 else np.full((4, 4), lost), frame.intrinsics)
+    assert len([text for text in caplog.messages if "the poses look world-to-camera" in text]) == 1
+
+
+def test_opencv_that_cannot_be_loaded_ends_the_comparison(monkeypatch):
+    """As without libGL: an ImportError that is no ModuleNotFoundError."""
+
+    def failing():
+        raise ImportError("libGL.so.1: cannot open shared object file")
+
+    monkeypatch.setattr(landmarks, "opencv", failing)
+    model, frame = UncertainDepth(lambda image: 2 + image[:, 0], CONFIG), video()[0]
+    assert model(frame.image, frame.T_world_cam, frame.intrinsics).depth.isfinite().all()
+
+
+def test_a_reset_of_other_streams_keeps_the_first_ones_images(monkeypatch):
+    added = []
+    monkeypatch.setattr(CornerTrack, "add", lambda self, index, gray: added.append(index) or True)
+    model = UncertainDepth(lambda image: 2 + image[:, 0], CONFIG)
+    for frame, streams in zip(video(), ([1], [0], torch.tensor([False, True]), [1]), strict=False):
+        model(np.stack([frame.image] * 2), frame.T_world_cam, frame.intrinsics)
+        model.reset(streams)
+    assert added == [1, 1]
 
 
 def test_floats_up_to_255_are_named(caplog):
@@ -424,7 +454,7 @@ def test_in_how_many_clips_the_first_images_show_each_mistake(caplog):
         found = [0, 0]
         for name in (*RECORDINGS, *TOURS):
             caplog.clear()
-            check, sequence = PoseCheck(40), change(followed(name)[0])
+            check, sequence = PoseCheck(40, CONFIG.rotation_tolerance), change(followed(name)[0])
             for frame in islice(sequence, 40):
                 image = torch.from_numpy(frame.image).permute(2, 0, 1)[None]
                 check.compare(image, torch.from_numpy(frame.T_world_cam), torch.from_numpy(frame.intrinsics))

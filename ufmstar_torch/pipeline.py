@@ -187,7 +187,7 @@ class UncertainDepth(NetworksInTurn):
         searching = self.landmarks is not None and self.landmarks.searching  # these sources compare poses themselves
         if not isinstance(check_poses, int) or check_poses < 0:
             raise ValueError(f"check_poses must be a number of images of at least 0, got {check_poses!r}")
-        self._pose_check = PoseCheck(0 if searching else check_poses)
+        self._pose_check = PoseCheck(0 if searching else check_poses, self.ufm.config.rotation_tolerance)
         self.mode = mode
         self.multiview_device = None if multiview_device is None else torch.device(multiview_device)
         self.register_buffer("image_index", torch.zeros((), dtype=torch.int64))
@@ -437,13 +437,14 @@ class UncertainDepth(NetworksInTurn):
     def reset(self, streams: Sequence[int] | Tensor | None = None, *, keep_evidence: bool = False) -> None:
         """Reset UfM* (:meth:`UfMStar.reset`) and the landmarks; resetting all streams also restarts the alternation."""
         self.ufm.reset(streams, keep_evidence=keep_evidence)
+        b = self.ufm.mean.shape[0]
+        chosen = None if streams is None else self.ufm._chosen(streams, b).nonzero().flatten().tolist()
         if self.landmarks is not None:
-            b = self.ufm.mean.shape[0]
-            mask = None if streams is None else self.ufm._chosen(streams, b).nonzero().flatten().tolist()
-            self.landmarks.reset(mask)
-        if streams is None:
+            self.landmarks.reset(chosen)
+        if chosen is None:
             self._count(0)
-        self._pose_check.reset()
+        if chosen is None or 0 in chosen:
+            self._pose_check.reset()
 
     def _count(self, images: int) -> None:
         """Set the number of processed images, as a number for the alternation and as a buffer for ``state_dict``."""

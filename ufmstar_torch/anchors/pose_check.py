@@ -7,12 +7,13 @@ without an error. This names them also to a user who asks for no anchors.
 from __future__ import annotations
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.anchors.landmarks import checked
 from ufmstar_torch.anchors.pose_fit import UNCHANGED, Cameras, CornerTrack, FollowedCorners, pose_fit
-from ufmstar_torch.anchors.streams import as_bytes
+from ufmstar_torch.anchors.streams import as_bytes, camera_faults
 from ufmstar_torch.stream_warnings import LOGGER
 
 
@@ -22,12 +23,14 @@ class PoseCheck:
 
     Args:
         images: number of images to compare; 0 = none.
+        rotation_tolerance: of the poses, as UfM*'s.
 
-    Images that are neither bytes nor floats in [0, 1] end the comparison, and so does a missing OpenCV.
+    Images with a faulty camera are left out; UfM* refuses or skips them, too. Images that are neither bytes nor floats
+    in [0, 1] end the comparison, and so does OpenCV if it cannot be imported.
     """
 
-    def __init__(self, images: int) -> None:
-        self._left, self._half = images, images // 2
+    def __init__(self, images: int, rotation_tolerance: float) -> None:
+        self._left, self._half, self._tolerance = images, images // 2, rotation_tolerance
         self.reset()
 
     def reset(self) -> None:
@@ -40,10 +43,12 @@ class PoseCheck:
         """Add the next image [B, 3, H, W] with its pose [B, 4, 4] or [4, 4] and K [B, 3, 3] or [3, 3]."""
         if not self._left:
             return
-        T, K = (value.detach().reshape(-1, *value.shape[-2:])[0].cpu().double().numpy() for value in (pose, intrinsics))
+        first = [value.detach().reshape(-1, *value.shape[-2:])[:1].cpu().double() for value in (pose, intrinsics)]
+        if any(camera_faults(*first, (torch.inf, torch.inf), self._tolerance)):
+            return
         try:
-            gray, T, K = checked(as_bytes(image[:1])[0].permute(1, 2, 0).cpu().numpy(), T, K)
-        except (ModuleNotFoundError, ValueError):  # an impossible camera is an error of UfM*
+            gray, T, K = checked(as_bytes(image[:1])[0].permute(1, 2, 0).cpu().numpy(), *(c[0].numpy() for c in first))
+        except (ImportError, ValueError):
             self._left = 0
             return
         self._cameras.append((T, K))

@@ -96,7 +96,7 @@ class StreamLandmarks:
         before, faults = self._states(), [0] * b
         if rotation_tolerance is not None:
             size = (torch.inf, torch.inf) if images is None else images.shape[1:3]
-            faults = _faults(torch.from_numpy(T), K, size, rotation_tolerance)
+            faults = camera_faults(torch.from_numpy(T), K, size, rotation_tolerance)
         if not skip and (faulty := [f"stream {i}: {FRAME_FAULTS[fault]}" for i, fault in enumerate(faults) if fault]):
             raise ValueError("; ".join(faulty))
         try:
@@ -173,7 +173,7 @@ class StreamLandmarks:
             self._sources[i].load_state(states[i])
 
 
-def _faults(pose: Tensor, K: Tensor, size: tuple[float, ...], tolerance: float) -> list[int]:
+def camera_faults(pose: Tensor, K: Tensor, size: tuple[float, ...], tolerance: float) -> list[int]:
     """Indices into ``FRAME_FAULTS`` of poses [B, 4, 4] and intrinsics [B, 3, 3] of images of a size (H, W)."""
     pose_faults = pose_fault(pose, rotation_deviation(pose[:, :3, :3]), tolerance)
     return torch.where(pose_faults > 0, pose_faults, intrinsics_fault(K, size)).tolist()
