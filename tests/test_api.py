@@ -57,6 +57,7 @@ def test_signatures():
         "preprocess",
         "anchors",
         "recalibration",
+        "check_poses",
         "multiview_device",
     ]
     assert names(UncertainDepth.__init__) == made_of
