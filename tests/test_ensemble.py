@@ -7,11 +7,12 @@ import pickle
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
 
-from ufmstar_torch import DepthPrediction, UncertainDepth
+from ufmstar_torch import DepthPrediction, UfMStarConfig, UncertainDepth
 from ufmstar_torch.models import CheckpointError, DepthNetwork, LazyMember, Preprocess
 
 INPUT = Preprocess(size=(8, 10))
@@ -54,6 +55,15 @@ def lazy(*gains, **options):
 
 def image(batch=2):
     return torch.rand(batch, 3, 8, 10, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize("options", [{}, {"offload": True}])
+def test_images_follow_members_that_are_not_loaded_to_their_device(options):
+    config = UfMStarConfig(max_components=64, initial_capacity=64, on_bad_frame="skip")
+    model = UncertainDepth(lazy(1.0, 1.1, **options)[0], config).to("meta")
+    picture = np.zeros((8, 10, 3), np.uint8)  # not a tensor, whose device is the caller's choice
+    for _ in range(3):
+        assert model(picture, POSE, K).depth.is_meta
 
 
 def test_only_the_members_in_turn_are_loaded_each_once():

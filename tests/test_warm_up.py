@@ -156,6 +156,21 @@ def test_warm_up_leaves_networks_images_and_state_as_they_are():
         model.warm_up(224)
 
 
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float64])
+def test_warm_up_of_a_network_of_another_dtype(dtype):
+    """Without preprocessing, a network's images have the dtype that it needs."""
+
+    class Network(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.layer = torch.nn.Conv2d(3, 1, 1).to(dtype)
+
+        def forward(self, image):
+            return DepthPrediction(2 + self.layer(image)[:, 0].sigmoid().float())
+
+    UncertainDepth(Network(), preprocess=None).warm_up((32, 48))
+
+
 @pytest.mark.slow
 def test_a_cold_start_compiles_all_and_a_warm_one_nothing(tmp_path):
     def run() -> dict:

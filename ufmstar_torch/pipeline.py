@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import torch
@@ -324,8 +325,9 @@ class UncertainDepth(NetworksInTurn):
         streams: int = 1,
         progress: Callable[[int, int], object] | None = None,
     ) -> None:
-        """Run the networks on noise, and compile all kernels or load them from disk. Images, evidence and state do not
-        change. Without this, the first images wait for the compiler and for the libraries of a GPU.
+        """Run every network twice on noise, and compile all kernels or load them from disk. State, evidence and the
+        number of images do not change; a network with a state of its own sees the noise. Without this, the first images
+        wait for the compiler and for the libraries of a GPU.
 
         Args:
             size: (H, W) of the images [px]; without networks, of the depth maps.
@@ -344,10 +346,11 @@ class UncertainDepth(NetworksInTurn):
 
     def _tried(self, size: tuple[int, int], streams: int) -> tuple[int, int]:
         """Run every network twice on noise in images of ``size``; the size of their depth maps."""
-        device = next((p.device for p in self.networks.parameters()), torch.device("cpu"))
+        device = self._device() or torch.device("cpu")
+        floats = (t.dtype for t in self._tensors() if t.is_floating_point() and t.element_size() > 1)
         with torch.no_grad(), torch.random.fork_rng([device] if device.type == "cuda" else []):
             noise = torch.randint(0, 256, (streams, 3, *size), dtype=torch.uint8, device=device)
-            image = noise / 255 if self.preprocess is None else noise
+            image = (noise / 255).to(next(floats, torch.float32)) if self.preprocess is None else noise
             x, K = self.prepare(image, camera_of(size).to(torch.float64).expand(streams, 3, 3))
             for _ in range(2):
                 maps = [self.member(x, K, n) for n in range(len(self.networks))]
@@ -415,7 +418,7 @@ class UncertainDepth(NetworksInTurn):
             brightest = f"the first image has floats up to {float(picture.max()):g}"
             LOGGER.warning("%s: pass bytes, or floats in [0, 1], unless the network expects this", brightest)
         if not isinstance(image, Tensor):  # a tensor's device is the caller's choice
-            picture = picture.to(next((p.device for p in self.networks.parameters()), picture.device))
+            picture = picture.to(self._device() or picture.device)
         member = None if self.mode == "full" else self.turn(self._next + ahead)
         with torch.no_grad():
             x, K = self.prepare(picture, K_image.expand(len(picture), 3, 3))
@@ -426,6 +429,14 @@ class UncertainDepth(NetworksInTurn):
         there, ready = _copied(tensors, self.multiview_device)
         H = there.pop("features", None)
         return _Predicted(picture, T, K_image, replace(prediction, **there), member, H, ready)
+
+    def _tensors(self) -> Iterator[Tensor]:
+        """The networks' parameters and buffers. A ``LazyMember`` has a buffer alone, on its device."""
+        return chain(self.networks.parameters(), self.networks.buffers())
+
+    def _device(self) -> torch.device | None:
+        """The networks' device; None if they have no tensors."""
+        return next((tensor.device for tensor in self._tensors()), None)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Move the networks; UfM* stays on ``multiview_device`` unless that is None."""

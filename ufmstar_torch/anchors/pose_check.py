@@ -41,7 +41,7 @@ class PoseCheck:
 
     def compare(self, image: Tensor, pose: Tensor, intrinsics: Tensor) -> None:
         """Add the next image [B, 3, H, W] with its pose [B, 4, 4] or [4, 4] and K [B, 3, 3] or [3, 3]."""
-        if not self._left:
+        if not self._left or image.is_meta:
             return
         first = [value.detach().reshape(-1, *value.shape[-2:])[:1].cpu().double() for value in (pose, intrinsics)]
         if any(camera_faults(*first, (torch.inf, torch.inf), self._tolerance)):
