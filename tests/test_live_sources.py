@@ -21,12 +21,11 @@ from layouts import quaternion_line
 from PIL import Image
 from rerun_stand_in import stand_in
 
-from ufmstar_torch import cli
+from ufmstar_torch import UncertainDepth, cli
 from ufmstar_torch.eval.run import rerun_log
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.live import PoseFile, growing_folder, json_lines, replay
 from ufmstar_torch.eval.tour import export_tour
-from ufmstar_torch.live import LiveDepth
 
 __all__ = ["stand_in"]
 
@@ -217,14 +216,14 @@ def test_a_recording_live(ufmstar, tmp_path):
 
 def test_a_recording_waits_for_a_network_that_starts_slowly(ufmstar, monkeypatch):
     """As on a GPU, whose libraries take seconds: longer than this recording."""
-    process, started = LiveDepth._process, []
+    member, started = UncertainDepth.member, []
 
     def slow_at_first(*words):
         if not started:
             started.append(time.sleep(2))
-        return process(*words)
+        return member(*words)
 
-    monkeypatch.setattr(LiveDepth, "_process", slow_at_first)
+    monkeypatch.setattr(UncertainDepth, "member", slow_at_first)
     code, out, err = ufmstar(TOUR, "--speed", "0.25", "--json")
     assert code == 0, err
     assert len(out.splitlines()) >= 3  # 2 without the wait: the first image and the last

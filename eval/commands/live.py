@@ -152,7 +152,7 @@ def _run(
     view: RerunLog | None,
 ) -> tuple[LiveStatistics, Exception | None]:
     """Push the events until they end, the time is over, or a signal comes. Returns the counts, and the error if any."""
-    deadline = monotonic() + options.seconds
+    deadline, warm = monotonic() + options.seconds, False
 
     def on_result(result: LiveResult) -> None:
         times.take(result)
@@ -174,9 +174,11 @@ def _run(
                 if event.T_world_cam is not None:
                     live.push_pose(event.stamp, event.T_world_cam)
                 if event.image is not None:
+                    if not warm:  # the first inference takes seconds; a recording's clock starts after it
+                        height, width = event.image.shape[:2]
+                        model.warm_up((height, width))
+                        warm = True
                     live.push_image(event.stamp, event.image, event.intrinsics)
-                if options.recorded and live.statistics.images == 1:
-                    live.wait_idle()  # the networks start, on a GPU for seconds; the recording's clock starts after it
             live.wait_idle()
     except (OSError, RuntimeError, TypeError, ValueError) as error:
         return live.statistics, error
