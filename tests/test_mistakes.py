@@ -428,7 +428,7 @@ def test_corrupted_poses_are_named(kind, seed):
     for name in RECORDINGS:
         problem = problems(name, change)
         assert "poses disagree with the images" in problem, name
-        for still in re.findall(r"corners fit to ([\d.]+) px then", problem):
+        for still in re.findall(r"but by ([\d.]+) px under", problem):
             assert float(still) <= max(1, 0.005 * followed(name)[0].image_size[1]), "a misfit is no remedy"
 
 

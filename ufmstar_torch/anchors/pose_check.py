@@ -1,7 +1,7 @@
-"""Comparison of a video's first images with their poses and intrinsics (``pose_fit``), while they come.
+"""Comparison of a video's first images with their poses and intrinsics (``pose_fit``), image by image.
 
 Wrong axes, the inverse pose, a late trajectory and the intrinsics of another image make UfM*'s disagreement large
-without an error. This names them also to a user who asks for no anchors.
+without an error. This comparison names them even where no anchors are used.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class PoseCheck:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the images: another video begins."""
+        """Drop the images so far, because another video begins. The number of images still to compare stays."""
         self._track: CornerTrack | None = None
         self._corners: list[FollowedCorners] = []
         self._cameras: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
@@ -43,11 +43,13 @@ class PoseCheck:
         """Add the next image [B, 3, H, W] with its pose [B, 4, 4] or [4, 4] and K [B, 3, 3] or [3, 3]."""
         if not self._left or image.is_meta:
             return
-        first = [value.detach().reshape(-1, *value.shape[-2:])[:1].cpu().double() for value in (pose, intrinsics)]
-        if any(camera_faults(*first, (torch.inf, torch.inf), self._tolerance)):
+        T_first, K_first = (x.detach().reshape(-1, *x.shape[-2:])[:1].cpu().double() for x in (pose, intrinsics))
+        if any(camera_faults(T_first, K_first, (torch.inf, torch.inf), self._tolerance)):
             return
         try:
-            gray, T, K = checked(as_bytes(image[:1])[0].permute(1, 2, 0).cpu().numpy(), *(c[0].numpy() for c in first))
+            gray, T, K = checked(
+                as_bytes(image[:1])[0].permute(1, 2, 0).cpu().numpy(), T_first[0].numpy(), K_first[0].numpy()
+            )
         except (ImportError, ValueError):
             self._left = 0
             return

@@ -88,7 +88,11 @@ class ImageFit:
     @property
     def words(self) -> str:
         """The outcome as one line."""
-        return f"poses disagree with the images by {self.error:.1f} px (limit: {self.limit:.1f})"
+        return f"{self._distance} (limit: {self.limit:.1f})"
+
+    @property
+    def _distance(self) -> str:
+        return f"poses disagree with the images by {self.error:.1f} px"
 
 
 @dataclass(frozen=True)
@@ -110,7 +114,6 @@ class CornerTrack:
     Args:
         index: number of the image.
         gray: [H, W] uint8.
-
     """
 
     def __init__(self, index: int, gray: NDArray[np.uint8]) -> None:
@@ -155,7 +158,7 @@ def pose_fit(cameras: Cameras, width: float, corners: Sequence[FollowedCorners])
     motion = float(np.median([one.motion for one in near]))
     fit = ImageFit(len(near), motion, error, limit, reading, best, "")
     if reading != UNCHANGED:
-        return replace(fit, problem=f"{fit.words}: {reading}: corners fit to {best:.1f} px then")
+        return replace(fit, problem=f"{fit._distance}, but by {best:.1f} px under another reading: {reading}")
     if error > limit:
         text = "poses, intrinsics and images belong together under no reading tried"
         return replace(fit, problem=f"{fit.words}: {text}")
@@ -177,7 +180,8 @@ def epipolar_offsets(
     cameras: Cameras, corners: FollowedCorners, readings: Sequence[Reading] = (UNCHANGED,)
 ) -> tuple[NDArray[np.float64], ...]:
     """[R, N] each, by reading: distance of the followed corners from their half lines [px], position along them [px],
-    and inverse depth in the first image [1/unit of the poses]. Beyond the poses, the nearest one is taken."""
+    and inverse depth in the first image [1/unit of the poses]. Where a late or early reading needs a pose before the
+    first one or after the last one, that one is used."""
     last = len(cameras.T_world_cam) - 1
     T_a, T_b = (
         np.stack([CONVENTIONS[r.poses].convert(cameras.T_world_cam[min(max(at + r.late, 0), last)]) for r in readings])
