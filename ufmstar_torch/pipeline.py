@@ -125,7 +125,8 @@ class UncertainDepth(NetworksInTurn):
             each. Saved and reset with the state. None: anchors may be passed with each image.
         recalibration: a map of V, applied last (``Recalibration.from_json(FILE)``); None = no map.
         check_poses: number of first images, of the first stream, that are compared with their poses and intrinsics by
-            tracked corners, 2 ms each; a warning names another reading that fits much better. 0 = none.
+            tracked corners, 2 ms each. A warning states if another convention or delay of the poses, or K of another
+            image size, fits much better. 0 = none.
         multiview_device: device of UfM* and of the results; None = the networks' device. "cpu", the paper's split, is
             faster for one camera with the networks on a GPU. :meth:`stream` runs both devices at the same time.
 

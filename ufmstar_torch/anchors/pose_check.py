@@ -18,8 +18,8 @@ from ufmstar_torch.stream_warnings import LOGGER
 
 
 class PoseCheck:
-    """Compares the first images of a batch's first stream with their cameras, after half of them and after all, and
-    warns if another reading of the cameras fits much better.
+    """Compares the first images of a batch's first stream with their cameras, once after half of the images and once
+    after all, and warns if another reading of the cameras (``pose_fit.Reading``) fits much better.
 
     Args:
         images: number of images to compare; 0 = none.
