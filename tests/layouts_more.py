@@ -9,6 +9,7 @@ import zlib
 import h5py
 import layouts
 import numpy as np
+from changed_poses import rigid
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -18,12 +19,6 @@ _P_RECT = (552.554261, 552.554261, 682.049453, 238.769549)
 # Camera axes (right, down, forward) in the car's and in the laser's.
 _CAR_FROM_CAMERA = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 _LASER_FROM_CAMERA = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-
-
-def rigid(R, t):
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, t
-    return T
 
 
 def turn(*degrees):

@@ -506,7 +506,7 @@ class UncertainDepth(NetworksInTurn):
         from those at saving, a warning is logged. Atomic: if it raises, state and landmarks are unchanged.
 
         Raises:
-            RuntimeError: the state is incomplete, of other networks or sources, or invalid.
+            RuntimeError: the state is incomplete, of other sources of anchors, or invalid.
         """
         before = {name: value.clone() for name, value in self.state_dict().items()}
         try:

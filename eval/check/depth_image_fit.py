@@ -19,7 +19,7 @@ _POINTS_PER_FRAME = 1000
 _ZOOMS = np.arange(0.86, 1.141, 0.02)
 _SHIFT, _SHIFT_STEP = 0.0375, 0.0047
 # Predicted maps are blurred: they are judged only with so many edges and so much contrast. The largest quality, and the
-# least zoom, of maps that show a part of the image (``pytest -m slow -s tests/test_mistakes.py -k middle``).
+# least zoom, of maps that show a part of the image (``pytest -m slow -s tests/test_mistakes_images.py -k middle``).
 _PART, _PART_EDGES, _PART_CONTRAST, _PART_ZOOM = 0.35, 3000, 0.05, 0.06
 
 

@@ -28,22 +28,9 @@ def near(depth, K, pixels, components, m, features, settings, out, out_f, first,
         if z > 0:
             x, y = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z
             value = _point(
-                x,
-                y,
-                z,
-                log_peak,
-                local,
-                extent,
-                m,
-                features,
-                prior_weight,
-                prior_mean,
-                near_radius,
-                far_radius,
-                gaps,
-                nearest,
-                sums,
-            )
+                x, y, z, log_peak, local, extent, m, features, prior_weight, prior_mean, near_radius, far_radius, gaps,
+                nearest, sums,
+            )  # fmt: skip
         out[i] = value
         for g in range(sums.size):
             out_f[g, i] = sums[g] if z > 0 else np.nan
@@ -67,22 +54,9 @@ def _prepared(components, n, sigmas):
 
 @part
 def _point(
-    x,
-    y,
-    z,
-    log_peak,
-    local,
-    extent,
-    m,
-    features,
-    prior_weight,
-    prior_mean,
-    near_radius,
-    far_radius,
-    gaps,
-    nearest,
-    sums,
-):
+    x, y, z, log_peak, local, extent, m, features, prior_weight, prior_mean, near_radius, far_radius, gaps,
+    nearest, sums,
+):  # fmt: skip
     """The regression at one point; writes its features to ``sums`` [F]."""
     count, least = 0, np.inf
     for k in range(m.size):
