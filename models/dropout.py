@@ -75,6 +75,8 @@ class MonteCarloDropout(DepthNetwork):
         ValueError: the network has no decoder dropout, or ``samples`` is not positive.
     """
 
+    stochastic = True
+
     def __init__(
         self,
         network: DepthNetwork,

@@ -117,7 +117,7 @@ def _corresponding(previous, current, intrinsics, size, config):
     return Correspondence(match, overlap)
 
 
-def _fused(previous, current, pairs, config, *, rounds=None):
+def _fused(previous, current, pairs, view, config, *, rounds=None):
     """The compiled fusion of a mixture, stream by stream."""
     out = GaussianMixture(*(value.clone() for value in previous.tensors().values()))
     epsilon = torch.finfo(previous.covariance.dtype).eps
@@ -127,8 +127,9 @@ def _fused(previous, current, pairs, config, *, rounds=None):
         new = (v[b].numpy() for v in (current.mean, current.covariance, current.weight, current.features))
         compiled(fuse_cpu.fuse_pairs)(
             *(value[b].numpy() for value in out.tensors().values()), *new,
-            c.numpy(), k.numpy(), pairs.overlap[b, c, k].numpy(), distance.numpy(),
-            config.overlap_weighted, epsilon, np.empty(fuse_cpu.WORK),
+            c.numpy(), k.numpy(), pairs.overlap[b, c, k].numpy(), distance.numpy(), view[b].numpy(),
+            (config.overlap_weighted, epsilon, config.view_baseline or 0.0, config.near_plane),
+            np.empty(out.capacity), np.empty(fuse_cpu.WORK),
         )  # fmt: skip
     return out
 

@@ -1,7 +1,8 @@
 """UfM* steps 2 to 6 in NumPy float64 loops, straight from the paper; slow, plain, and independent.
 
-Imports neither torch nor the package. Component lists are plain Python lists of dicts with keys mean,
-cov, weight, m, count, features; the mixture is kept in the first camera's frame.
+Imports neither torch nor the package. Component lists are plain Python lists of dicts with keys mean, cov, weight, m,
+features, and of the views compared: compared, evidence and view (of the reference: the camera's centre, the network's
+index, and the largest change since). The mixture is kept in the first camera's frame.
 """
 
 from __future__ import annotations
@@ -125,7 +126,6 @@ def segment(depth, K, segmentation, *, valid=None, features=None, near=0.05):
             "cov": floor_eigenvalues(piece.covariance, floor),
             "weight": float(piece.N),
             "m": 0.0,
-            "count": 1,
             "features": np.zeros(0) if features is None else features[:, rows, columns].mean(1),
         })  # fmt: skip
     return components
@@ -165,9 +165,28 @@ def correspond(previous_cam, current_cam, K, size, eta, eta_occl, near):
     return matches, overlaps
 
 
-def fuse(mixture, current, matches, overlaps, *, overlap_weighted=False, remembered=None, distances=None):
-    """M_i from M_(i-1) and C_i, both in one frame; returns a new list."""
+def view_weight(component, view, baseline, near):
+    """Weight of a comparison: 1 if another network predicted (or baseline is None, the paper), else the increase of
+    1 - exp(-(b/b0)^2), with the baseline b over the distance, beyond its largest value since the reference view."""
+    if baseline is None or component["view"][3] != view[3]:
+        return 1.0
+    distance = max(np.linalg.norm(component["mean"] - view[:3]), near)
+    change = 1 - np.exp(-((np.linalg.norm(view[:3] - component["view"][:3]) / distance / baseline) ** 2))
+    return max(change - component["view"][4], 0.0)
+
+
+def fuse(mixture, current, matches, overlaps, view, *, baseline=0.1, near=0.05, overlap_weighted=False,
+         remembered=None, distances=None):  # fmt: skip
+    """M_i from M_(i-1) and C_i, both in the first camera's frame; returns a new list. view: centre of the camera there,
+    and index of the network."""
     fused = [dict(k) for k in mixture]
+    counts = [view_weight(g, view, baseline, near) for g in mixture]
+    for k in {k for ks in matches for k in ks}:
+        if counts[k] > 0:
+            fused[k]["evidence"] += counts[k]
+            change = fused[k]["view"][4] + counts[k]
+            reference = fused[k]["view"][:4]
+            fused[k]["view"] = np.append(view, 0.0) if change >= 0.9 else np.append(reference, change)
     for c, ks in enumerate(matches):  # increasing c for every k
         for k in ks:
             g, new = fused[k], current[c]
@@ -177,13 +196,15 @@ def fuse(mixture, current, matches, overlaps, *, overlap_weighted=False, remembe
             if distances is not None:
                 distance = distances[c, k]
             g["mean"], g["cov"] = geodesic(g["mean"], g["cov"], new["mean"], new["cov"], lam)
-            g["m"] = (1 - lam) * g["m"] + lam * distance
+            if counts[k] > 0:
+                g["m"] = (g["compared"] * g["m"] + counts[k] * pi_c * distance) / (g["compared"] + counts[k] * pi_c)
+                g["compared"] += counts[k] * pi_c
             g["features"] = (1 - lam) * g["features"] + lam * new["features"]
             g["weight"] += pi_c
-            g["count"] += 1
     for c, ks in enumerate(matches):
         if not ks and (remembered is None or remembered[c]):
-            fused.append({**current[c], "m": 0.0, "count": 1})
+            first = 0.0 if baseline is not None else current[c]["weight"]
+            fused.append({**current[c], "m": 0.0, "compared": first, "evidence": 0.0, "view": np.append(view, 0.0)})
     return fused
 
 
@@ -239,9 +260,9 @@ def dense(mixture_cam, depth, valid, K, **prior):
 
 
 def compared_share(mixture_cam, depth, valid, K, **prior):
-    """Share of every valid pixel's M from components seen at least twice, NaN elsewhere."""
+    """Share to which every valid pixel is measured, sum of w_k (1 - exp(-n_k)); NaN elsewhere."""
     out = np.full(depth.shape, np.nan)
-    mixture = prepared([{**g, "features": np.array([float(g["count"] > 1)])} for g in mixture_cam])
+    mixture = prepared([{**g, "features": np.array([1 - np.exp(-g["evidence"])])} for g in mixture_cam])
     for v, u in np.argwhere(valid):
         d = depth[v, u]
         x = np.array([(u - K[0, 2]) / K[0, 0] * d, (v - K[1, 2]) / K[1, 1] * d, d])
@@ -268,7 +289,8 @@ class Oracle:
 
     def __init__(self, spgf, *, eta=0.5, eta_occl=0.7, near=0.05, prior_weight=1.0, prior_mean=0.0,
                  alpha=0.5, overlap_weighted=False, neighbourhood=None, disagreement="w2",
-                 unmeasured="paper", unmeasured_relative=0.1):  # fmt: skip
+                 unmeasured="paper", unmeasured_relative=0.1, baseline=0.1):  # fmt: skip
+        self.baseline = baseline
         self.unmeasured, self.unmeasured_relative = unmeasured, unmeasured_relative
         self.disagreement = disagreement
         self.spgf, self.eta, self.eta_occl, self.near = spgf, eta, eta_occl, near
@@ -279,13 +301,15 @@ class Oracle:
 
     def share(self):
         """Return :func:`compared_share` [H, W] of the last frame."""
-        return compared_share(*self.seen, **self.prior)
+        return self.informative * compared_share(*self.seen, **self.prior)
 
-    def step(self, depth, T_world_cam, K, aleatoric=None, epistemic=None, features=None):
+    def step(self, depth, T_world_cam, K, aleatoric=None, epistemic=None, features=None, member=0, informative=True):
+        self.informative = float(informative)
         valid = np.isfinite(depth) & (depth > 0) & (depth <= self.spgf.settings.max_depth)
         if self.T_first is None:
             self.T_first = T_world_cam
-        current = segment(np.where(valid, depth, 0.0), K, self.spgf, valid=valid, features=features)
+        shown = valid & informative
+        current = segment(np.where(shown, depth, 0.0), K, self.spgf, valid=shown, features=features)
         to_cam = relative(self.T_first, T_world_cam)
         to_first = relative(T_world_cam, self.T_first)
         previous_cam = [transform(g, *to_cam) for g in self.mixture]
@@ -304,6 +328,9 @@ class Oracle:
             current_first,
             self.matches,
             overlaps,
+            np.append(to_first[1], member),
+            baseline=self.baseline,
+            near=self.near,
             overlap_weighted=self.overlap_weighted,
             remembered=[g["mean"][2] > self.near for g in current],
             distances=distances,

@@ -17,8 +17,10 @@ def joint(g, h):
         "mean": a * g["mean"] + b * h["mean"],
         "cov": a * g["cov"] + b * h["cov"] + a * b * np.outer(d, d),
         "weight": weight,
-        "m": a * g["m"] + b * h["m"],
-        "count": g["count"] + h["count"] - 1,
+        "m": (g["compared"] * g["m"] + h["compared"] * h["m"]) / max(g["compared"] + h["compared"], 1e-300),
+        "compared": g["compared"] + h["compared"],
+        "evidence": g["evidence"] + h["evidence"],
+        "view": (g if a >= b else h)["view"],
         "features": a * g["features"] + b * h["features"],
         "sums": g["sums"] + h["sums"],
     }
@@ -27,7 +29,7 @@ def joint(g, h):
 def loss(g, h):
     """Bound on the divergence per pixel of the lighter component [nat]; infinite for a pair that must not join."""
     lighter, heavier = (g, h) if g["weight"] < h["weight"] else (h, g)
-    if lighter["count"] > 1 and heavier["count"] == 1:
+    if lighter["evidence"] > 0 and heavier["evidence"] == 0:
         return np.inf
     weight = g["weight"] + h["weight"]
     volume = [np.linalg.slogdet(x["cov"])[1] for x in (joint(g, h), g, h)]
@@ -84,10 +86,12 @@ def dissolve(components, least, prior_weight):
             retained.append(k)
             continue
         for h, share in zip(after, shares / shares.sum(), strict=True):
-            weight = h["weight"] + share * g["weight"]
-            for name in ("m", "features"):
-                h[name] = (h["weight"] * h[name] + share * g["weight"] * g[name]) / weight
-            h["weight"], h["sums"] = weight, h["sums"] + share * g["sums"]
+            for weight, name in (("weight", "features"), ("compared", "m")):
+                total = h[weight] + share * g[weight]
+                if total > 0:
+                    h[name] = (h[weight] * h[name] + share * g[weight] * g[name]) / total
+                h[weight] = total
+            h["sums"] = h["sums"] + share * g["sums"]
     return [after[k] for k in retained]
 
 

@@ -26,11 +26,12 @@ def number(
     *,
     open_low: bool = False,
     open_high: bool = False,
+    optional: bool = False,
 ) -> Any:
     """A numeric field with the allowed range [low, high], where ``open_low`` and ``open_high`` exclude an end. An
-    integer default requires whole numbers; the default None allows None."""
+    integer default requires whole numbers; ``optional``, or the default None, allows None."""
     metadata = {"symbol": symbol, "unit": unit, "range": (low, high, open_low), "open_high": open_high}
-    return field(default=default, metadata=metadata | {"optional": default is None})
+    return field(default=default, metadata=metadata | {"optional": optional or default is None})
 
 
 def choice(default: str | int, *others: str | int) -> Any:

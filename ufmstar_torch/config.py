@@ -15,7 +15,7 @@ UNSTATED_RANGE = 20.0
 # The paper's settings where the defaults differ from them (``UfMStarConfig.paper`` has the reasons), by dotted name.
 PAPER: Mapping[str, Any] = MappingProxyType({
     "segment.min_pixels": 2000, "segment.min_rows": 32, "segment.prune": "either", "segment.slope_focal": "camera",
-    "regression": "neighbourhood", "unmeasured": "paper",
+    "view_baseline": None, "regression": "neighbourhood", "unmeasured": "paper",
 })  # fmt: skip
 
 
@@ -212,6 +212,8 @@ class UfMStarConfig(Checked):
         eta_occlusion: overlap with a nearer Gaussian from which on a Gaussian counts as hidden
         near_plane: Gaussians nearer to the camera are not in view
         overlap_weighted: weight a fusion by the overlap of its Gaussians
+        view_baseline: baseline over distance at which a comparison with an earlier view counts for 63 %: two views from
+            one position of the camera show nothing; null = every comparison counts fully, as in the paper
         disagreement: between views: squared 2-Wasserstein distance (w2), or squared depth difference where both
             Gaussians are seen (overlap)
         prior_weight: weight of the prior in the regression
@@ -251,6 +253,8 @@ class UfMStarConfig(Checked):
 
     # Fusion (section "Multiview Fusion")
     overlap_weighted: bool = False
+    # Two views from one position are one view (``views``).
+    view_baseline: float | None = number(0.07, "b_0", "1", 0.0, open_low=True, optional=True)
     # m averages the paper's squared 2-Wasserstein distance, or the squared depth difference where both Gaussians are
     # seen (``disagree``).
     disagreement: str = choice("w2", "overlap")
@@ -312,6 +316,8 @@ class UfMStarConfig(Checked):
           depth alone is .562 here and .458 by default (docs/results/accuracy.md).
         - ``segment.slope_focal``: SPGF's thresholds have the camera's own focal length here, by default the
           reference's, which made no difference on tours.
+        - ``view_baseline``: every comparison counts here, and the first view counts as agreement; by default a
+          comparison counts as far as the view changed (``views``).
         - ``regression``: over the Gaussians within .1 m here, or .5 m where there are none; by default over all, the
           sum that this approximates to save time, which was calibrated better.
         - ``unmeasured``: a surface that no two views compared reads as 0 here, as a share of its depth by default.

@@ -8,7 +8,7 @@ are marked ``valid = False`` and counted.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -58,6 +58,8 @@ class FrameInput:
         fault: [B] int64 index into ``FRAME_FAULTS``, 0 = fine.
         rotation_deviation: [B] float64 max |R^T R - I| of the original pose.
         host_fault: ``fault`` on the CPU if pose and intrinsics were there, so that reading it does not wait; else None.
+        member: [B] float64 index of the network, or of the random sample, that predicted; None = always the same.
+        informative: [B] False where the image shows nothing, so that its depth is a guess; None = all True.
     """
 
     depth: Tensor
@@ -72,6 +74,8 @@ class FrameInput:
     beyond: Tensor
     out_of_range: Tensor
     host_fault: Tensor | None = None
+    member: Tensor | None = None
+    informative: Tensor | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -144,6 +148,8 @@ def check_frame(
     aleatoric_in_h: bool = False,
     rotation_tolerance: float,
     max_depth: float = DEPTH_RANGE[1],
+    member: int | Tensor = 0,
+    informative: Tensor | None = None,
     kernel: CheckKernel = check_values,
 ) -> FrameInput:
     """Check and normalise one frame (shapes as in :meth:`ufmstar_torch.UfMStar.forward`).
@@ -153,6 +159,8 @@ def check_frame(
         aleatoric_in_h: append A and 1 to the features.
         rotation_tolerance: largest deviation of a pose's rotation from an orthogonal matrix.
         max_depth: farther pixels are not valid [m].
+        member: index of the network, for all streams or [B].
+        informative: [B] bool or None, see :class:`FrameInput`.
         kernel: an implementation of :func:`check_values`.
 
     Raises:
@@ -185,7 +193,11 @@ def check_frame(
     if valid is not None:
         either = [*shapes, (shape[0], 1, *shape[-2:])]
         mask = _as(require_mask("valid", as_tensor("valid", valid), either, depth), size, torch.bool)
-    return kernel(plain, T, K, a, e, extra, mask, rotation_tolerance=rotation_tolerance, max_depth=max_depth)
+    frame = kernel(plain, T, K, a, e, extra, mask, rotation_tolerance=rotation_tolerance, max_depth=max_depth)
+    if informative is None and isinstance(member, int) and member == 0:
+        return frame
+    index = torch.as_tensor(member, dtype=torch.float64, device=plain.device).expand(shape[0])
+    return replace(frame, member=index, informative=_of_streams("informative", informative, plain))
 
 
 def raise_faults(frame: FrameInput) -> None:
@@ -221,6 +233,15 @@ def _of_depth(name: str, value: Tensor, plain: Tensor) -> Tensor:
     if value.device.type == "meta" and plain.device.type != "meta":
         raise ValueError(f"{name} must hold values, got a tensor on device meta")
     return _constant(value)
+
+
+def _of_streams(name: str, value: Tensor | None, plain: Tensor) -> Tensor | None:
+    """A checked mask [B] on the depth's device."""
+    if value is None:
+        return None
+    if not isinstance(value, Tensor) or value.dtype != torch.bool or value.shape != plain.shape[:1]:
+        raise ValueError(f"{name} must be a bool tensor [{len(plain)}], got {value!r}")
+    return _moved(value, plain.device)
 
 
 def of_streams(cameras: Tensor, streams: int) -> Tensor:

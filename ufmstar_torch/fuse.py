@@ -17,12 +17,14 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
 from ufmstar_torch.gaussian import floor_covariance, geodesic, storage_floor
 from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.views import after_view, first_weight, view_weights
 
 
 def fuse(
     mixture: GaussianMixture,
     current: GaussianMixture,
     pairs: Correspondence,
+    view: Tensor,
     config: UfMStarConfig,
     *,
     rounds: int | None = None,
@@ -31,14 +33,17 @@ def fuse(
 
     For each k the matched c are applied one after the other in increasing index (SPGF's emission order);
     different k are independent. With pi_c (times beta_ck if ``config.overlap_weighted``) and
-    lambda = pi_c / (pi_k + pi_c): m_k <- (1-lambda) m_k + lambda W2^2(G_k, G_c), features likewise, mean and
-    covariance move by lambda along the optimal-transport geodesic, pi_k <- pi_k + pi_c. ``pairs.distance`` replaces
-    W2^2 if it is not None. A c that matches several k is fused into each of them with its full weight.
+    lambda = pi_c / (pi_k + pi_c): mean and covariance move by lambda along the optimal-transport geodesic, features are
+    averaged with lambda, pi_k <- pi_k + pi_c. With the weight w_k of the comparison (``views``; 1 in the paper) and
+    rho = w_k pi_c / (W_k + w_k pi_c): m_k <- (1-rho) m_k + rho W2^2(G_k, G_c), W_k <- W_k + w_k pi_c; in the paper
+    rho = lambda. Where w_k > 0, n_k <- n_k + w_k. ``pairs.distance`` replaces W2^2 if it is not None. A c that matches
+    several k is fused into each of them with its full weight.
 
     Args:
-        mixture: M_(i-1), [B, K].
-        current: C_i, [B, C].
+        mixture: M_(i-1), [B, K], in the first camera's frame.
+        current: C_i, [B, C], likewise.
         pairs: their correspondence.
+        view: [B, 4] the camera's centre in that frame [m] and the index of the network, float64.
         rounds: upper bound on the matches of any k; None = read it from the device (waits for an accelerator).
 
     Returns:
@@ -47,16 +52,20 @@ def fuse(
     order = pairs.match.cumsum(dim=1)  # 1-based position of c among the matches of k
     if rounds is None:
         rounds = int(order[:, -1:].max()) if order.numel() else 0
+    weight = view_weights(mixture, view, config)
     for position in range(1, rounds + 1):
         turn = pairs.match & (order == position)  # [B, C, K], at most one c for every k
-        mixture = _fuse_one_each(mixture, current, turn, pairs, config)
-    return mixture
+        mixture = _fuse_one_each(mixture, current, turn, pairs, weight, config)
+    counts = pairs.match.any(dim=1) & (weight > 0)
+    changes = {"evidence": mixture.evidence.double() + weight, "view": after_view(mixture, view, weight)}
+    return mixture.replace(**{name: _where(counts, value, getattr(mixture, name)) for name, value in changes.items()})
 
 
 def _fuse_one_each(
-    mixture: GaussianMixture, current: GaussianMixture, turn: Tensor, pairs: Correspondence, config: UfMStarConfig
-) -> GaussianMixture:
-    """Fuse at most one c into every k."""
+    mixture: GaussianMixture, current: GaussianMixture, turn: Tensor, pairs: Correspondence, counts: Tensor,
+    config: UfMStarConfig,
+) -> GaussianMixture:  # fmt: skip
+    """Fuse at most one c into every k; ``counts`` [B, K] is the weight w of the comparison."""
     dtype = torch.float64
     used = turn.any(dim=1)
     c = turn.to(torch.uint8).argmax(dim=1)  # [B, K]
@@ -81,6 +90,10 @@ def _fuse_one_each(
 
     covariance = floor_covariance(covariance, storage_floor(covariance, mixture.covariance.dtype))
 
+    added = torch.where(used, counts * pi_c, torch.zeros_like(pi_c))
+    compared = mixture.compared.to(dtype) + added
+    rho = added / compared.clamp_min(torch.finfo(dtype).tiny)
+
     def average(old: Tensor, new: Tensor, share: Tensor) -> Tensor:
         return (1 - share) * old.to(dtype) + share * new
 
@@ -88,8 +101,8 @@ def _fuse_one_each(
         "mean": mean,
         "covariance": covariance,
         "weight": pi_k + pi_c,
-        "disagreement": average(mixture.disagreement, distance, lam),
-        "count": mixture.count + 1,
+        "disagreement": average(mixture.disagreement, distance, rho),
+        "compared": compared,
         "features": average(mixture.features, of_c(current.features), lam[..., None]),
     }
     return mixture.replace(**{name: _where(used, value, getattr(mixture, name)) for name, value in updated.items()})
@@ -99,14 +112,17 @@ def _where(used: Tensor, new: Tensor, old: Tensor) -> Tensor:
     return torch.where(used.view(*used.shape, *[1] * (old.dim() - 2)), new.to(old.dtype), old)
 
 
-def append(mixture: GaussianMixture, current: GaussianMixture, new: Tensor) -> tuple[GaussianMixture, Tensor]:
-    """Add first observations to the mixture, M_i <- M_(i-1) with G_c: m = 0, count = 1.
+def append(
+    mixture: GaussianMixture, current: GaussianMixture, new: Tensor, view: Tensor, config: UfMStarConfig
+) -> tuple[GaussianMixture, Tensor]:
+    """Add first observations to the mixture, M_i <- M_(i-1) with G_c: m = 0, no evidence.
 
     Occupied slots come first; the new components follow in increasing c. Their covariances must survive rounding to the
     mixture's dtype (``gaussian.storage_floor``).
 
     Args:
         new: [B, C] True where c is to be added.
+        view: [B, 4], see :func:`fuse`.
 
     Returns:
         The mixture [B, K] and the number of components per stream [B] without a free slot.
@@ -122,8 +138,11 @@ def append(mixture: GaussianMixture, current: GaussianMixture, new: Tensor) -> t
         return padded.scatter(1, index, value.to(old.dtype))[:, :capacity]
 
     placed = {name: scattered(old, getattr(current, name)) for name, old in mixture.tensors().items()}
-    placed["disagreement"] = scattered(mixture.disagreement, torch.zeros_like(current.disagreement))
-    placed["count"] = scattered(mixture.count, torch.ones_like(current.count))
+    zero = torch.zeros_like(current.weight)
+    placed["disagreement"], placed["evidence"] = (scattered(x, zero) for x in (mixture.disagreement, mixture.evidence))
+    placed["compared"] = scattered(mixture.compared, first_weight(current.weight, config))
+    first = torch.cat([view, torch.zeros_like(view[:, :1])], 1)
+    placed["view"] = scattered(mixture.view, first[:, None].expand(b, current.capacity, first.shape[1]))
     return GaussianMixture(**placed), (new & ~fits).sum(dim=1)
 
 

@@ -5,10 +5,12 @@ Every ``merge.every`` frames, two rules reduce the mixture; both are pure functi
 
 **Join.** Two components become one with their joint moments,
 
-    pi = pi_i + pi_j,   a = pi_i / pi,   mu = a mu_i + (1-a) mu_j,   m = a m_i + (1-a) m_j, features likewise,
+    pi = pi_i + pi_j,   a = pi_i / pi,   mu = a mu_i + (1-a) mu_j,   features likewise,
+    W = W_i + W_j,      m = (W_i m_i + W_j m_j) / W,                 n = n_i + n_j,
     Sigma = a Sigma_i + (1-a) Sigma_j + a (1-a) (mu_i - mu_j)(mu_i - mu_j)^T,
 
-which preserve the sums of pi, pi mu, pi (Sigma + mu mu^T) and pi m over the mixture. Runnalls (IEEE TAES 43, 2007)
+which preserve the sums of pi, pi mu, pi (Sigma + mu mu^T) and W m over the mixture (in the paper W = pi); the last view
+is that of the heavier component. Runnalls (IEEE TAES 43, 2007)
 bounds the Kullback-Leibler divergence of the reduced mixture from the original; per pixel of the lighter component, the
 bound is
 
@@ -17,8 +19,8 @@ bound is
 0 for equal components and KL(lighter || heavier) in the limit of a weightless lighter one. A pair within ``merge.loss``
 overlaps so much that the regression mixes the two anyway. In each round, pairs join that are mutually best.
 
-A component seen from two or more views does not join a heavier one that was seen from one view, because the unmeasured
-surface would then count as measured. The count is c = c_i + c_j - 1, which preserves the number of comparisons c - 1.
+A component with evidence does not join a heavier one without, because the unmeasured surface would then count as
+measured.
 
 **Dissolve.** A component's weight share at its own points, s_k = mean of w_k(x) over the cubature points
 mu_k +- sqrt(3) L_k e_i (L_k L_k^T = Sigma_k), falls as others are observed repeatedly. Removing it changes a regressed
@@ -88,7 +90,8 @@ class _MergeFrame(FrameExtension):
     def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
         """Merge the due streams, and count the components."""
         state = merged(state, self._frame.fault == 0, self._config)
-        counts = {"components": state.mixture.components, "single_view": (state.count == 1).sum(1)}
+        alone = state.mixture.valid & (state.evidence == 0)
+        counts = {"components": state.mixture.components, "single_view": alone.sum(1)}
         return state, replace(out, statistics=replace(out.statistics, **counts))
 
 
@@ -196,9 +199,9 @@ def _close_pairs(g: Components, fresh: Tensor, limit: float) -> tuple[Tensor, Te
         volume = _log_det(_joint(first, second)["covariance"]) - a * log_det[pair[0]] - b * log_det[pair[1]]
         loss = 0.5 * volume / torch.minimum(a, b)
         lighter_first = first["weight"] < second["weight"]
-        lighter = torch.where(lighter_first, first["count"], second["count"])
-        heavier = torch.where(lighter_first, second["count"], first["count"])
-        within = (loss <= limit) & ~((lighter > 1) & (heavier == 1))
+        lighter = torch.where(lighter_first, first["evidence"], second["evidence"])
+        heavier = torch.where(lighter_first, second["evidence"], first["evidence"])
+        within = (loss <= limit) & ~((lighter > 0) & (heavier == 0))
         found.append((pair[:, within], loss[within]))
     return torch.cat([pair for pair, _ in found], 1), torch.cat([loss for _, loss in found])
 
@@ -228,11 +231,13 @@ def _joint(g: Components, h: Components) -> Components:
 
     d = g["mean"] - h["mean"]
     between = (a * b)[:, None, None] * d[:, :, None] * d[:, None, :]
-    return {name: average(name) for name in ("mean", "disagreement", "features")} | {
+    compared = g["compared"] + h["compared"]
+    weighted = g["compared"] * g["disagreement"] + h["compared"] * h["disagreement"]
+    return {name: average(name) for name in ("mean", "features")} | {
         "covariance": average("covariance") + between,
-        "weight": g["weight"] + h["weight"],
-        "count": g["count"] + h["count"] - 1,
-        "sums": g["sums"] + h["sums"],
+        "disagreement": torch.where(compared > 0, weighted / compared, torch.zeros_like(weighted)),
+        "view": torch.where((a >= b)[:, None], g["view"], h["view"]),
+        **{name: g[name] + h[name] for name in ("weight", "compared", "evidence", "sums")},
     }
 
 
@@ -293,16 +298,16 @@ def dissolve(g: Components, config: UfMStarConfig) -> Components:
     split = share[enough] / rest[enough, None]
     goes = weak.nonzero().flatten()[enough]
 
-    w, values = g["weight"][:, None], torch.cat([g["disagreement"][:, None], g["features"]], -1)
-    gifts = torch.cat([w, w * values, g["sums"]], -1)[goes]
+    # Averages, each with its weight; the others are sums.
+    means = (("weight", "features"), ("compared", "disagreement"))
+    products = [g[w][:, None] * g[name].view(len(weak), -1) for w, name in means]
+    gifts = torch.cat([g["weight"][:, None], g["compared"][:, None], *products, g["sums"]], -1)[goes]
     gain = torch.stack([total(split * gift[:, None], 0) for gift in gifts.unbind(-1)], -1)
-    weight, more, learnt = gain.split([1, values.shape[1], g["sums"].shape[1]], -1)
-    values = torch.where(weight > 0, (w * values + more) / (w + weight), values)
-    after = g | {
-        "weight": g["weight"] + weight[:, 0],
-        "disagreement": values[:, 0],
-        "features": values[:, 1:],
-        "sums": g["sums"] + learnt,
-    }
+    weight, compared, *more, learnt = gain.split([1, 1, *(p.shape[1] for p in products), g["sums"].shape[1]], -1)
+    after = g | {"sums": g["sums"] + learnt}
+    for (w, name), gained, product, added in zip(means, (weight, compared), products, more, strict=True):
+        after[w] = g[w] + gained[:, 0]
+        mean = (product + added) / after[w].clamp_min(torch.finfo(gain.dtype).tiny)[:, None]
+        after[name] = torch.where(gained > 0, mean, g[name].view(mean.shape)).view(g[name].shape)
     remains = torch.ones_like(weak).index_fill(0, goes, False)
     return {name: value[remains] for name, value in after.items()}

@@ -20,8 +20,11 @@ class GaussianMixture:
         mean: [B, K, 3] mu_X [m], in the frame that the variable's name states (``mixture_cam``: the camera's).
         covariance: [B, K, 3, 3] Sigma_XX [m^2], symmetric.
         weight: [B, K] pi, the number of pixels observed so far [px]; 0 = empty slot.
-        disagreement: [B, K] m, the running squared 2-Wasserstein distance [m^2].
-        count: [B, K] number of observations fused into the component (1 when appended), int64.
+        disagreement: [B, K] m, the mean squared 2-Wasserstein distance of the comparisons that counted [m^2].
+        compared: [B, K] weight of m, the sum of w pi_c over these comparisons (``views``) [px].
+        evidence: [B, K] n, the sum of w over the views that were compared; 0 = seen in a single view.
+        view: [B, K, 5] the reference view (``views``): the camera's centre in the first camera's frame [m], the index
+            of the network, and the largest change q of the view since.
         features: [B, K, F] further entries of H, running averages in the caller's units.
     """
 
@@ -29,7 +32,9 @@ class GaussianMixture:
     covariance: Tensor
     weight: Tensor
     disagreement: Tensor
-    count: Tensor
+    compared: Tensor
+    evidence: Tensor
+    view: Tensor
     features: Tensor
 
     @classmethod
@@ -41,8 +46,7 @@ class GaussianMixture:
         def zeros(*shape: int) -> Tensor:
             return torch.zeros(streams, capacity, *shape, dtype=dtype, device=device)
 
-        count = torch.zeros(streams, capacity, dtype=torch.int64, device=device)
-        return cls(zeros(3), zeros(3, 3), zeros(), zeros(), count, zeros(features))
+        return cls(zeros(3), zeros(3, 3), zeros(), zeros(), zeros(), zeros(), zeros(5), zeros(features))
 
     @property
     def streams(self) -> int:
@@ -77,15 +81,14 @@ class GaussianMixture:
         return GaussianMixture(**{**self.tensors(), **changes})
 
     def to(self, *args: Any, **kwargs: Any) -> GaussianMixture:
-        """``Tensor.to`` on every field; ``count`` keeps its integer type."""
-        moved = {name: value.to(*args, **kwargs) for name, value in self.tensors().items()}
-        moved["count"] = moved["count"].to(torch.int64)
-        return GaussianMixture(**moved)
+        """``Tensor.to`` on every field."""
+        return GaussianMixture(**{name: value.to(*args, **kwargs) for name, value in self.tensors().items()})
 
     def rigid(self, R: Tensor, t: Tensor) -> GaussianMixture:
         """The mixture in another frame (section "Projection to the Image Plane", step 1).
 
-        mu <- R mu + t, Sigma <- R Sigma R^T; empty slots stay zero.
+        mu <- R mu + t, Sigma <- R Sigma R^T; empty slots stay zero. ``view`` stays in the frame of the mixture's first
+        camera.
 
         Args:
             R: [B, 3, 3] rotation from the current frame into the new one.
@@ -117,7 +120,10 @@ class GaussianMixture:
 
     def __post_init__(self) -> None:
         slots = b, k = self.weight.shape
-        expected = {"mean": (b, k, 3), "covariance": (b, k, 3, 3), "disagreement": slots, "count": slots}
+        expected = {
+            "mean": (b, k, 3), "covariance": (b, k, 3, 3), "disagreement": slots, "compared": slots,
+            "evidence": slots, "view": (b, k, 5),
+        }  # fmt: skip
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} must have shape {tuple(shape)}, got {tuple(getattr(self, name).shape)}")

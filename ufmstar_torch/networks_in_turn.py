@@ -17,6 +17,8 @@ from torch import Tensor, nn
 
 from ufmstar_torch.prediction import DepthPrediction, infer, stated_range, states_confidence
 
+# Number of indices of random samples: exact in float32.
+SAMPLES = 2**20
 _PART = 2**16  # [bytes] of a file's beginning and end
 # image [B, 3, H, W], intrinsics [B, 3, 3] -> network image and the intrinsics of that image
 Preprocess = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -30,7 +32,8 @@ class NetworksInTurn(nn.Module):
 
     Args:
         networks: one network or a sequence of them. Each maps an image [B, 3, H, W] to a :class:`DepthPrediction`. A
-            network with an attribute ``takes_intrinsics = True`` is also passed the intrinsics of that image.
+            network with an attribute ``takes_intrinsics = True`` is also passed the intrinsics of that image. One with
+            an attribute ``stochastic = True`` predicts a random sample, another one for every image.
         samples: number of passes of a single stochastic network that :meth:`every` combines; None: one pass of each
             network.
         preprocess: maps image and intrinsics to the networks' input; None = no preprocessing.
@@ -71,6 +74,11 @@ class NetworksInTurn(nn.Module):
     def passes(self) -> int:
         """Number of inferences in :meth:`every`."""
         return len(self.networks) if self.samples is None else self.samples
+
+    @property
+    def stochastic(self) -> bool:
+        """True for a single network that predicts random samples."""
+        return len(self.networks) == 1 and bool(getattr(self.networks[0], "stochastic", False))
 
     def turn(self, images: int) -> int:
         """Index of the member that runs after ``images`` images; both start at 0."""

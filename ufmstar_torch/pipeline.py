@@ -17,7 +17,9 @@ from ufmstar_torch.anchors.pose_check import PoseCheck
 from ufmstar_torch.anchors.streams import SourceLike, StreamLandmarks
 from ufmstar_torch.arguments import Array, CameraLike, ImageLike, as_image, as_intrinsics, as_pose, as_tensor
 from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
+from ufmstar_torch.image_check import ImageCheck
 from ufmstar_torch.networks_in_turn import (
+    SAMPLES,
     NetworksInTurn,
     Preprocess,
     in_unit_range,
@@ -103,7 +105,8 @@ class UncertainDepth(NetworksInTurn):
 
     Args:
         networks: one network or a sequence of them (an ensemble's members; BatchEnsemble members as separate
-            callables); None: pass predictions to :meth:`update`. Each network maps an image [B, 3, H, W] to a
+            callables); None: pass predictions to :meth:`update`. A network whose attribute ``stochastic`` is True
+            predicts another random sample for every image. Each network maps an image [B, 3, H, W] to a
             :class:`DepthPrediction`; one with an attribute ``takes_intrinsics = True`` is called as ``network(x, K)``
             with K [B, 3, 3] [px] of ``x``. ``ufmstar_torch.UncertainDepth`` also accepts everything that
             ``ufmstar_torch.models.wrap_network`` accepts without further declarations: metric depth is assumed.
@@ -190,6 +193,7 @@ class UncertainDepth(NetworksInTurn):
         if not isinstance(check_poses, int) or check_poses < 0:
             raise ValueError(f"check_poses must be a number of images of at least 0, got {check_poses!r}")
         self._pose_check = PoseCheck(0 if searching else check_poses, self.ufm.config.rotation_tolerance)
+        self._image_check = ImageCheck()
         self.mode = mode
         self.multiview_device = None if multiview_device is None else torch.device(multiview_device)
         self.register_buffer("image_index", torch.zeros((), dtype=torch.int64))
@@ -424,6 +428,8 @@ class UncertainDepth(NetworksInTurn):
         with torch.no_grad():
             x, K = self.prepare(picture, K_image.expand(len(picture), 3, 3))
             prediction = self.every(x, K) if member is None else self.member(x, K, member)
+        index = (self._next + ahead) % SAMPLES if self.stochastic else member or 0
+        prediction = replace(prediction, member=index, informative=self._image_check.informative(picture, T))
         tensors = {name: value for name, value in vars(prediction).items() if isinstance(value, Tensor)}
         if features is not None:
             tensors["features"] = as_tensor("features", features)
@@ -455,6 +461,7 @@ class UncertainDepth(NetworksInTurn):
             self.landmarks.reset(chosen)
         if chosen is None:
             self._count(0)
+        self._image_check.reset(chosen)
         if chosen is None or 0 in chosen:
             self._pose_check.reset()
 
@@ -525,11 +532,14 @@ def _without_weights(module: nn.Module, state_dict: dict[str, Any], prefix: str,
 
 
 def maps_of(prediction: DepthPrediction, ufm: UfMStar) -> dict[str, Any]:
-    """The arguments of :meth:`UfMStar.forward` from a prediction: depth, A, E, and the confidence if used."""
+    """The arguments of :meth:`UfMStar.forward` from a prediction: depth, A, E, the network's index, whether the image
+    shows something, and the confidence if used."""
     maps = {
         "depth": prediction.depth,
         "aleatoric": prediction.aleatoric_variance,
         "epistemic": prediction.epistemic_variance,
+        "member": prediction.member,
+        "informative": prediction.informative,
     }
     return maps | ({"confidence": prediction.confidence} if ufm.takes("confidence") else {})
 

@@ -26,6 +26,8 @@ class DepthPrediction:
             learnt from anchors (``ufmstar_torch.confidence``).
         intrinsics: [B, 3, 3] of the depth map [px]; None = those of the network's input.
         ms: total time of the inferences [ms]; None = not measured.
+        member: index of the network, or of the random sample, that predicted; 0 for a mean of all.
+        informative: [B] bool, False where the image shows nothing, so that the depth is a guess; None = all True.
 
     Raises:
         TypeError: a map is neither a tensor nor an array.
@@ -38,6 +40,8 @@ class DepthPrediction:
     confidence: Tensor | None = None
     intrinsics: Tensor | None = None
     ms: float | None = None
+    member: int = 0
+    informative: Tensor | None = None
 
     def __post_init__(self) -> None:
         for name in ("depth", *_OPTIONAL):
@@ -57,7 +61,10 @@ class DepthPrediction:
     def to(self, to: torch.device | torch.dtype) -> DepthPrediction:
         """A copy with the maps on a device, or of a dtype; the intrinsics are unchanged."""
         maps = {name: value.to(to) for name in ("depth", *_OPTIONAL) if (value := getattr(self, name)) is not None}
-        return replace(self, **maps)
+        informative = self.informative
+        if informative is not None and isinstance(to, torch.device):
+            informative = informative.to(to)
+        return replace(self, **maps, informative=informative)
 
     @property
     def size(self) -> tuple[int, int]:

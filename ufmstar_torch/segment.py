@@ -86,14 +86,9 @@ def _mixture(g: Gaussian, labels: Tensor, inputs: SegmentInput) -> GaussianMixtu
     features = n.new_zeros(*n.shape, 0)
     if inputs.features is not None:
         features = _feature_means(inputs.features.to(n.dtype), labels, n)
-    return GaussianMixture(
-        mean=g.mean.to(inputs.depth.dtype),
-        covariance=full.to(inputs.depth.dtype),
-        weight=n.to(inputs.depth.dtype),
-        disagreement=torch.zeros_like(n, dtype=inputs.depth.dtype),
-        count=(n > 0).to(torch.int64),
-        features=features.to(inputs.depth.dtype),
-    )
+    empty = GaussianMixture.empty(*n.shape, dtype=inputs.depth.dtype, device=n.device)
+    fields = {"mean": g.mean, "covariance": full, "weight": n, "features": features}
+    return empty.replace(**{name: value.to(inputs.depth.dtype) for name, value in fields.items()})
 
 
 def _feature_means(features: Tensor, labels: Tensor, n: Tensor) -> Tensor:

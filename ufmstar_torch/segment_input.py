@@ -6,6 +6,7 @@ import functools
 import math
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from ufmstar_torch.config import SPGFConfig, UfMStarConfig
@@ -42,8 +43,12 @@ class SegmentInput:
 
     @classmethod
     def of_frame(cls, frame: FrameInput, config: UfMStarConfig) -> SegmentInput:
-        """The input of step 2 from a checked frame, whose depth is 0 at invalid pixels."""
-        return cls.of(frame.depth, frame.intrinsics, config.segment, frame.features)
+        """The input of step 2 from a checked frame, whose depth is 0 at invalid pixels; nothing of an image that shows
+        nothing."""
+        depth = frame.depth
+        if frame.informative is not None:
+            depth = torch.where(frame.informative[:, None, None], depth, torch.zeros_like(depth))
+        return cls.of(depth, frame.intrinsics, config.segment, frame.features)
 
     @property
     def segments_per_row(self) -> int:

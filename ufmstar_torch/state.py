@@ -19,8 +19,8 @@ class UfMStarState:
     """The state of B streams. The tensors' names are the keys of a saved state (``UfMStar.state_dict``).
 
     Attributes:
-        mean, covariance, weight, disagreement, count, features: M_i (:class:`GaussianMixture`) in the frame of each
-            stream's first camera.
+        mean, covariance, weight, disagreement, compared, evidence, view, features: M_i (:class:`GaussianMixture`) in
+            the frame of each stream's first camera.
         T_world_first: [B, 4, 4] float64 pose of that camera; identity before the first frame.
         started: [B] bool, True after the first frame of a stream.
         frames: [B] int64 number of frames used.
@@ -35,7 +35,9 @@ class UfMStarState:
     covariance: Tensor
     weight: Tensor
     disagreement: Tensor
-    count: Tensor
+    compared: Tensor
+    evidence: Tensor
+    view: Tensor
     features: Tensor
     T_world_first: Tensor
     started: Tensor
@@ -66,7 +68,7 @@ class UfMStarState:
     @property
     def mixture(self) -> GaussianMixture:
         """M_i, [B, K]."""
-        return GaussianMixture(self.mean, self.covariance, self.weight, self.disagreement, self.count, self.features)
+        return GaussianMixture(**{f.name: getattr(self, f.name) for f in fields(GaussianMixture)})
 
     def require(self, config: UfMStarConfig, like: UfMStarState) -> None:
         """Check tensors from outside, for example a checkpoint, before they are used.
@@ -84,7 +86,8 @@ class UfMStarState:
         b, k = self.weight.shape
         image = tuple(self.smoothed.shape[1:]) if self.smoothed.dim() == 3 else ("H", "W")
         shapes = {
-            "mean": (b, k, 3), "covariance": (b, k, 3, 3), "disagreement": (b, k), "count": (b, k),
+            "mean": (b, k, 3), "covariance": (b, k, 3, 3), "disagreement": (b, k), "compared": (b, k),
+            "evidence": (b, k), "view": (b, k, 5),
             "features": (b, k, config.entries), "T_world_first": (b, 4, 4), "started": (b,), "frames": (b,),
             "skipped": (b,), "smoothed": (b, *image),
             **{name: (b, k, *value.shape[2:]) for name, value in like.by_component.items()},
@@ -101,7 +104,7 @@ class UfMStarState:
         for name, value in self.tensors().items():
             if not bool((value.isfinite() | value.isnan() if name == "smoothed" else value.isfinite()).all()):
                 raise ValueError(f"{name} holds NaN or infinity")
-        for name in ("weight", "disagreement", "count", "frames", "skipped", "smoothed"):
+        for name in ("weight", "disagreement", "compared", "evidence", "frames", "skipped", "smoothed"):
             if bool((getattr(self, name) < 0).any()):
                 raise ValueError(f"{name} holds negative values")
         occupied = self.weight > 0

@@ -96,21 +96,24 @@ def step(
     current_first = current_cam.rigid(*relative_pose(frame.T_world_cam, first))
     needed, rounds = _room(mixture, pairs, new, config, grow)
     mixture = mixture.grown(needed, config.max_components)
-    mixture = kernels.fuse(mixture, current_first, pairs.padded(mixture.capacity), config, rounds=rounds)
+    centre = relative_pose(frame.T_world_cam, first)[1]
+    member = torch.zeros_like(centre[:, 0]) if frame.member is None else frame.member
+    view = torch.cat([centre, member[:, None]], 1)
+    mixture = kernels.fuse(mixture, current_first, pairs.padded(mixture.capacity), view, config, rounds=rounds)
     stage("fuse")
 
     sums, limit, gone = dict(state.by_component), config.max_components, torch.zeros_like(state.frames)
     if limit is not None and needed >= limit:
-        position = relative_pose(frame.T_world_cam, first)[1]
-        mixture, sums, _, gone = fuse.make_room(mixture, sums, mixture.components, new.sum(1), position, limit)
-    mixture, dropped = fuse.append(mixture, current_first, new)
+        mixture, sums, _, gone = fuse.make_room(mixture, sums, mixture.components, new.sum(1), centre, limit)
+    mixture, dropped = fuse.append(mixture, current_first, new, view, config)
     mixture_cam = mixture.to(torch.float64).rigid(R_cam, t_cam)
     changed, mixture_cam = extensions.before_regression({**state.by_stream, **sums}, mixture_cam, regress.distribute)
     mixture_cam = unmeasured.before_regression(mixture_cam)
     stage("append")
 
     result = kernels.regress_image(mixture_cam, frame.depth, frame.intrinsics, frame.valid, config, pixels)
-    result, measured = unmeasured.after_regression(result, regress.at_pixels(frame.depth, pixels), config)
+    at_pixels = regress.at_pixels(frame.depth, pixels)
+    result, measured = unmeasured.after_regression(result, at_pixels, config, frame.informative)
     result = extensions.after_regression(result)
     stage("regress")
 
@@ -123,7 +126,7 @@ def step(
         "dropped": gone + dropped + (current_cam.valid & ~far_enough).sum(1),
         "valid_pixels": frame.valid.sum((1, 2)),
         "unmeasured": (measured < unmeasured.HALF).flatten(1).sum(1),
-        "single_view": (mixture.count == 1).sum(1),
+        "single_view": (mixture.valid & (mixture.evidence == 0)).sum(1),
     }
     disagreement, smoothed = result.disagreement, state.smoothed
     if smooth and config.ema_alpha < 1.0:

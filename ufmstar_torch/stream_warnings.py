@@ -18,6 +18,8 @@ from ufmstar_torch.output import FrameStatistics
 # Least frames and components before a warning about views, and the largest share of components seen in only one view.
 # On rendered tours, also at 1/10 of their frames, correct input stays below .7; poses in millimetres reach .99.
 _FRAMES, _COMPONENTS, _ALONE = 8, 20, 0.9
+# Path of the camera over the mean depth from which on views must differ: ten times the default ``view_baseline``.
+_TRAVELLED = 0.7
 # Anchors: least frames in which the camera moved by this share of the depth; warn below one used anchor per such frame.
 _MOVED_FRAMES, _MOVED = 10, 0.01
 # Largest share of pixels outside the accepted ranges, and largest standard deviation of most pixels over their depth.
@@ -57,6 +59,7 @@ class _Track:
     anchored_at: list[float]  # camera position in the last of the ``moving`` frames
     moving: int = 0  # frames with anchors in which the camera had moved
     used: int = 0  # anchors used in these frames
+    travelled: float = 0.0  # path, each step over the mean depth
     steps: int = 0  # changes of the pose
     largest: float = 0.0  # longest step [m]
     before: list[float] | None = None  # position before the last one
@@ -92,6 +95,7 @@ class _Track:
                 text = f"the pose is exactly the first one again, {self.steps} poses later. Another recording begins "
                 yield "again", text + "with reset()"
             self.steps, self.largest = self.steps + 1, max(self.largest, step)
+            self.travelled += step / _mean(depth, total)
         self.before = _position(self.T)
         self.T, self.focal, self.total = T, focal, total
 
@@ -176,8 +180,8 @@ class StreamWarnings:
         for b, kind, text in (
             *_left_out(frame, statistics, frames, config),
             *(_spreads(frame) if self._calls % EVERY in (0, 1) else ()),
-            *_alone(statistics, frames),
             *self._tracked(frame, statistics),
+            *self._alone(statistics, frames),
         ):
             if (b, kind) not in self._logged:
                 self._logged.add((b, kind))
@@ -202,6 +206,14 @@ class StreamWarnings:
                 yield from ((b, *warning) for warning in track.follow(T, focal, rows[b], sums[b]))
             if used is not None and (text := track.anchored(used[b], _mean(rows[b], sums[b]))):
                 yield b, "anchors", text
+
+    def _alone(self, statistics: FrameStatistics, frames: Tensor) -> Iterator[tuple[int, str, str]]:
+        """A warning if nearly all components were seen in one view although the camera has moved far enough."""
+        counts = (value.tolist() for value in (statistics.single_view, statistics.components, frames))
+        for b, each in enumerate(zip(*counts, strict=True)):
+            track = self._tracks.get(b)
+            if track is not None and track.travelled > _TRAVELLED and (text := hardly_compared(*each)):
+                yield b, "views", text
 
     def _one_video(self, poses: list[list[list[float]]]) -> Iterator[tuple[int, str, str]]:
         """A warning if the first stream of each batch continues the last stream of the previous batch."""
@@ -228,7 +240,8 @@ def _left_out(
         unstated = 0 if config.segment.max_depth is not None else beyond
         parted = f"of {positive} pixels {beyond} lie beyond segment.max_depth = {config.segment.depth_limit} m and "
         parted += f"{outside} outside the accepted ranges. "
-        if positive and not segments and not fault:
+        shows = frame.informative is None or bool(frame.informative[b])
+        if positive and not segments and not fault and shows:
             text = f"a frame has no segment, so nothing is compared between views: {parted}"
             yield b, "segments", text + "Is the depth in metres, smooth, and the intrinsics the depth map's?"
         elif max(outside, unstated) > _OUTSIDE * positive:
@@ -275,8 +288,3 @@ def hardly_compared(alone: int, components: int, frames: int) -> str:
     return text + f"compared between views. {_CAUSES}, or views that do not overlap"
 
 
-def _alone(statistics: FrameStatistics, frames: Tensor) -> Iterator[tuple[int, str, str]]:
-    counts = (value.tolist() for value in (statistics.single_view, statistics.components, frames))
-    for b, each in enumerate(zip(*counts, strict=True)):
-        if text := hardly_compared(*each):
-            yield b, "views", text

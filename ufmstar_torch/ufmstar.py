@@ -95,6 +95,8 @@ class UfMStar(StatefulModule):
         valid: Array | None = None,
         *,
         features: Array | None = None,
+        member: int | Tensor = 0,
+        informative: Tensor | None = None,
         **inputs: Any,
     ) -> UfMStarOutput:
         """Process one predicted depth map per stream and return its variance.
@@ -113,6 +115,10 @@ class UfMStar(StatefulModule):
             epistemic: likewise E [m^2].
             valid: like ``depth``, bool, True = use.
             features: [B, F, H, W] with F = ``config.features``, averaged per component and regressed; of at most 1e12.
+            member: index of the network, or of the random sample, that predicted, for all streams or [B]: views of one
+                network from one place show nothing (``views``), those of two networks do.
+            informative: [B] bool, False where the image shows nothing (black, covered, frozen): the depth is a guess,
+                which is neither fused nor measured. None = all True.
             **inputs: inputs of extensions, by the name of the extension's section in the config; None = no input.
 
         Raises:
@@ -123,7 +129,7 @@ class UfMStar(StatefulModule):
         """
         depth = as_tensor("depth", depth)
         a, e = (None if v is None else as_tensor(n, v) for n, v in (("aleatoric", aleatoric), ("epistemic", epistemic)))
-        frame = self._checked(depth, pose, intrinsics, a, e, valid, features)
+        frame = self._checked(depth, pose, intrinsics, a, e, valid, features, member, informative)
         out, maps = self._observe(frame, inputs)
         originals: dict[str, Any] = {"epistemic": e} if self.config.aleatoric_in_h else {"aleatoric": a, "epistemic": e}
 
@@ -154,6 +160,8 @@ class UfMStar(StatefulModule):
         valid: Array | None = None,
         *,
         features: Array | None = None,
+        member: int | Tensor = 0,
+        informative: Tensor | None = None,
         pixels: int | None = None,
         fraction: float | None = None,
         seed: int = 0,
@@ -174,7 +182,7 @@ class UfMStar(StatefulModule):
             ValueError: both ``pixels`` and ``fraction``, or one out of range; and as :meth:`forward`.
         """
         depth = as_tensor("depth", depth)
-        frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
+        frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features, member, informative)
         index, used = sample_pixels(frame.valid, sample_size(frame.size, pixels, fraction), seed)
         out, maps = self._observe(frame, inputs, index, average=average)
         return mean_uncertainty(out, maps | {"depth": torch.gather(frame.depth.flatten(1), 1, index)}, used)
@@ -267,13 +275,16 @@ class UfMStar(StatefulModule):
         if state["weight"].device.type != "meta":
             self._extensions.require_state(state)
 
-    def _checked(self, depth: Tensor, pose: CameraLike, intrinsics: CameraLike, *optional: Array | None) -> FrameInput:
-        aleatoric, epistemic, valid, features = optional
+    def _checked(
+        self, depth: Tensor, pose: CameraLike, intrinsics: CameraLike, aleatoric: Array | None,
+        epistemic: Array | None, valid: Array | None, features: Array | None, member: int | Tensor,
+        informative: Tensor | None,
+    ) -> FrameInput:  # fmt: skip
         return check_frame(
             depth, pose, intrinsics, aleatoric, epistemic, valid, features,
             feature_count=self.config.features, aleatoric_in_h=self.config.aleatoric_in_h,
             rotation_tolerance=self.config.rotation_tolerance, max_depth=self.config.segment.depth_limit,
-            kernel=self._kernels(depth.device.type)[1],
+            member=member, informative=informative, kernel=self._kernels(depth.device.type)[1],
         )  # fmt: skip
 
     def _observe(

@@ -3,9 +3,10 @@
 A surface seen from one view has m = 0 because nothing was compared. Far from all components, M is the prior's mean. In
 the paper both count as certain. The share of a pixel's M that rests on surfaces seen from two or more views,
 
-    s(x) = sum of w_k(x) over the components with a count above 1,
+    s(x) = sum of w_k(x) (1 - exp(-n_k))  with the evidence n_k (``views``),
 
-is regressed as an additional feature. A pixel counts as measured where s is at least one half.
+is regressed as an additional feature. It is 0 for an image that shows nothing (``FrameInput.informative``). A pixel
+counts as measured where s is at least one half.
 """
 
 from __future__ import annotations
@@ -18,28 +19,34 @@ from torch import Tensor
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import Regression
+from ufmstar_torch.views import measured_share
 
 HALF = 0.5
 
 
 def before_regression(mixture: GaussianMixture) -> GaussianMixture:
-    """The mixture [B, K] with an additional feature, 1 for components seen from two or more views, else 0."""
-    compared = (mixture.count > 1).to(mixture.features.dtype)
-    return mixture.replace(features=torch.cat([mixture.features, compared[..., None]], dim=-1))
+    """The mixture [B, K] with an additional feature, the share 1 - exp(-n) to which a component is measured."""
+    share = measured_share(mixture.evidence).to(mixture.features.dtype)
+    return mixture.replace(features=torch.cat([mixture.features, share[..., None]], dim=-1))
 
 
-def after_regression(result: Regression, depth: Tensor | None, config: UfMStarConfig) -> tuple[Regression, Tensor]:
+def after_regression(
+    result: Regression, depth: Tensor | None, config: UfMStarConfig, informative: Tensor | None = None
+) -> tuple[Regression, Tensor]:
     """Separate the share s from the regressed features, and set M where it was not measured.
 
     Args:
         result: of the mixture of :func:`before_regression`.
         depth: of the same pixels [m]; None = points without a depth, for which "relative" acts as "nan".
         config: of UfM*.
+        informative: [B] False for the streams whose image shows nothing; None = all True.
 
     Returns:
         The regression without the share, and s, NaN where not valid.
     """
     measured = result.features[..., -1]
+    if informative is not None:
+        measured = measured * informative.view(-1, *[1] * (measured.dim() - 1)).to(measured.dtype)
     disagreement = result.disagreement
     if config.unmeasured == "nan" or (config.unmeasured == "relative" and depth is None):
         disagreement = torch.where(measured < HALF, torch.nan, disagreement)

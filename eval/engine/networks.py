@@ -55,6 +55,7 @@ class NetworkSource(DepthSource):
         self.networks = cast("tuple[DepthNetwork, ...]", tuple(self._turns.networks))
         self.max_depth, self.passes = self._turns.max_depth, self._turns.passes
         self.states_confidence = self._turns.states_confidence
+        self.stochastic = len(self.networks) == 1 and bool(stochastic(networks.networks))
         self._device, self._precision = device, precision
         self._generator = torch.Generator(device)
         self._inputs: WeakKeyDictionary[Frame, tuple[Tensor, Tensor]] = WeakKeyDictionary()

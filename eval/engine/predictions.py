@@ -7,17 +7,22 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ufmstar_torch.array_files import read_npz_whole
 from ufmstar_torch.atomic import write_atomic
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
+from ufmstar_torch.eval.sequences.images import image_tensor
+from ufmstar_torch.image_check import reduced, shows_something
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.networks_in_turn import combine
+from ufmstar_torch.networks_in_turn import SAMPLES, combine
 from ufmstar_torch.prediction import DepthPrediction
 
 _SHOWN = 16  # hex digits of a digest in the name of a folder: 64 bits
@@ -42,11 +47,12 @@ class DepthSource(ABC):
         passes: number of inferences of all members (or samples).
         max_depth: [m] the largest depth that its networks can predict; None = unknown.
         states_confidence: True if its networks predict a confidence.
+        stochastic: True if it predicts another random sample for every image.
         needs_image: True if it predicts from the image, False if it reads a depth map.
         is_truth: True if it is the sequence's depth, which has no error.
     """
 
-    needs_image = is_truth = states_confidence = False
+    needs_image = is_truth = states_confidence = stochastic = False
     networks: tuple[DepthNetwork, ...] = ()
     passes = 1
     max_depth: float | None = None
@@ -157,8 +163,17 @@ class FramePredictions:
             prediction = combine(parts) if combined else parts[0]
             if store is not None:
                 store.store(path, self._content, prediction)
+        index = 0 if combined else self.frame.index % SAMPLES if source.stochastic else int(member)
+        prediction = replace(prediction, member=index, informative=self._informative)
         self._cached[key] = prediction
         return prediction
+
+    @cached_property
+    def _informative(self) -> Tensor | None:
+        """[1] whether the frame's image shows something; None without an image."""
+        if self.frame.image is None:
+            return None
+        return shows_something(reduced(image_tensor(self.frame))).to(self._device)
 
     def _inference(self, source: DepthSource, n: int) -> DepthPrediction:
         """Member (or sample) n, computed once for all rows."""

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
+from ufmstar_torch.views import COMPLETE
 
 _SWEEPS = 12  # an upper bound: the loops end when a sweep no longer rotates
 _NEGLIGIBLE = 16 * np.finfo(np.float64).eps
@@ -162,16 +163,45 @@ def lift(mean, covariance, weight, near, focal, widening, epsilon):
 
 
 @leaf
+def view_weight(mean, reference, view, baseline, near):
+    """w of a comparison of a component with a new view (``ufmstar_torch.views``); ``baseline`` 0 = the paper's 1."""
+    if baseline == 0 or reference[3] != view[3]:
+        return 1.0
+    moved = reach = 0.0
+    for i in range(3):
+        moved += (view[i] - reference[i]) ** 2
+        reach += (mean[i] - view[i]) ** 2
+    change = -math.expm1(-moved / (max(reach, near * near) * (baseline * baseline)))
+    return max(change - reference[4], 0.0)
+
+
+@leaf
 def fuse_pairs(
-    mean, covariance, weight, disagreement, count, features,
-    mean_c, cov_c, weight_c, features_c, pair_c, pair_k, overlap, distance, weighted, epsilon, work,
+    mean, covariance, weight, disagreement, compared, evidence, views, features,
+    mean_c, cov_c, weight_c, features_c, pair_c, pair_k, overlap, distance, view, settings, w, work,
 ):  # fmt: skip
     """Fuse the pairs [P] of one stream in their order, in place.
 
     After each pair the values are rounded to the dtype of the state. A ``distance`` [P] that is not empty replaces
-    W2^2. With ``weighted``, pi_c is multiplied by the overlap [P].
+    W2^2. With ``weighted``, pi_c is multiplied by the overlap [P]. ``view`` [4]: see ``ufmstar_torch.fuse.fuse``;
+    ``w`` [K] is written.
     """
+    weighted, epsilon, baseline, near = settings
     mean_k, cov_k = work[6, 1], work[7]
+    for p in range(pair_k.size):
+        w[pair_k[p]] = -1.0
+    for p in range(pair_k.size):
+        k = pair_k[p]
+        if w[k] < 0:
+            w[k] = view_weight(mean[k], views[k], view, baseline, near)
+            if w[k] > 0:
+                evidence[k] = np.float64(evidence[k]) + w[k]
+                change = np.float64(views[k, 4]) + w[k]
+                if change >= COMPLETE:
+                    for i in range(4):
+                        views[k, i] = view[i]
+                    change = 0.0
+                views[k, 4] = change
     for p in range(pair_c.size):
         c, k = pair_c[p], pair_k[p]
         pi_k = np.float64(weight[k])
@@ -190,16 +220,23 @@ def fuse_pairs(
             for j in range(3):
                 covariance[k, i, j] = cov_k[i, j]
         weight[k] = pi_k + pi_c
-        disagreement[k] = (1 - lam) * np.float64(disagreement[k]) + lam * squared
+        if w[k] > 0:
+            added = w[k] * pi_c
+            total = np.float64(compared[k]) + added
+            rho = added / total
+            disagreement[k] = (1 - rho) * np.float64(disagreement[k]) + rho * squared
+            compared[k] = total
         for g in range(features.shape[1]):
             features[k, g] = (1 - lam) * np.float64(features[k, g]) + lam * features_c[c, g]
-        count[k] += 1
 
 
 @leaf
-def append(mean, covariance, weight, disagreement, count, features, mean_c, cov_c, weight_c, features_c, new, occupied):
+def append(
+    mean, covariance, weight, disagreement, compared, evidence, views, features,
+    mean_c, cov_c, weight_c, features_c, new, occupied, view, baseline,
+):  # fmt: skip
     """Append the components c where ``new`` [C] from slot ``occupied`` on, in place, until the slots are full; return
-    the number of slots in use."""
+    the number of slots in use. ``view``, ``baseline``: as :func:`fuse_pairs`."""
     slot = occupied
     for c in range(weight_c.size):
         if not new[c] or slot == weight.size:
@@ -210,6 +247,10 @@ def append(mean, covariance, weight, disagreement, count, features, mean_c, cov_
                 covariance[slot, i, j] = cov_c[c, i, j]
         for g in range(features.shape[1]):
             features[slot, g] = features_c[c, g]
-        weight[slot], disagreement[slot], count[slot] = weight_c[c], 0.0, 1
+        weight[slot], disagreement[slot], evidence[slot] = weight_c[c], 0.0, 0.0
+        compared[slot] = weight_c[c] if baseline == 0 else 0.0
+        for i in range(4):
+            views[slot, i] = view[i]
+        views[slot, 4] = 0.0
         slot += 1
     return slot

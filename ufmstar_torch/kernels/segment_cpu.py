@@ -84,13 +84,14 @@ def gaussians(inputs: SegmentInput) -> tuple[GaussianMixture, Callable[[], Tenso
     dtype = z.dtype
     k = max(1, *(retained.size for retained, *_ in joined))
     mean, covariance = np.zeros((streams, k, 3), dtype), np.zeros((streams, k, 3, 3), dtype)
-    weight, count = np.zeros((streams, k), dtype), np.zeros((streams, k), np.int64)
+    weight = np.zeros((streams, k), dtype)
     for b, fit in enumerate(joined):
-        write_gaussians(*fit[:3], mean[b], covariance[b], weight[b], count[b])
+        write_gaussians(*fit[:3], mean[b], covariance[b], weight[b])
     features = np.empty((streams, k, 0), dtype)
     if inputs.features is not None:
         features = _feature_means(array(inputs.features), labels().numpy(), weight)
-    fields = (mean, covariance, weight, np.zeros((streams, k), dtype), count, features)
+    not_compared = *(np.zeros((streams, k), dtype) for _ in range(3)), np.zeros((streams, k, 5), dtype)
+    fields = (mean, covariance, weight, *not_compared, features)
     return GaussianMixture(*map(torch.from_numpy, fields)), labels
 
 

@@ -230,12 +230,12 @@ def _prune(whole, created, limits, emitted, retained, position):
 
 
 @kernel
-def write_gaussians(retained, gaussians, whole, mean, covariance, weight, count):
+def write_gaussians(retained, gaussians, whole, mean, covariance, weight):
     """Write the retained Gaussians to the mixture's slots; a single pixel has no sample covariance (zeros)."""
     for i in range(retained.size):
         g = gaussians[retained[i]]
         n = whole[retained[i], N]
-        weight[i], count[i] = n, 1
+        weight[i] = n
         scatter = 0
         for r in range(3):
             mean[i, r] = g[_M + r]

@@ -99,6 +99,8 @@ def step(
 
     result = regress_maps(joined.seen, frame.depth, frame.intrinsics, config, pixels, views, shift)
     measured, disagreement = result.features[..., -1], result.disagreement
+    if frame.informative is not None:
+        measured = measured * frame.informative.view(-1, *[1] * (measured.dim() - 1)).to(measured.dtype)
     result = extensions.after_regression(replace(result, features=result.features[..., :-1]))
     stage("regress")
 
@@ -172,11 +174,14 @@ def _join(
     while capacity < needed:
         capacity *= 2
     updated = tuple(_extended(value, capacity) for value in slots)
-    settings = config.overlap_weighted, float(np.finfo(slots[1].dtype).eps)
-    poses, current = array(frame.T_world_cam), (*segments[:3], segments[5])
+    epsilon = float(np.finfo(slots[1].dtype).eps)
+    settings = config.overlap_weighted, epsilon, config.view_baseline or 0.0, config.near_plane
+    poses, current = array(frame.T_world_cam), (*segments[:3], segments[_NAMES.index("features")])
+    members = np.zeros(len(poses)) if frame.member is None else array(frame.member)
     calls = [
         (
-            poses[b], first[b], tuple(value[b] for value in updated), tuple(value[b] for value in current), pair[:3],
+            poses[b], first[b], members[b], tuple(value[b] for value in updated),
+            tuple(value[b] for value in current), pair[:3],
             _distance(b, pair, segments, config), pair.new, pair.occupied,
             settings, columns + 1,
         )
@@ -256,7 +261,7 @@ def _counts(
 ) -> dict[str, Tensor]:
     """Count the step's statistics [B]; ``unmeasured`` holds the pixels that no two views compare."""
     totals = np.zeros((len(_COUNTS), len(pairs)), np.int64)
-    valid, seen_in = array(frame.valid), array(joined.mixture["count"])
+    valid, evidence = array(frame.valid), array(joined.mixture["evidence"])
     for b, (pair, one, new, removed) in enumerate(zip(pairs, joined.seen, joined.new, joined.dropped, strict=True)):
         totals[:, b] = (
             len(one.disagreement),
@@ -267,6 +272,6 @@ def _counts(
             removed + pair.segments - pair.matched - new,  # too many, or too near
             np.count_nonzero(valid[b]),
             unmeasured[b],
-            np.count_nonzero(seen_in[b] == 1),
+            np.count_nonzero(evidence[b, : len(one.disagreement)] == 0),
         )
     return dict(zip(_COUNTS, map(torch.from_numpy, totals), strict=True))

@@ -47,11 +47,13 @@ class Rest:
     Attributes:
         current: C_i in the camera frame, [B, C].
         to_first: R and t into the mixture's frame.
+        view: [B, 4], see ``append.Cameras``.
         left: [B, C] bool, the Gaussians without a slot.
     """
 
     current: GaussianMixture
     to_first: tuple[Tensor, Tensor]
+    view: Tensor
     left: Tensor
 
 
@@ -162,8 +164,8 @@ class DeviceStep:
         if waiting is not None and waiting.rest is not None and needed > mixture.capacity:
             rest = waiting.rest
             lost, _ = append(
-                grown, rest.current, rest.to_first, rest.left, state.frames, near_plane=config.near_plane, again=True,
-                last=False,
+                grown, rest.current, rest.to_first, rest.view, rest.left, state.frames, near_plane=config.near_plane,
+                paper=config.view_baseline is None, again=True, last=False,
             )  # fmt: skip
             self._lost = lost.sum(1)
         return state.with_tensors(grown.tensors())
@@ -187,7 +189,8 @@ def device_step(
     previous, new = candidates(state.mixture, poses.to_camera, current, camera, frame.size, config)
     counts = torch.zeros(ends.COUNTS, b, dtype=torch.int64, device=frame.depth.device)
     bits, matched = match_bits(previous, new, config, counts[ends.PAIRS])
-    mixture = fuse_bits(state.mixture, current, poses.to_first, (bits, new.index, previous.position, new.count), config)
+    matches = bits, new.index, previous.position, new.count
+    mixture = fuse_bits(state.mixture, current, poses.to_first, matches, poses.view, config)
     full, removed = _full(mixture.capacity, config), torch.zeros_like(frame.fault)
     if full and config.max_components is not None:
         coming = (current.valid & (current.mean[..., 2] > config.near_plane) & ~matched).sum(1)
@@ -195,9 +198,10 @@ def device_step(
         room = make_room(mixture, {}, mixture.components, coming, position, config.max_components)
         mixture, removed = room.mixture, room.dropped
     left, needed = append(
-        mixture, current, poses.to_first, matched, counts, near_plane=config.near_plane, again=False, last=full
-    )
-    waiting = None if full else Waiting.after(needed, Rest(current, poses.to_first, left))
+        mixture, current, poses.to_first, poses.view, matched, counts, near_plane=config.near_plane,
+        paper=config.view_baseline is None, again=False, last=full,
+    )  # fmt: skip
+    waiting = None if full else Waiting.after(needed, Rest(current, poses.to_first, poses.view, left))
     result = regress_frame(mixture, poses.to_camera, frame, state.smoothed, config, counts, smooth=smooth)
     statistics = FrameStatistics(
         components=counts[ends.COMPONENTS],
@@ -210,7 +214,7 @@ def device_step(
         beyond=frame.beyond,
         out_of_range=frame.out_of_range,
         unmeasured=counts[ends.UNMEASURED],
-        single_view=(mixture.count == 1).sum(1),
+        single_view=(mixture.valid & (mixture.evidence == 0)).sum(1),
         fault=frame.fault,
         rotation_deviation=frame.rotation_deviation,
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from ufmstar_torch.kernels.compile_cpu import empty, kernel
@@ -58,25 +60,27 @@ def match(camera, started, first_before, first, mixture, segments, size, thresho
 
 
 @kernel
-def join(pose, first, slots, segments, pairs, distance, new, occupied, settings, extra):
+def join(pose, first, member, slots, segments, pairs, distance, new, occupied, settings, extra):
     """Step 4 for one stream: fuse the pairs, append the new components, and transform the mixture into the camera frame
     for the regression.
 
     Args:
         pose, first: camera-to-world [4, 4] of this frame and of the first.
-        slots: mean, covariance, weight, disagreement, count and features [K, ...] of the mixture; changed.
+        member: index of the network.
+        slots: mean, covariance, weight, disagreement, compared, evidence, view and features [K, ...] of the mixture;
+            changed.
         segments: mean, covariance, weight and features [C, ...] of C_i.
         pairs: c, k and overlap [P].
         distance: as :func:`fuse_pairs`.
         new: [C] which segments to append, from slot ``occupied`` on.
-        settings: ``weighted`` and ``epsilon`` as :func:`fuse_pairs`.
+        settings: as :func:`fuse_pairs`: whether weighted by overlap, epsilon, b_0 (0 = the paper) and near plane.
         extra: number of columns after the mixture's features. The last one is the feature of
             ``unmeasured.before_regression``; the others are not written.
 
     Returns:
         The n components by field [13, n and more], their disagreement [n] and features [n, F] for the regression.
     """
-    mean, covariance, weight, disagreement, count, features = slots
+    mean, covariance, weight, disagreement, compared, evidence, views, features = slots
     mean_c, cov_c, weight_c, features_c = segments
     c, k, overlap = pairs
     work, motion = empty(WORK, np.float64), empty((3, 4), np.float64)
@@ -86,13 +90,18 @@ def join(pose, first, slots, segments, pairs, distance, new, occupied, settings,
     gather(weight_c.size, mean_c, cov_c, weight_c, by_field)
     turn(motion, by_field.shape[1], by_field.shape[1], by_field)
     scatter(weight_c.size, by_field, moved, turned)
+    view = empty(4, np.float64)
+    for i in range(3):
+        view[i] = motion[i, 3]
+    view[3] = member
     fuse_pairs(
-        mean, covariance, weight, disagreement, count, features, moved, turned, weight_c, features_c, c, k,
-        overlap, distance, settings[0], settings[1], work,
+        mean, covariance, weight, disagreement, compared, evidence, views, features, moved, turned, weight_c,
+        features_c, c, k, overlap, distance, view, settings, empty(weight.size, np.float64), work,
     )  # fmt: skip
     n = append(
-        mean, covariance, weight, disagreement, count, features, moved, turned, weight_c, features_c, new, occupied
-    )
+        mean, covariance, weight, disagreement, compared, evidence, views, features, moved, turned, weight_c,
+        features_c, new, occupied, view, settings[2],
+    )  # fmt: skip
     components = empty((FIELDS, padded(n)), np.float64)
     gather(n, mean, covariance, weight, components)
     relative(first, pose, motion)
@@ -102,5 +111,5 @@ def join(pose, first, slots, segments, pairs, distance, new, occupied, settings,
         m[i] = disagreement[i]
         for f in range(features.shape[1]):
             columns[i, f] = features[i, f]
-        columns[i, columns.shape[1] - 1] = 1.0 if count[i] > 1 else 0.0
+        columns[i, columns.shape[1] - 1] = -math.expm1(-np.float64(evidence[i]))
     return components, m, columns

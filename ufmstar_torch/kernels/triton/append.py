@@ -32,12 +32,14 @@ class Cameras:
         first: [B, 4, 4] float64 pose of the first camera.
         to_camera: R [B, 3, 3] and t [B, 3] float64 from the first camera's frame to the present one's.
         to_first: R and t of the inverse.
+        view: [B, 4] float64 t of ``to_first``, which is the camera's centre, and the index of the network.
         started, frames, skipped: [B] of the new state.
     """
 
     first: Tensor
     to_camera: tuple[Tensor, Tensor]
     to_first: tuple[Tensor, Tensor]
+    view: Tensor
     started: Tensor
     frames: Tensor
     skipped: Tensor
@@ -51,21 +53,26 @@ def cameras(state: UfMStarState, frame: FrameInput) -> Cameras:
     shift = first.new_empty(2, b, 3)
     counters = state.frames.new_empty(2, b)
     started = torch.empty_like(state.started)
+    view = first.new_empty(b, 4)
+    member = first.new_zeros(b) if frame.member is None else frame.member.double().contiguous()
     launch(
         _cameras, (b,), state.T_world_first, frame.T_world_cam.contiguous(), frame.fault, state.started, state.frames,
-        state.skipped, first, motion[0], shift[0], motion[1], shift[1], started, counters[0], counters[1], warps=1,
+        state.skipped, member, first, motion[0], shift[0], motion[1], shift[1], view, started, counters[0],
+        counters[1], warps=1,
     )  # fmt: skip
-    return Cameras(first, (motion[0], shift[0]), (motion[1], shift[1]), started, counters[0], counters[1])
+    return Cameras(first, (motion[0], shift[0]), (motion[1], shift[1]), view, started, counters[0], counters[1])
 
 
 def append(
     mixture: GaussianMixture,
     current: GaussianMixture,
     to_first: tuple[Tensor, Tensor],
+    view: Tensor,
     chosen: Tensor,
     counts: Tensor,
     *,
     near_plane: float,
+    paper: bool,
     again: bool,
     last: bool,
 ) -> tuple[Tensor, Tensor]:
@@ -75,9 +82,11 @@ def append(
         mixture: [B, K], in memory that only this step uses.
         current: C_i in the camera frame, [B, C].
         to_first: R and t to the mixture's frame.
+        view: [B, 4], see :class:`Cameras`.
         chosen: [B, C] bool: with ``again``, the Gaussians to append; else those that matched, which are not appended.
         counts: [8, B] int64, written without ``again``.
         near_plane: nearer Gaussians are dropped [m].
+        paper: whether the first view has a weight in m (``views.first_weight``).
         again: whether these Gaussians had no slot in an earlier launch.
         last: whether the mixture cannot grow: Gaussians without a slot are dropped.
 
@@ -89,9 +98,11 @@ def append(
     needed = torch.empty(b, dtype=torch.int32, device=counts.device)
     channels = mixture.features.shape[2]
     launch(
-        _append, (b,), current.mean, current.covariance, current.weight, current.features, *to_first, chosen,
+        _append, (b,), current.mean, current.covariance, current.weight, current.features, *to_first,
+        view.contiguous(), chosen,
         *mixture.tensors().values(), counts, waiting, needed, c, mixture.capacity, b,
-        near_plane=near_plane, again=again, last=last, channels=channels, padded=power_of_two(channels), chunk=128,
+        near_plane=near_plane, paper=paper, again=again, last=last, channels=channels, padded=power_of_two(channels),
+        chunk=128,
     )  # fmt: skip
     return waiting, needed
 
@@ -109,8 +120,8 @@ def _relative(a, b, R, t):
 
 @triton.jit
 def _cameras(
-    T_first, T, fault, started, frames, skipped, first, R_cam, t_cam, R_first, t_first, started_o, frames_o,
-    skipped_o,
+    T_first, T, fault, started, frames, skipped, member, first, R_cam, t_cam, R_first, t_first, view, started_o,
+    frames_o, skipped_o,
 ):  # fmt: skip
     b = tl.program_id(0).to(tl.int64)
     usable = tl.load(fault + b) == 0
@@ -123,6 +134,9 @@ def _cameras(
     tl.store(first + 16 * b + entry, tl.load(base + entry))
     _relative(base, pose, R_cam + 9 * b, t_cam + 3 * b)
     _relative(pose, base, R_first + 9 * b, t_first + 3 * b)
+    for i in tl.static_range(3):
+        tl.store(view + 4 * b + i, tl.load(t_first + 3 * b + i))
+    tl.store(view + 4 * b + 3, tl.load(member + b))
     tl.store(started_o + b, was_started | usable)
     tl.store(frames_o + b, tl.load(frames + b) + usable.to(tl.int64))
     tl.store(skipped_o + b, tl.load(skipped + b) + 1 - usable.to(tl.int64))
@@ -130,11 +144,11 @@ def _cameras(
 
 @triton.jit
 def _append(
-    mean_c, covariance_c, weight_c, features_c, R, t, chosen,
-    mean, covariance, weight, disagreement, count, features, counts, waiting_mask, needed,
+    mean_c, covariance_c, weight_c, features_c, R, t, view, chosen,
+    mean, covariance, weight, disagreement, compared, evidence, reference, features, counts, waiting_mask, needed,
     capacity_c, capacity_k, streams,
-    near_plane: tl.constexpr, again: tl.constexpr, last: tl.constexpr, channels: tl.constexpr, padded: tl.constexpr,
-    chunk: tl.constexpr,
+    near_plane: tl.constexpr, paper: tl.constexpr, again: tl.constexpr, last: tl.constexpr, channels: tl.constexpr,
+    padded: tl.constexpr, chunk: tl.constexpr,
 ):  # fmt: skip
     b = tl.program_id(0).to(tl.int64)
     R, t = R + 9 * b, t + 3 * b
@@ -173,7 +187,11 @@ def _append(
         store_symmetric(covariance + 9 * k, xx, xy, xz, yy, yz, zz, has_slot)
         tl.store(weight + k, pi, mask=has_slot)
         tl.store(disagreement + k, pi * 0.0, mask=has_slot)
-        tl.store(count + k, (lane * 0 + 1).to(tl.int64), mask=has_slot)
+        tl.store(compared + k, pi if paper else pi * 0.0, mask=has_slot)
+        tl.store(evidence + k, pi * 0.0, mask=has_slot)
+        for i in tl.static_range(4):
+            tl.store(reference + 5 * k + i, pi * 0.0 + tl.load(view + 4 * b + i), mask=has_slot)
+        tl.store(reference + 5 * k + 4, pi * 0.0, mask=has_slot)
         if channels > 0:
             stored = has_slot[:, None] & (f < channels)[None, :]
             value = tl.load(features_c + c[:, None] * channels + f[None, :], mask=stored, other=0.0)

@@ -17,6 +17,7 @@ from ufmstar_torch.correspond import Correspondence
 from ufmstar_torch.kernels.triton.correspond import WORD
 from ufmstar_torch.kernels.triton.launch import launch, power_of_two
 from ufmstar_torch.kernels.triton.matrices import (
+    exact,
     floored,
     geodesic,
     load_symmetric,
@@ -26,6 +27,7 @@ from ufmstar_torch.kernels.triton.matrices import (
     turned,
 )
 from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.views import COMPLETE
 
 _LANES = 32
 
@@ -34,6 +36,7 @@ def fuse(
     mixture: GaussianMixture,
     current: GaussianMixture,
     pairs: Correspondence,
+    view: Tensor,
     config: UfMStarConfig,
     *,
     rounds: int | None = None,
@@ -48,7 +51,7 @@ def fuse(
     position = torch.arange(k, dtype=torch.int32, device=device).repeat(b, 1)
     count = torch.full((b,), c, dtype=torch.int32, device=device)
     still = torch.eye(3, dtype=torch.float64, device=device).repeat(b, 1, 1), index.new_zeros(b, 3, dtype=torch.float64)
-    return fuse_bits(mixture, current, still, (bits, index, position, count), config, pairs)
+    return fuse_bits(mixture, current, still, (bits, index, position, count), view, config, pairs)
 
 
 def fuse_bits(
@@ -56,6 +59,7 @@ def fuse_bits(
     current: GaussianMixture,
     motion: tuple[Tensor, Tensor],
     matches: tuple[Tensor, Tensor, Tensor, Tensor],
+    view: Tensor,
     config: UfMStarConfig,
     pairs: Correspondence | None = None,
 ) -> GaussianMixture:
@@ -67,6 +71,7 @@ def fuse_bits(
         motion: R [B, 3, 3] and t [B, 3] float64 from the frame of ``current`` to the mixture's frame.
         matches: bits [B, K, words], indices of the listed c's [B, C], row of each k in the bits [B, K], number of
             listed c's [B].
+        view: [B, 4] as :func:`ufmstar_torch.fuse.fuse`.
         config: of UfM*.
         pairs: overlaps and distances if the config needs them; None = W2^2, not weighted by overlap.
     """
@@ -81,9 +86,11 @@ def fuse_bits(
     channels = mixture.features.shape[2]
     launch(
         _fuse, (triton.cdiv(k, _LANES), b),
-        *(v.contiguous() for v in mixture.tensors().values()), *(v.contiguous() for v in current.tensors().values()),
-        *motion, bits, index, position, count, overlap, distance, *out.tensors().values(),
+        *(v.contiguous() for v in mixture.tensors().values()),
+        *(v.contiguous() for v in (current.mean, current.covariance, current.weight, current.features)),
+        *motion, bits, index, position, count, overlap, distance, view.contiguous(), *out.tensors().values(),
         k, current.capacity, bits.shape[2], epsilon=8 * torch.finfo(mixture.covariance.dtype).eps,
+        baseline=config.view_baseline or 0.0, near=config.near_plane, complete=COMPLETE,
         weighted=weighted, has_distance=has_distance, channels=channels, padded=power_of_two(channels), word=WORD,
         lanes=_LANES, warps=1,
     )  # fmt: skip
@@ -111,13 +118,19 @@ def _floor(covariance, floor, lifted, count, chunk: tl.constexpr):
 
 
 @triton.jit
+def _view(view):
+    return tl.load(view), tl.load(view + 1), tl.load(view + 2), tl.load(view + 3)
+
+
+@triton.jit
 def _fuse(
-    mean, covariance, weight, disagreement, count, features,
-    mean_c, covariance_c, weight_c, disagreement_c, count_c, features_c,
-    R, t, bits, index_c, position, listed_c, overlap, distances,
-    mean_o, covariance_o, weight_o, disagreement_o, count_o, features_o, capacity_k, capacity_c, words,
-    epsilon: tl.constexpr, weighted: tl.constexpr, has_distance: tl.constexpr, channels: tl.constexpr,
-    padded: tl.constexpr, word: tl.constexpr, lanes: tl.constexpr,
+    mean, covariance, weight, disagreement, compared, evidence, reference, features,
+    mean_c, covariance_c, weight_c, features_c,
+    R, t, bits, index_c, position, listed_c, overlap, distances, view,
+    mean_o, covariance_o, weight_o, disagreement_o, compared_o, evidence_o, reference_o, features_o,
+    capacity_k, capacity_c, words,
+    epsilon: tl.constexpr, baseline: tl.constexpr, near: tl.constexpr, complete: tl.constexpr, weighted: tl.constexpr,
+    has_distance: tl.constexpr, channels: tl.constexpr, padded: tl.constexpr, word: tl.constexpr, lanes: tl.constexpr,
 ):  # fmt: skip
     b = tl.program_id(1).to(tl.int64)
     stored = mean.dtype.element_ty
@@ -136,7 +149,21 @@ def _fuse(
     zy = tl.load(covariance + 9 * k + 7, mask=inside, other=0.0).to(tl.float64)
     pi = tl.load(weight + k, mask=inside, other=0.0).to(tl.float64)
     m = tl.load(disagreement + k, mask=inside, other=0.0).to(tl.float64)
-    views = tl.load(count + k, mask=inside, other=0)
+    compared_k = tl.load(compared + k, mask=inside, other=0.0).to(tl.float64)
+    n_k = tl.load(evidence + k, mask=inside, other=0.0).to(tl.float64)
+    vx, vy, vz, v_member = _view(view + 4 * b)
+    rx = tl.load(reference + 5 * k, mask=inside, other=0.0).to(tl.float64)
+    ry = tl.load(reference + 5 * k + 1, mask=inside, other=0.0).to(tl.float64)
+    rz = tl.load(reference + 5 * k + 2, mask=inside, other=0.0).to(tl.float64)
+    r_member = tl.load(reference + 5 * k + 3, mask=inside, other=0.0).to(tl.float64)
+    change = tl.load(reference + 5 * k + 4, mask=inside, other=0.0).to(tl.float64)
+    w = tl.full([lanes], 1.0, tl.float64)
+    if baseline > 0:
+        squared = (vx - rx) * (vx - rx) + (vy - ry) * (vy - ry) + (vz - rz) * (vz - rz)
+        reach = (x - vx) * (x - vx) + (y - vy) * (y - vy) + (z - vz) * (z - vz)
+        reach = tl.maximum(reach, exact(near * near, reach)) * exact(baseline * baseline, reach)
+        w = tl.where(r_member != v_member, 1.0, tl.maximum(1 - tl.exp(-squared / reach) - change, 0.0))
+    any_match = slot < 0
     in_f = inside[:, None] & (f < channels)[None, :]
     h = tl.zeros([lanes, padded], tl.float64)
     if channels > 0:
@@ -147,6 +174,7 @@ def _fuse(
         remaining = tl.load(bits + (b * capacity_k + row) * words + w, mask=row >= 0, other=0)
         while tl.max(remaining, 0) > 0:
             use = remaining != 0
+            any_match = any_match | use
             bit, rest = lowest_bit(tl.where(use, remaining, 1))
             remaining = tl.where(use, rest, 0)
             c = tl.load(index_c + b * capacity_c + w * word + bit, mask=use, other=0)
@@ -182,8 +210,12 @@ def _fuse(
             zz = tl.where(use, n5.to(stored).to(tl.float64), zz)
             yx, zx, zy = tl.where(use, xy, yx), tl.where(use, xz, zx), tl.where(use, yz, zy)
             pi = tl.where(use, (pi + pi_c).to(stored).to(tl.float64), pi)
-            m = tl.where(use, ((1 - lam) * m + lam * d).to(stored).to(tl.float64), m)
-            views = tl.where(use, views + 1, views)
+            added = w * pi_c
+            counts = use & (added > 0)
+            total = compared_k + added
+            rho = added / tl.where(counts, total, 1.0)
+            m = tl.where(counts, ((1 - rho) * m + rho * d).to(stored).to(tl.float64), m)
+            compared_k = tl.where(counts, total.to(stored).to(tl.float64), compared_k)
             if channels > 0:
                 from_c = features_c + index[:, None] * channels + f[None, :]
                 new = tl.load(from_c, mask=in_f & use[:, None], other=0.0).to(tl.float64)
@@ -198,6 +230,15 @@ def _fuse(
     tl.store(covariance_o + 9 * k + 7, zy, mask=inside)
     tl.store(weight_o + k, pi, mask=inside)
     tl.store(disagreement_o + k, m, mask=inside)
-    tl.store(count_o + k, views, mask=inside)
+    tl.store(compared_o + k, compared_k, mask=inside)
+    any_match = any_match & (w > 0)
+    tl.store(evidence_o + k, tl.where(any_match, n_k + w, n_k), mask=inside)
+    change = tl.where(any_match, change + w, change)
+    new = any_match & (change >= complete)
+    tl.store(reference_o + 5 * k, tl.where(new, vx, rx), mask=inside)
+    tl.store(reference_o + 5 * k + 1, tl.where(new, vy, ry), mask=inside)
+    tl.store(reference_o + 5 * k + 2, tl.where(new, vz, rz), mask=inside)
+    tl.store(reference_o + 5 * k + 3, tl.where(new, v_member, r_member), mask=inside)
+    tl.store(reference_o + 5 * k + 4, tl.where(new, 0.0, change), mask=inside)
     if channels > 0:
         tl.store(features_o + k[:, None] * channels + f[None, :], h, mask=in_f)

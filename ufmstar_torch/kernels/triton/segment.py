@@ -78,8 +78,7 @@ def fit(inputs: SegmentInput, *, floor: Floor | None = None) -> tuple[GaussianMi
         launch(
             _join, (b,),
             rows.camera, rows.moments, rows.integers, rows.count,
-            mixture.mean, mixture.covariance, mixture.weight, mixture.count, member, slot_of, height, most, capacity,
-            total,
+            mixture.mean, mixture.covariance, mixture.weight, member, slot_of, height, most, capacity, total,
             rounded=floor is not None and inputs.depth.dtype == torch.float32,
             scale=float(limits.adaptive_thresh_scale), reference=float(limits.reference_focal),
             scaled=limits.fixed_slope, noise_floor=float(limits.noise_floor), angle2=float(limits.angle_cosine) ** 2,
@@ -188,7 +187,7 @@ def _most_active(counts, height, lanes: tl.constexpr):
 
 @triton.jit
 def _join(
-    camera, moments, integers, counts, mean_o, covariance_o, weight_o, count_o, member, slot_of,
+    camera, moments, integers, counts, mean_o, covariance_o, weight_o, member, slot_of,
     height, most, capacity, total,
     rounded: tl.constexpr, scale: tl.constexpr, reference: tl.constexpr, scaled: tl.constexpr,
     noise_floor: tl.constexpr, angle2: tl.constexpr, min_pixels: tl.constexpr, min_rows: tl.constexpr,
@@ -316,7 +315,6 @@ def _join(
             tl.store(mean_o + 3 * out + 2, _stored(mz, rounded), mask=keep)
             store_symmetric(covariance_o + 9 * out, cxx, cxy, cxz, cyy, cyz, czz, keep)
             tl.store(weight_o + out, n.to(tl.float64), mask=keep)
-            tl.store(count_o + out, (n * 0 + 1).to(tl.int64), mask=keep)
             born = tl.where(gone, -1, born)
 
 

@@ -1,0 +1,123 @@
+"""Finds images that show nothing, and images that contradict a pose that never changes.
+
+A network predicts a depth for a black image, too, and predicts it again for the next one, so views agree on a guess. An
+image shows nothing if it is black, saturated, blurred beyond recognition or covered (``shows_something``), or if it is
+the same as the last one although the camera moved. The depth of such an image is neither fused nor counted as measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from ufmstar_torch.stream_warnings import LOGGER
+
+# Width of the reduced image [px], and the cells over which it is averaged [px].
+_WIDTH, _CELL = 192, 3
+# Least detail [grey levels of 255]: RMS difference of a cell from the mean of its 3 x 3 cells. Images of recordings and
+# tours have 5 to 18, at a tenth of their brightness .5 to 1.8, blurred with a radius of 1/30 of the width .2 to 1.4;
+# sensor noise of 3 grey levels has .5.
+_DETAIL = 1.0
+# Cells within this range of grey levels are not clipped; least share of such cells.
+_DARK, _BRIGHT, _SHARE = 4.0, 251.0, 0.1
+# Successive images after which a warning is logged.
+_IMAGES = 8
+# Largest correlation of an image with that at the first of ``_IMAGES`` equal poses: below, the camera must have moved.
+_SAME_SCENE = 0.5
+
+
+def reduced(image: Tensor) -> Tensor:
+    """Grey levels [B, 1, h, w] from 0 to 255 of an image [B, 3, H, W] of bytes or of floats in [0, 1]."""
+    stride = max(1, image.shape[-1] // _WIDTH)
+    grey = image[:, :, ::stride, ::stride].float().mean(1, keepdim=True)
+    grey = grey if image.dtype == torch.uint8 else 255 * grey
+    return avg_pool2d(grey, _CELL) if min(grey.shape[-2:]) >= 3 * _CELL else grey
+
+
+def shows_something(grey: Tensor) -> Tensor:
+    """[B] False where a reduced image [B, 1, h, w] has too little detail, or is almost everywhere black or saturated."""
+    around = avg_pool2d(grey, 3, 1, 1, count_include_pad=False)
+    detail = (grey - around).square().mean((1, 2, 3)).sqrt()
+    exposed = ((grey > _DARK) & (grey < _BRIGHT)).float().mean((1, 2, 3))
+    return (detail >= _DETAIL) & (exposed >= _SHARE)
+
+
+class ImageCheck:
+    """Compares every image with the one before, and logs each finding once per stream."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self, streams: Sequence[int] | None = None) -> None:
+        """Forget the last images of all streams, because other videos begin, or of some."""
+        if streams is None:
+            self._last: tuple[Tensor, Tensor] | None = None
+            self._empty: Tensor | None = None
+            self._logged = set[tuple[int, str]]()
+        elif self._last is not None:
+            self._last[0][list(streams)] = torch.nan  # equal to no image
+            self._still[list(streams)] = 0
+
+    def informative(self, image: Tensor, pose: Tensor) -> Tensor | None:
+        """[B] False where the image shows nothing; None for an image of normalised floats, or on a device without
+        values, of which nothing is known.
+
+        Args:
+            image: [B, 3, H, W].
+            pose: [B, 4, 4] or [4, 4] camera-to-world [m].
+        """
+        if image.is_meta or not (image.dtype == torch.uint8 or _in_unit_range(image)):
+            return None
+        grey = reduced(image.detach())
+        T = pose.detach().to(grey.device).double().expand(len(grey), *pose.shape[-2:])
+        if self._last is None or self._last[0].shape != grey.shape or self._empty is None:
+            self._first, self._still = grey.clone(), torch.zeros(len(grey), dtype=torch.int64, device=grey.device)
+            self._empty, self._frozen = self._still.clone(), self._still.clone()
+            moved = same = torch.zeros_like(self._still, dtype=torch.bool)
+        else:
+            moved = (T != self._last[1]).flatten(1).any(1)
+            same = (grey == self._last[0]).flatten(1).all(1)
+        shows = shows_something(grey)
+        frozen = same & moved
+        self._still = torch.where(moved, 0, self._still + 1)
+        self._first = torch.where((self._still <= 1)[:, None, None, None], grey, self._first)
+        self._empty = torch.where(shows, 0, self._empty + 1)
+        self._frozen = torch.where(moved, torch.where(same, self._frozen + 1, 0), self._frozen)
+        self._last = grey, T.clone()
+        if image.is_cpu:  # on an accelerator, reading the counts would synchronise
+            self._warn(grey)
+        return shows & ~frozen
+
+    def _warn(self, grey: Tensor) -> None:
+        for b, kind, text in (*self._findings(), *self._moving(grey)):
+            if (b, kind) not in self._logged:
+                self._logged.add((b, kind))
+                LOGGER.warning("stream %d: %s (logged once)", b, text)
+
+    def _findings(self) -> Iterator[tuple[int, str, str]]:
+        assert self._empty is not None
+        for b in (self._empty == _IMAGES).nonzero().flatten().tolist():
+            text = f"{_IMAGES} images in a row show nothing (black, saturated, blurred, or a covered lens): their "
+            yield b, "empty", text + "depth is a guess, so it counts as unmeasured"
+        for b in (self._frozen == _IMAGES).nonzero().flatten().tolist():
+            text = f"the image was the same in {_IMAGES + 1} frames of a moving camera: is it updated? Its depth counts "
+            yield b, "frozen", text + "as unmeasured"
+
+    def _moving(self, grey: Tensor) -> Iterator[tuple[int, str, str]]:
+        due = (self._still > 0) & (self._still % _IMAGES == 0)
+        for b in due.nonzero().flatten().tolist():
+            both = torch.stack([grey[b].flatten(), self._first[b].flatten()])
+            if float(torch.corrcoef(both)[0, 1]) < _SAME_SCENE:
+                text = f"the pose was the same in {int(self._still[b]) + 1} images, which show different scenes: is the "
+                yield b, "pose", text + "pose updated, and has SLAM started?"
+
+
+def _in_unit_range(image: Tensor) -> bool:
+    """True for floats in [0, 1]; on an accelerator, where looking would synchronise, False."""
+    if not image.is_floating_point() or not image.is_cpu or not image.numel():
+        return False
+    low, high = image.aminmax()
+    return float(low) >= 0 and float(high) <= 1
