@@ -39,7 +39,9 @@ def mixture(streams: int, capacity: int, seed: int, *, empty: int = 2, features:
         covariance=covariances(n, seed).view(streams, capacity, 3, 3) * mask[..., None, None],
         weight=(100 + 2000 * draw()) * mask,
         disagreement=draw() * mask,
-        count=valid.long(),
+        compared=2000 * draw() * mask,
+        evidence=3 * draw() * mask,
+        view=torch.cat([0.5 * draw(3), (2 * draw(1)).round(), 0.8 * draw(1)], -1) * mask[..., None],
         features=draw(features) * mask[..., None],
     )
 
@@ -53,11 +55,20 @@ def as_lists(m: GaussianMixture, stream: int) -> list[dict]:
             "cov": m.covariance[stream, k].numpy(),
             "weight": m.weight[stream, k].item(),
             "m": m.disagreement[stream, k].item(),
-            "count": int(m.count[stream, k]),
+            "compared": m.compared[stream, k].item(),
+            "evidence": m.evidence[stream, k].item(),
+            "view": m.view[stream, k].numpy(),
             "features": m.features[stream, k].numpy(),
         }
         for k in range(n)
     ]
+
+
+def views(streams: int, seed: int) -> Tensor:
+    """[streams, 4] centre of a camera near the origin [m], and the index 0 or 1 of a network."""
+    generator = torch.Generator().manual_seed(seed + 3)
+    centre = 0.5 * torch.rand(streams, 3, generator=generator, dtype=torch.float64)
+    return torch.cat([centre, torch.randint(0, 2, (streams, 1), generator=generator).double()], 1)
 
 
 def random_pairs(streams: int, previous, current, seed: int, density: float = 0.3) -> Correspondence:

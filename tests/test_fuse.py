@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from random_gaussians import as_lists, covariances, mixture, random_pairs
+from random_gaussians import as_lists, covariances, mixture, random_pairs, views
 
 import oracle
 from ufmstar_torch.config import UfMStarConfig
@@ -21,34 +21,35 @@ pytestmark = pytest.mark.numerics
 
 
 @pytest.mark.parametrize("weighted", [False, True], ids=["w2", "weighted and given"])
+@pytest.mark.parametrize("baseline", [0.07, 0.5, None])
 @given(seed=st.integers(0, 10**6))
-def test_agrees_with_the_oracle(backend, weighted, seed):
+def test_agrees_with_the_oracle(backend, weighted, baseline, seed):
     """Several c that match one k are fused in increasing c. ``weighted``: by overlap, with distances instead of
     W2^2."""
     previous, current = mixture(2, 6, seed, features=2), mixture(2, 5, seed + 50, empty=1, features=2)
     pairs = random_pairs(2, previous, current, seed)
     if weighted:
         pairs = replace(pairs, distance=1 + pairs.overlap)
-    config = UfMStarConfig(overlap_weighted=weighted, features=2)
-    fused = backend.kernels.fuse(previous.padded(12), current, pairs.padded(12), config)
-    fused, dropped = append(fused, current, current.valid & ~pairs.match.any(2))
+    config = UfMStarConfig(overlap_weighted=weighted, features=2, view_baseline=baseline)
+    view = views(2, seed)
+    fused = backend.kernels.fuse(previous.padded(12), current, pairs.padded(12), view, config)
+    fused, dropped = append(fused, current, current.valid & ~pairs.match.any(2), view, config)
     assert dropped.tolist() == [0, 0]
     for b in range(2):
         matches = [pairs.match[b, c].nonzero().flatten().tolist() for c in range(int(current.components[b]))]
         overlaps = {(c, k): pairs.overlap[b, c, k].item() for c in range(5) for k in range(6)}
         distances = {pair: 1 + overlap for pair, overlap in overlaps.items()} if weighted else None
         expected = oracle.fuse(
-            as_lists(previous, b), as_lists(current, b), matches, overlaps, overlap_weighted=weighted,
-            distances=distances,
+            as_lists(previous, b), as_lists(current, b), matches, overlaps, view[b].numpy(), baseline=baseline,
+            overlap_weighted=weighted, distances=distances,
         )  # fmt: skip
         ours = as_lists(fused, b)
         assert len(ours) == len(expected)
         for mine, theirs in zip(ours, expected, strict=True):
-            assert mine["count"] == theirs["count"]
-            for name in ("mean", "cov", "weight", "m", "features"):
+            for name in ("mean", "cov", "weight", "m", "compared", "evidence", "view", "features"):
                 np.testing.assert_allclose(mine[name], theirs[name], rtol=1e-10, atol=1e-11)
-    single = backend.kernels.fuse(previous.to(torch.float32), current, pairs, config)
-    for name, value in fuse(previous.to(torch.float32), current, pairs, config).tensors().items():
+    single = backend.kernels.fuse(previous.to(torch.float32), current, pairs, view, config)
+    for name, value in fuse(previous.to(torch.float32), current, pairs, view, config).tensors().items():
         torch.testing.assert_close(getattr(single, name), value, rtol=1e-5, atol=1e-7)
 
 
@@ -58,10 +59,9 @@ def test_each_fusion_adds_exactly_its_weight(backend, seed):
     previous = previous.replace(weight=previous.weight.round())
     current = current.replace(weight=current.weight.round())
     pairs = random_pairs(1, previous, current, seed)
-    fused = backend.kernels.fuse(previous, current, pairs, UfMStarConfig())
+    fused = backend.kernels.fuse(previous, current, pairs, views(1, seed), UfMStarConfig())
     added = torch.einsum("bck,bc->bk", pairs.match.double(), current.weight)
     assert torch.equal(fused.weight, previous.weight + added)
-    assert torch.equal(fused.count, previous.count + pairs.match.sum(1))
     untouched = ~pairs.match.any(1)
     for name, value in fused.tensors().items():
         assert torch.equal(value[untouched], getattr(previous, name)[untouched])
@@ -71,8 +71,9 @@ def test_a_static_number_of_rounds_changes_nothing():
     previous, current = mixture(2, 6, 5), mixture(2, 5, 6)
     pairs = random_pairs(2, previous, current, 8)
     config = UfMStarConfig()
-    for name, value in fuse(previous, current, pairs, config, rounds=5).tensors().items():
-        torch.testing.assert_close(value, getattr(fuse(previous, current, pairs, config), name), rtol=1e-14, atol=1e-15)
+    for name, value in fuse(previous, current, pairs, views(2, 5), config, rounds=5).tensors().items():
+        free = fuse(previous, current, pairs, views(2, 5), config)
+        torch.testing.assert_close(value, getattr(free, name), rtol=1e-14, atol=1e-15)
 
 
 def test_equal_gaussians_disagree_by_nothing_in_float32(backend):
@@ -80,7 +81,7 @@ def test_equal_gaussians_disagree_by_nothing_in_float32(backend):
     previous = previous.replace(disagreement=torch.zeros_like(previous.disagreement)).to(torch.float32)
     eye = torch.eye(6, dtype=torch.bool)[None] & previous.valid[:, None]
     fused = backend.kernels.fuse(
-        previous, previous.to(torch.float64), Correspondence(eye, eye.double()), UfMStarConfig()
+        previous, previous.to(torch.float64), Correspondence(eye, eye.double()), views(1, 5), UfMStarConfig()
     )
     assert fused.disagreement.max() < 1e-14
     torch.testing.assert_close(fused.covariance, previous.covariance, rtol=1e-6, atol=1e-9)
@@ -104,12 +105,12 @@ def test_thin_wide_plates_survive_many_fusions_in_float32(backend):
     one = torch.ones(1, 1, dtype=torch.float64)
     tilt = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.5, 0.3], [0.5, 0.0, -0.8], [-0.3, 0.8, 0.0]]).double())
     cov = tilt @ torch.diag(torch.tensor([1.0, 1.0, 1e-7], dtype=torch.float64)) @ tilt.T
-    plate = GaussianMixture(
-        torch.zeros(1, 1, 3).double(), cov[None, None], one, 0 * one, one.long(), one[..., None][..., :0]
+    plate = GaussianMixture.empty(1, 1, dtype=torch.float64, device="cpu").replace(
+        covariance=cov[None, None], weight=one
     )
     m, pairs = plate.to(torch.float32), Correspondence(one.bool()[None], one[None])
     for _ in range(20 if backend.slow else 200):
-        m = backend.kernels.fuse(m, plate, pairs, UfMStarConfig(), rounds=1)
+        m = backend.kernels.fuse(m, plate, pairs, torch.zeros(1, 4).double(), UfMStarConfig.paper(), rounds=1)
         assert torch.linalg.eigvalsh(m.covariance.double())[0, 0, 0] > 4 * torch.finfo(torch.float32).eps * 2
     assert m.disagreement.isfinite().all()
 
@@ -117,12 +118,16 @@ def test_thin_wide_plates_survive_many_fusions_in_float32(backend):
 def test_append_counts_what_has_no_slot():
     previous, current = mixture(2, 6, 5, empty=2), mixture(2, 5, 6, empty=0)
     new = torch.tensor([[True, False, True, False, True], [False, True, False, False, False]])
-    filled, dropped = append(previous, current, new)
+    view = views(2, 5)
+    filled, dropped = append(previous, current, new, view, UfMStarConfig())
     assert dropped.tolist() == [1, 0]
     assert torch.equal(filled.mean[0, 4], current.mean[0, 0])
     assert torch.equal(filled.mean[0, 5], current.mean[0, 2])
     assert torch.equal(filled.mean[1, 4], current.mean[1, 1])
     assert filled.disagreement[0, 4:].tolist() == [0, 0]
-    assert filled.count[0, 4:].tolist() == [1, 1]
+    assert filled.evidence[0, 4:].tolist() == filled.compared[0, 4:].tolist() == [0, 0]
+    assert torch.equal(filled.view[0, 4:, :4], view[0].expand(2, 4))
+    papers = append(previous, current, new, view, UfMStarConfig.paper())[0]
+    assert torch.equal(papers.compared[0, 4:], papers.weight[0, 4:])
     for name, value in filled.tensors().items():
         assert torch.equal(value[:, :4], getattr(previous, name)[:, :4])
