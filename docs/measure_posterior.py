@@ -36,12 +36,12 @@ from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.frame import FrameInput, check_frame
-from ufmstar_torch.kernels.posterior_cpu import update
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import load_trained
 from ufmstar_torch.posterior.extension import common_error
 from ufmstar_torch.posterior.running import SIZE
+from ufmstar_torch.posterior.update import update
 
 KINDS_OF_TOURS = ("711?style=home", "713?style=home", "712?style=hall", "721?style=blank", "723?style=blank",
                   "732?style=blank&pan=1")  # fmt: skip

@@ -15,9 +15,8 @@ from modules import frame as input_frame
 from modules import same
 
 from ufmstar_torch import SPGFConfig, UfMStar, frame
-from ufmstar_torch.kernels import check_cpu, posterior_cpu, select, step_cpu
+from ufmstar_torch.kernels import check_cpu, select, step_cpu
 from ufmstar_torch.kernels.host import moved, on_host
-from ufmstar_torch.posterior.update import update as update_posterior
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.step_parts import REFERENCE
 
@@ -34,9 +33,6 @@ def test_seam():
     compiled = select.select_step("numba", "cpu")
     assert select.select_step("auto", "cpu") is compiled is step_cpu.step
     assert select.select_check("auto", "cpu") is check_cpu.check_values
-    assert select.select_posterior("auto", "cpu") is posterior_cpu.update
-    assert select.select_posterior("torch", "cpu") is select.select_posterior("torch", "cuda") is update_posterior
-    assert select.select_posterior("auto", "cuda") not in (update_posterior, posterior_cpu.update), "on the host"
     for device in ("cpu", "cuda"):
         assert select.select_kernels("torch", device) is select.select_step("torch", device).keywords["kernels"]
         assert select.select_kernels("torch", device) is REFERENCE

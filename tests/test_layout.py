@@ -145,17 +145,6 @@ def test_kernels_import_back_only_plain_types():
         "FOCAL_RANGE",
         "LARGEST",
         "POLAR_STEPS",
-        "AnchorInput",
-        "Posterior",
-        "PosteriorConfig",
-        "SIDE",
-        "FEATURES",
-        "RATIOS",
-        "ratios",
-        "LEAST_LEFT",
-        "LEAST_REST",
-        "APART",
-        "MOST_WRONG",
     }
     for path in (ROOT / "ufmstar_torch" / "kernels").glob("*_cpu.py"):
         if path.stem in ("step_cpu", "anchors_cpu", "neighbours_cpu"):

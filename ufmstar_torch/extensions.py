@@ -8,7 +8,7 @@ from ufmstar_torch.anchors.extension import AnchorExtension
 from ufmstar_torch.confidence import ConfidenceExtension
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Extension, Extensions
-from ufmstar_torch.kernels.select import select_anchors, select_posterior
+from ufmstar_torch.kernels.select import select_anchors
 from ufmstar_torch.merge import MergeExtension
 from ufmstar_torch.posterior.extension import PosteriorExtension
 
@@ -25,7 +25,7 @@ def extensions_of(config: UfMStarConfig, further: Sequence[Extension] = ()) -> E
     if config.confidence is not None:
         each.append(ConfidenceExtension(config))
     if config.posterior is not None:
-        each.append(PosteriorExtension(config, select_posterior))
+        each.append(PosteriorExtension(config))
     if config.merge is not None:
         each.append(MergeExtension(config))
     return Extensions([*each, *further], config)

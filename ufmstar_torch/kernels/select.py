@@ -14,8 +14,6 @@ from ufmstar_torch.anchors.extension import AnchorKernels
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import CheckKernel, check_values
 from ufmstar_torch.kernels.host import on_host
-from ufmstar_torch.posterior.update import PosteriorUpdate
-from ufmstar_torch.posterior.update import update as update_posterior
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.step import Step, step
 from ufmstar_torch.step_parts import REFERENCE, Kernels
@@ -111,17 +109,6 @@ def _on_gpu(name: str, device_type: str) -> bool:
             raise ValueError(f"backend='triton' needs tensors of a GPU, got device type {device_type!r}")
         return True
     return name == "auto" and device_type in _TRITON_DEVICES and _has_triton(device_type)
-
-
-def select_posterior(name: str, device_type: str) -> PosteriorUpdate:
-    """The posterior's update for a device, on the host for an accelerator; arguments as :func:`select_step`. Raises
-    ValueError: "numba" off the CPU."""
-    compiled = _compiled(name, device_type)
-    if not compiled and (name == "torch" or device_type in ("cpu", "meta")):
-        return update_posterior
-    from ufmstar_torch.kernels import posterior_cpu
-
-    return posterior_cpu.update if compiled else on_host(posterior_cpu.update)
 
 
 @functools.cache

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -15,9 +15,11 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Extension, FrameExtension, Tensors, Total
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.output import StepOutput
-from ufmstar_torch.posterior.running import SIZE, Running, restarted
-from ufmstar_torch.posterior.update import Posterior, PosteriorUpdate
+from ufmstar_torch.posterior.running import SIZE, require, restarted
 from ufmstar_torch.state import UfMStarState
+
+if TYPE_CHECKING:
+    from ufmstar_torch.posterior.update import Posterior
 
 
 class PosteriorFrame(FrameExtension):
@@ -26,22 +28,23 @@ class PosteriorFrame(FrameExtension):
     Args:
         anchor_frame: the anchors' extension in the same frame.
         config: with ``posterior``.
-        update: an implementation of :func:`ufmstar_torch.posterior.update.update`.
     """
 
-    def __init__(self, anchor_frame: AnchorFrame, config: UfMStarConfig, update: PosteriorUpdate) -> None:
-        self._anchors, self._config, self._update = anchor_frame, config, update
+    def __init__(self, anchor_frame: AnchorFrame, config: UfMStarConfig) -> None:
+        self._anchors, self._config = anchor_frame, config
         self._posterior: Posterior | None = None
 
     def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
-        """Learn from the frame's anchors, and correct the depth."""
+        """Learn from the frame's anchors, and correct the depth (on the CPU, :mod:`ufmstar_torch.posterior.update`)."""
+        from ufmstar_torch.posterior.update import update  # kernels compile when they are first needed
+
         assert self._config.posterior is not None
         claimed = total(out.disagreement).detach()
         frame, anchors, packed = self._anchors.frame, self._anchors.anchors, state.by_stream["posterior"]
         if anchors is not None and anchors.shared is not None:  # wrong poses, for an unknown time
             start = restarted(packed, self._config.posterior)
             packed = torch.where(anchors.shared.isinf()[:, None], start, packed)
-        learnt, posterior = self._update(packed, frame, anchors, claimed, self._config.posterior)
+        learnt, posterior = update(packed, frame, anchors, claimed, self._config.posterior)
         added = torch.zeros_like(posterior.variance)
         if anchors is not None and anchors.contradiction is not None:  # most anchors are off by a factor over 100
             added = posterior.depth.square() * anchors.contradiction[:, None, None].to(added.dtype)
@@ -76,13 +79,12 @@ class PosteriorExtension(Extension):
 
     Args:
         config: with ``posterior`` and ``anchors``.
-        update: makes the implementation for a backend and a device's type.
     """
 
     always_float64: ClassVar[tuple[str, ...]] = ("posterior",)
 
-    def __init__(self, config: UfMStarConfig, update: Callable[[str, str], PosteriorUpdate]) -> None:
-        self._config, self._update = config, update
+    def __init__(self, config: UfMStarConfig) -> None:
+        self._config = config
 
     def by_stream(self, streams: int, dtype: torch.dtype, device: torch.device | str) -> dict[str, Tensor]:
         """``posterior`` [B, S] float64, the memory of each stream (``posterior.running``)."""
@@ -90,10 +92,7 @@ class PosteriorExtension(Extension):
 
     def require_state(self, state: Tensors) -> None:
         """See :meth:`Extension.require_state`."""
-        assert self._config.posterior is not None
-        packed = state["posterior"]
-        started = torch.cat([packed[:, :1].clamp_min(1), packed[:, 1:]], 1)  # check the stored values, not the start's
-        Running.of(torch.where(packed.any(1, keepdim=True), started, packed), self._config.posterior).require()
+        require(state["posterior"])
 
     def of_frame(
         self,
@@ -108,5 +107,4 @@ class PosteriorExtension(Extension):
         anchor_frames = [extension for extension in before if isinstance(extension, AnchorFrame)]
         if not dense or not anchor_frames:
             return FrameExtension()
-        update = self._update(self._config.backend, frame.depth.device.type)
-        return PosteriorFrame(anchor_frames[0], self._config, update)
+        return PosteriorFrame(anchor_frames[0], self._config)

@@ -9,14 +9,13 @@ other anchors: outliers have widened the field's variance, and ``wrong`` account
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
-from torch.nn.functional import pad
+import numpy as np
+from numpy.typing import NDArray
 
-from ufmstar_torch.fixed_order import total
-from ufmstar_torch.posterior.field import Field
-from ufmstar_torch.posterior.running import Running, ratios
+from ufmstar_torch.posterior.field import Field, at, conditioned
+from ufmstar_torch.posterior.running import Floats, Running
 from ufmstar_torch.posterior.scene import (
+    MOST_WRONG,
     LeftOut,
     Scene,
     away_from,
@@ -26,7 +25,6 @@ from ufmstar_torch.posterior.scene import (
     second_moments,
     spread_around,
     steepness,
-    wrong,
     wrong_factor,
 )
 
@@ -39,63 +37,63 @@ LEAST_REST = 5
 STEPS = (0.7548776662466927, 0.5698402909980532)
 
 
-def learnt(scene: Scene, field: Field, weight: Tensor, left_out: LeftOut, running: Running) -> Running:
-    """The memory after the frame."""
-    sums = _of_neighbours(scene, left_out, running) | _of_discs(scene, weight, left_out, running)
-    added = {name: running.added(name, *sums[name]) for name in ratios(scene.config)}
-    above, below = ({name: pair[i] for name, pair in added.items()} for i in range(2))
-    after = running.frames + 1, scene.grid.mean, above, below, field.coefficients, field.covariance
-    return Running(scene.config, *after)
+def learnt(scene: Scene, field: Field, weight: Floats, left_out: LeftOut, running: Running) -> Floats:
+    """The packed memory after the frame."""
+    above, below = running.added(_of_neighbours(scene, left_out, running) | _of_discs(scene, weight, left_out, running))
+    first = [running.frames + 1, scene.grid.mean]
+    return np.concatenate([first, above, below, field.coefficients, field.covariance.ravel()])
 
 
-def _of_neighbours(scene: Scene, left_out: LeftOut, running: Running) -> dict[str, tuple[Tensor, Tensor]]:
+def _of_neighbours(scene: Scene, left_out: LeftOut, running: Running) -> dict[str, tuple[float, float]]:
     """Sums for roughness and noise from the excess of squared leave-one-out residuals over their variance, weighted by
     the squared share of the quantity in that variance."""
     variance = left_out.total
-    excess = torch.minimum(left_out.residual.square(), scene.config.clip * variance) - variance
-    per_cell = torch.where(scene.valid, 1 / scene.counted(torch.ones_like(excess)), 0.0)
+    excess = np.minimum(left_out.residual**2, scene.config.clip * variance) - variance
+    per_cell = 1 / scene.counted(np.ones(len(variance)))
     sums = {}
-    for name, part in (("roughness", running.ratio("roughness")[:, None]), ("noise", scene.stated)):
-        w = per_cell * (part / variance).square()
-        unit = running.ratio(name)[:, None] / part.clamp_min(1e-12)
-        sums[name] = (total(w * (part + excess) * unit, 1), total(w, 1))
+    for name, part in (("roughness", np.full(len(variance), running.ratios["roughness"])), ("noise", scene.stated)):
+        w = per_cell * (part / variance) ** 2
+        unit = running.ratios[name] / np.maximum(part, 1e-12)
+        sums[name] = float((w * (part + excess) * unit).sum()), float(w.sum())
     return sums
 
 
 def _of_discs(
-    scene: Scene, weight: Tensor, left_out: LeftOut, running: Running
-) -> dict[str, tuple[Tensor, Tensor]]:  # fmt: skip
+    scene: Scene, weight: Floats, left_out: LeftOut, running: Running
+) -> dict[str, tuple[float, float]]:  # fmt: skip
     """Sums for the other ratios, from anchors in held-out discs."""
-    held_out = _discs(scene, running.frames) & scene.valid
-    rest = scene.valid & ~held_out
-    held_out = held_out & (rest.sum(1, keepdim=True) >= LEAST_REST)
-    field = Field.conditioned(scene.prior, scene.observed, weight * rest)
-    mean, variance = field.at(scene.observed.node, scene.observed.features)
-    away = torch.gather(away_from(scene, rest), 1, scene.observed.node)
-    error, b = scene.observed.value - mean, field.coefficients
-    believed = torch.where(held_out, scene.believed(), 0.0)
-    area = believed / scene.counted(believed).clamp_min(1e-12)
-    offset = mean - (scene.observed.features * b[:, None]).sum(-1)
-    nodes = spread_around(scene, rest, b[:, 0]), local_scale(scene, left_out, rest), steepness(scene.grid, field.offset)
-    around, scale, steep = (torch.gather(x, 1, scene.observed.node) for x in nodes)
-    factor, more_wrong = inlier_factor(running, away), wrong_factor(scene.config, away, scale)
-    unseen = away * running.ratio("unseen")[:, None]
-    inlier_variance = scale * (factor * (variance + scene.noise + unseen) + steep)
-    p, wide = wrong(running, more_wrong), elsewhere_variance(scene.config, around, unseen)
-    z2 = error.square() / inlier_variance - (error + offset).square() / (scene.noise + wide)
-    elsewhere = torch.sigmoid(p.logit() + ((inlier_variance / (scene.noise + wide)).log() + z2) / 2)
-    stated = second_moments(scene.config, inlier_variance, p, offset, wide)[0]
-    return _of_pairs(scene, held_out, torch.stack([error, variance, away, scene.noise]), running) | {
-        "wrong": (total(area * elsewhere, 1), total(area * more_wrong, 1)),
-        "inlier": (
-            total(area * (1 - elsewhere) * factor * error.square() / inlier_variance, 1),
-            total(area * (1 - elsewhere), 1),
-        ),
-        "calibration": (total(area * error.square() / stated, 1), total(area, 1)),
+    held_out, config = _discs(scene, running.frames), scene.config
+    rest = ~held_out
+    held_out = held_out & (np.count_nonzero(rest) >= LEAST_REST)
+    field = conditioned(scene.prior, scene.observed, weight * rest)
+    node, x, noise = scene.observed.node[held_out], scene.observed.features[held_out], scene.noise[held_out]
+    mean, variance = at(field, node, x)
+    away, b = away_from(scene, rest)[node], field.coefficients
+    error, offset = scene.observed.value[held_out] - mean, mean - (x * b).sum(1)
+    believed = np.where(held_out, scene.believed(), 0.0)
+    area = (believed / np.maximum(scene.counted(believed), 1e-12))[held_out]
+    unseen = away * running.ratios["unseen"]
+    wide = elsewhere_variance(config, spread_around(scene, rest, b[0])[node], unseen)
+    scale, factor = local_scale(scene, left_out, rest)[node], inlier_factor(running, away)
+    inlier_variance = factor * (variance + noise + unseen) + steepness(scene.grid, field.offset)[node]
+    inlier_variance, more_wrong = scale * inlier_variance, wrong_factor(config, away, scale)
+    p = np.minimum(running.ratios["wrong"] * more_wrong, MOST_WRONG)
+    z2 = error**2 / inlier_variance - (error + offset) ** 2 / (noise + wide)
+    with np.errstate(over="ignore", divide="ignore"):  # infinite odds of the evidence's surface
+        elsewhere = 1 / (1 + np.exp(-np.log(p / (1 - p)) - (np.log(inlier_variance / (noise + wide)) + z2) / 2))
+    stated = second_moments(config, inlier_variance, p, offset, wide)[0]
+    sums = {
+        "wrong": (area * elsewhere, area * more_wrong),
+        "inlier": (area * (1 - elsewhere) * factor * error**2 / inlier_variance, area * (1 - elsewhere)),
+        "calibration": (area * error**2 / stated, area),
     }
+    added = {name: (float(above.sum()), float(below.sum())) for name, (above, below) in sums.items()}
+    return _of_pairs(scene, node, np.stack([error, variance, away, noise]), running) | added
 
 
-def _of_pairs(scene: Scene, held_out: Tensor, values: Tensor, running: Running) -> dict[str, tuple[Tensor, Tensor]]:
+def _of_pairs(
+    scene: Scene, node: NDArray[np.int64], values: Floats, running: Running
+) -> dict[str, tuple[float, float]]:  # fmt: skip
     """Sums for amplitude and unseen from the errors at pairs of neighbouring cells.
 
     The mean product of their errors is the covariance of the network's errors: noise and wrong anchors are independent
@@ -104,50 +102,40 @@ def _of_pairs(scene: Scene, held_out: Tensor, values: Tensor, running: Running) 
 
     Args:
         scene: of the frame.
-        held_out: [B, N] bool.
-        values: [4, B, N] error, its variance in the field, distance from evidence and noise.
+        node: [M] nodes of the held-out anchors.
+        values: [4, M] error, its variance in the field, distance from evidence and noise.
         running: up to the frame before.
     """
-    streams, (rows, cols) = len(held_out), scene.grid.size
-    each = torch.cat([torch.where(held_out, values, 0.0), held_out[None].to(values)])
-    cells = torch.zeros(5, streams, rows * cols, dtype=each.dtype, device=each.device)
-    cells = cells.scatter_add(2, scene.observed.node.expand_as(each), each).view(5, streams, rows, cols)
-    count, means = cells[4], cells[:4] / cells[4].clamp_min(1)
-    amplitude, paired = running.ratio("amplitude"), torch.zeros_like(count, dtype=torch.bool)
-    sums = torch.zeros(4, streams, dtype=each.dtype, device=each.device)
-    pairs = torch.zeros_like(sums[0])
-    for axis, link in ((2, scene.grid.right), (1, scene.grid.down)):
-        n = count.shape[axis] - 1
-        one, other = means.narrow(axis + 1, 0, n), means.narrow(axis + 1, 1, n)
-        pair = (count.narrow(axis, 0, n) > 0) & (count.narrow(axis, 1, n) > 0)
-        before, after = ((0, 1), (1, 0)) if axis == 2 else ((0, 0, 0, 1), (0, 0, 1, 0))
-        paired, pairs = paired | pad(pair, before) | pad(pair, after), pairs + pair.sum((1, 2))
-        _, variance, away, noise = (one + other) / 2
-        between = amplitude[:, None, None] * link.view_as(count).narrow(axis, 0, n)
-        sums = sums + _products(
-            pair, one[0] * other[0], (variance - APART * between / 2).clamp_min(0), variance, noise, away
-        )
-    error, variance, away, noise = means
-    alone, product = (count > 0) & ~paired, error.square() - noise / count.clamp_min(1)
-    share = alone.sum((1, 2)) / (alone.sum((1, 2)) + pairs).clamp_min(1)
-    sums = sums + share * _products(alone, product, variance, variance, noise, away)
-    return {"amplitude": (sums[0], sums[1] / amplitude), "unseen": (sums[2], sums[3])}
+    grid, amplitude, sums = scene.grid, running.ratios["amplitude"], np.zeros(4)
+    count = np.bincount(node, minlength=grid.rows * grid.cols)
+    means = np.stack([np.bincount(node, row, len(count)) for row in values]) / np.maximum(count, 1)
+    cells, alone, pairs = np.arange(len(count)).reshape(grid.rows, grid.cols), count > 0, 0
+    for first, second, link in ((cells[:, :-1], cells[:, 1:], grid.right), (cells[:-1], cells[1:], grid.down)):
+        pair = (count[first] > 0) & (count[second] > 0)
+        one, other = first[pair], second[pair]
+        alone[one] = alone[other] = False
+        pairs += len(one)
+        _, variance, away, noise = (means[:, one] + means[:, other]) / 2
+        covariance = np.maximum(variance - APART * amplitude * link[one] / 2, 0)
+        sums += _products(means[0, one] * means[0, other], covariance, variance, noise, away)
+    error, variance, away, noise = means[:, alone]
+    share = len(error) / max(len(error) + pairs, 1)
+    sums += share * _products(error**2 - noise / count[alone], variance, variance, noise, away)
+    return {"amplitude": (float(sums[0]), float(sums[1]) / amplitude), "unseen": (float(sums[2]), float(sums[3]))}
 
 
-def _products(
-    used: Tensor, product: Tensor, expected: Tensor, variance: Tensor, noise: Tensor, away: Tensor
-) -> Tensor:  # fmt: skip
-    """[4, B] sums over the mask ``used``: numerator and denominator of amplitude, weighted, and of unseen."""
-    weight = 1 / (variance + noise).clamp_min(1e-12)
-    terms = weight * product, weight * expected, away * (product - expected), away.square()
-    return torch.stack([total(torch.where(used, x, 0.0).flatten(1), 1) for x in terms])
+def _products(product: Floats, expected: Floats, variance: Floats, noise: Floats, away: Floats) -> Floats:
+    """[4] sums: numerator and denominator of amplitude, weighted, and of unseen."""
+    weight = 1 / np.maximum(variance + noise, 1e-12)
+    terms = weight * product, weight * expected, away * (product - expected), away**2
+    return np.array([x.sum() for x in terms])
 
 
-def _discs(scene: Scene, frames: Tensor) -> Tensor:
-    """[B, N] whether an anchor lies in one of the frame's discs."""
-    position, discs = (scene.observed.features[..., 2:4] + 1) / 2, scene.config.discs
-    inside = torch.zeros_like(scene.valid)
+def _discs(scene: Scene, frames: float) -> NDArray[np.bool_]:
+    """[N] whether an anchor lies in one of the frame's discs."""
+    position, discs = (scene.observed.features[:, 2:4] + 1) / 2, scene.config.discs
+    inside = np.zeros(len(position), np.bool_)
     for disc in range(discs):
-        centre = torch.stack([((frames * discs + disc + 1) * step) % 1 for step in STEPS], -1)
-        inside = inside | ((position - centre[:, None]).square().sum(-1) < scene.config.radius**2)
+        centre = np.array([((frames * discs + disc + 1) * step) % 1 for step in STEPS])
+        inside |= ((position - centre) ** 2).sum(1) < scene.config.radius**2
     return inside

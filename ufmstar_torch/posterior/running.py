@@ -15,14 +15,17 @@ Each ratio is the quotient of two sums that fade towards a prior, so that few an
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import functools
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.posterior.config import PosteriorConfig
 
+Floats = NDArray[np.float64]
 FEATURES = 4  # 1, log d - m_0, u and v from -1 to 1
 _MATRIX = FEATURES * FEATURES
 # Limits of stored values, beyond what any run reaches: of m_0, the log of the largest accepted depth
@@ -65,88 +68,83 @@ def restarted(packed: Tensor, config: PosteriorConfig) -> Tensor:
     return torch.cat([packed[:, : -FEATURES - _MATRIX], start], 1)
 
 
-@dataclass(frozen=True)
-class Running:
-    """The posterior's memory of B streams.
+def require(packed: Tensor) -> None:
+    """Raise a ValueError if no anchors can have led to the memory [B, SIZE]."""
+    frames, mean, sums, _, covariance = packed.split([1, 1, 2 * RATIOS, FEATURES, _MATRIX], 1)
+    matrix = covariance.reshape(-1, FEATURES, FEATURES)
+    scale = matrix.abs().amax((1, 2)).clamp(1e-300, 1e300)
+    low = torch.linalg.eigvalsh(matrix / scale[:, None, None])[:, 0]
+    faults = {
+        f"values beyond {LARGEST:g}": packed.abs() > LARGEST,
+        "negative sums": torch.cat([frames, sums], 1) < 0,
+        "a mean log depth out of range": mean.abs() > LARGEST_LOG,
+        "a covariance with negative eigenvalues": low < -1e-6,
+    }
+    if names := [name for name, bad in faults.items() if bool(bad.any())]:
+        raise ValueError(f"posterior holds impossible values: {', '.join(names)}")
+
+
+class Running(NamedTuple):
+    """The posterior's memory of one stream.
 
     Attributes:
         config: of the posterior.
-        frames: [B] number of frames with anchors.
-        mean: [B] m_0 of the last frame.
-        above, below: [B] numerators and denominators of :func:`ratios`, by name.
-        coefficients: [B, 4] of the features in the last frame.
-        covariance: [B, 4, 4] of the coefficients.
+        frames: number of frames with anchors.
+        mean: m_0 of the last frame.
+        above, below: [R] numerators and denominators of :func:`ratios`, in their order.
+        coefficients: [4] of the features in the last frame.
+        covariance: [4, 4] of the coefficients.
+        ratios: the ratios by name, within their limits; the prior's value where the denominator is 0.
     """
 
     config: PosteriorConfig
-    frames: Tensor
-    mean: Tensor
-    above: dict[str, Tensor]
-    below: dict[str, Tensor]
-    coefficients: Tensor
-    covariance: Tensor
+    frames: float
+    mean: float
+    above: Floats
+    below: Floats
+    coefficients: Floats
+    covariance: Floats
+    ratios: dict[str, float]
 
     @classmethod
-    def of(cls, packed: Tensor, config: PosteriorConfig) -> Running:
-        """Unpack [B, SIZE]; a row of zeros is the start."""
-        packed, priors = packed.double(), ratios(config)
-        frames, mean, sums, coefficients, covariance = packed.split([1, 1, 2 * RATIOS, FEATURES, _MATRIX], 1)
-        new = frames == 0
-        start = [r.value * r.weight for r in priors.values()] + [r.weight for r in priors.values()]
-        above, below = torch.where(new, sums.new_tensor(start), sums).split(RATIOS, 1)
-        P = torch.diag(packed.new_tensor(config.prior_variance))
-        return cls(
-            config, frames[:, 0], mean[:, 0], dict(zip(priors, above.unbind(1), strict=True)),
-            dict(zip(priors, below.unbind(1), strict=True)), coefficients,
-            torch.where(new[..., None], P, covariance.reshape(-1, FEATURES, FEATURES)),
-        )  # fmt: skip
+    def of(cls, packed: Floats, config: PosteriorConfig) -> Running:
+        """Unpack [SIZE]; zeros are the start."""
+        names, (value, weight, least, largest) = _priors(config)
+        (above, below), rest = packed[2 : 2 + 2 * RATIOS].reshape(2, RATIOS), packed[2 + 2 * RATIOS :]
+        b, covariance = rest[:FEATURES], rest[FEATURES:].reshape(FEATURES, FEATURES)
+        if packed[0] == 0:
+            above, below, covariance = value * weight, weight, np.diag(config.prior_variance)
+        values = np.where(below > 0, above / np.maximum(below, 1e-12), value).clip(least, largest)
+        by_name = dict(zip(names, values.tolist(), strict=True))
+        return cls(config, packed[0], packed[1], above, below, b, covariance, by_name)
 
-    def packed(self) -> Tensor:
-        """Pack into [B, SIZE]; inverse of :meth:`of`."""
-        scalars = [self.frames, self.mean, *self.above.values(), *self.below.values()]
-        return torch.cat([torch.stack(scalars, 1), self.coefficients, self.covariance.flatten(1)], 1)
+    def added(self, sums: dict[str, tuple[float, float]]) -> tuple[Floats, Floats]:
+        """Numerators and denominators [R] after a frame with the ``sums`` by name."""
+        value, weight, least, largest = _priors(self.config)[1]
+        fade, (above, below) = 0.5 ** (1 / self.config.half_life), np.array([sums[name] for name in self.ratios]).T
+        n = fade * self.below + (1 - fade) * weight + below
+        total = fade * self.above + (1 - fade) * weight * value + above
+        return np.minimum(np.maximum(total, least * n), largest * n), n
 
-    def drifted(self, mean: Tensor) -> Tensor:
-        """[B, SIZE] after a frame without anchors whose m_0 is ``mean`` [B]; zeros before the first anchor."""
-        coefficients, covariance = self.expected(mean)
-        packed = replace(self, mean=mean, coefficients=coefficients, covariance=covariance).packed()
-        return torch.where(self.frames[:, None] > 0, packed, torch.zeros_like(packed))
+    def drifted(self, mean: float) -> Floats:
+        """Pack into [SIZE] after a frame without anchors whose m_0 is ``mean``."""
+        b, covariance = self.expected(mean)
+        return np.concatenate([[self.frames, mean], self.above, self.below, b, covariance.ravel()])
 
-    def require(self) -> None:
-        """Raise a ValueError if no anchors can have led to these values."""
-        sums = torch.stack([*self.above.values(), *self.below.values(), self.frames])
-        scale = self.covariance.abs().amax((1, 2)).clamp(1e-300, 1e300)
-        low = torch.linalg.eigvalsh(self.covariance / scale[:, None, None])[:, 0]
-        faults = {
-            f"values beyond {LARGEST:g}": self.packed().abs() > LARGEST,
-            "negative sums": sums < 0,
-            "a mean log depth out of range": self.mean.abs() > LARGEST_LOG,
-            "a covariance with negative eigenvalues": low < -1e-6,
-        }
-        if names := [name for name, bad in faults.items() if bool(bad.any())]:
-            raise ValueError(f"posterior holds impossible values: {', '.join(names)}")
+    def expected(self, mean: float) -> tuple[Floats, Floats]:
+        """Predict coefficients [4] and covariance [4, 4] for a frame whose m_0 is ``mean``: a random walk from the last
+        frame. The walk stops adding variance at the prior's."""
+        T = np.eye(FEATURES)
+        T[0, 1] = mean - self.mean if self.frames else 0.0
+        transformed = T @ self.covariance @ T.T
+        if self.frames:
+            remaining = (1 - transformed.diagonal() / self.config.prior_variance).clip(0, 1)
+            transformed = transformed + np.diag(self.config.drift**2 * remaining)
+        return T @ self.coefficients, transformed
 
-    def ratio(self, name: str) -> Tensor:
-        """[B] a ratio within its limits; the prior's value where the denominator is 0."""
-        prior, below = ratios(self.config)[name], self.below[name]
-        ratio = torch.where(below > 0, self.above[name] / below.clamp_min(1e-12), torch.full_like(below, prior.value))
-        return ratio.clamp(prior.least, prior.largest)
 
-    def added(self, name: str, above: Tensor, below: Tensor) -> tuple[Tensor, Tensor]:
-        """Numerator and denominator [B] of a ratio after a frame with the sums ``above`` and ``below`` [B]."""
-        prior, fade = ratios(self.config)[name], 0.5 ** (1 / self.config.half_life)
-        n = fade * self.below[name] + (1 - fade) * prior.weight + below
-        total = fade * self.above[name] + (1 - fade) * prior.weight * prior.value + above
-        return torch.minimum(torch.maximum(total, prior.least * n), prior.largest * n), n
-
-    def expected(self, mean: Tensor) -> tuple[Tensor, Tensor]:
-        """Predict coefficients [B, 4] and covariance [B, 4, 4] for a frame whose m_0 is ``mean`` [B]: a random walk
-        from the last frame. The walk stops adding variance at the prior's."""
-        T = torch.eye(FEATURES, dtype=mean.dtype, device=mean.device).repeat(len(mean), 1, 1)
-        T[:, 0, 1] = torch.where(self.frames > 0, mean - self.mean, torch.zeros_like(mean))
-        transformed = T @ self.covariance @ T.mT
-        prior = mean.new_tensor(self.config.prior_variance)
-        remaining = (1 - transformed.diagonal(dim1=1, dim2=2) / prior).clamp(0, 1)
-        started = (self.frames > 0).to(mean)[:, None]
-        grown = torch.diag_embed(self.config.drift**2 * remaining * started)
-        return (T @ self.coefficients[..., None])[..., 0], transformed + grown
+@functools.lru_cache(maxsize=4)  # a posterior has the same config in every frame
+def _priors(config: PosteriorConfig) -> tuple[tuple[str, ...], Floats]:
+    """Names of the ratios [R], and their values, weights, least and largest values [4, R]."""
+    priors = ratios(config)
+    return tuple(priors), np.array(list(priors.values())).T

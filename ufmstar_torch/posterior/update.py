@@ -48,32 +48,42 @@ stream without anchors has UfM*'s output.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import AnchorInput
 from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.kernels.arrays_cpu import array
+from ufmstar_torch.kernels.threads_cpu import each
+from ufmstar_torch.posterior.cells import cell_means, features, read
 from ufmstar_torch.posterior.config import PosteriorConfig
-from ufmstar_torch.posterior.grid import Grid
+from ufmstar_torch.posterior.field import at
 from ufmstar_torch.posterior.learn import learnt
-from ufmstar_torch.posterior.read import read
-from ufmstar_torch.posterior.running import Running
+from ufmstar_torch.posterior.running import Floats, Running
 from ufmstar_torch.posterior.scene import (
-    Scene,
+    MOST_WRONG,
+    SIDE,
+    AnchorRows,
+    Grid,
     away_from,
     elsewhere_variance,
     fitted,
     inlier_factor,
     local_scale,
+    scene_of,
     second_moments,
     spread_around,
     steepness,
-    wrong,
     wrong_factor,
 )
+
+_NONE = AnchorRows(np.empty((0, 2)), np.empty(0, np.int64), *(np.empty(0) for _ in range(3)))
 
 
 @dataclass(frozen=True)
@@ -98,65 +108,77 @@ class Posterior:
     inlier: Tensor
 
 
-# Signature of :func:`update`, and of ``kernels/posterior_cpu.update``.
-PosteriorUpdate = Callable[[Tensor, FrameInput, AnchorInput | None, Tensor, PosteriorConfig], tuple[Tensor, Posterior]]
-
-
 def update(
-    packed: Tensor,
-    frame: FrameInput,
-    anchors: AnchorInput | None,
-    claimed: Tensor,
-    config: PosteriorConfig,
+    packed: Tensor, frame: FrameInput, anchors: AnchorInput | None, claimed: Tensor, config: PosteriorConfig
 ) -> tuple[Tensor, Posterior]:
-    """Process a frame.
+    """Process a frame of B streams, one after the other, on the CPU.
 
     Args:
-        packed: [B, running.SIZE] the memory; not modified.
-        frame: checked.
+        packed: [B, running.SIZE] float64, the memory; not modified.
+        frame: checked, on any device. On device meta, the results have shapes and no values.
         anchors: of the frame, or None.
         claimed: [B, H, W] V of UfM* without B [m^2], NaN where not valid.
         config: the constants.
 
     Returns:
-        The memory after this frame, and the posterior. Without a valid anchor, a stream learns nothing and its
-        coefficients drift.
+        The memory after this frame, and the posterior, on the frame's device. Without a valid anchor, a stream learns
+        nothing and its coefficients drift.
     """
-    has_anchors = anchors is not None
-    anchors = anchors if anchors is not None and anchors.valid.shape[1] else _none(frame)
-    running, grid = Running.of(packed, config), Grid.of(frame, config)
-    scene = Scene.of(grid, frame, anchors, running)
+    device = frame.depth.device
+    if device.type == "meta":
+        return packed, Posterior(frame.depth, claimed, packed[:, 0], packed[:, 0], frame.depth, claimed)
+    maps = [array(x) for x in (packed, frame.depth, frame.valid, claimed)]
+    streams = zip(*maps, _anchors(anchors, len(packed)), strict=True)
+    results = each(functools.partial(_of_stream, config), list(streams))
+    memory, depth, variance, outlier, inlier = (np.stack([result[i] for result in results]) for i in range(5))
+    memories = [result[5] for result in results]
+    calibration = [one.ratios["calibration"] if one.below[-1] > 0 else np.nan for one in memories]
+    unseen = [one.ratios["unseen"] for one in memories]
+    outputs = depth, variance, np.array(calibration), np.array(unseen), outlier, inlier
+    return torch.from_numpy(memory).to(device), Posterior(*(torch.from_numpy(x).to(device) for x in outputs))
+
+
+def _anchors(anchors: AnchorInput | None, streams: int) -> list[AnchorRows | None]:
+    if anchors is None:
+        return [None] * streams
+    fields = [array(x) for x in (anchors.pixel, anchors.index, anchors.predicted, anchors.depth, anchors.variance)]
+    used = array(anchors.valid)
+    return [AnchorRows(*(x[b][used[b]] for x in fields)) for b in range(streams)]
+
+
+def _of_stream(
+    config: PosteriorConfig, packed: Floats, depth: NDArray[Any], valid: NDArray[np.bool_], claimed: NDArray[Any],
+    anchor_rows: AnchorRows | None,
+) -> tuple[Floats, NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], Running]:  # fmt: skip
+    """The memory after the frame; depth, variance, probability of another surface and inlier variance; and the unpacked
+    memory."""
+    running, anchors = Running.of(packed, config), _NONE if anchor_rows is None else anchor_rows
+    has_valid = len(anchors.depth) > 0
+    if anchor_rows is None and not running.frames:
+        predicted = np.where(valid, depth, np.nan).astype(depth.dtype)
+        return packed, predicted, claimed, np.full_like(depth, np.nan), claimed, running
+    with np.errstate(all="ignore"):  # invalid pixels are not read
+        logs = np.log(depth)
+    rows, cols = (min(SIDE, n) for n in depth.shape)
+    grid = Grid.of(cell_means(logs, valid, rows, cols), rows, cols, config)
+    scene = scene_of(grid, depth, valid, anchors, running)
     field, left_out, weight = fitted(scene)
-    away = away_from(scene, anchors.valid & (weight * config.weak_sigma**2 >= 1))
-    has_valid = anchors.valid.any(1)
-    drifted = torch.where(frame.valid.flatten(1).any(1)[:, None], running.drifted(grid.mean), packed)
-    memory = torch.where(has_valid[:, None], learnt(scene, field, weight, left_out, running).packed(), drifted)
-    updated = Running.of(memory, config)
-    features, b = grid.features(), field.coefficients
-    mean, variance = field.at(torch.arange(features.shape[1], device=b.device).expand_as(away), features)
-    offset = mean - (features * b[:, None]).sum(-1)
-    unseen = away * updated.ratio("unseen")[:, None]
-    variance = variance + updated.ratio("roughness")[:, None] + unseen
-    wide = elsewhere_variance(config, spread_around(scene, anchors.valid, b[:, 0]), unseen)
-    scale = local_scale(scene, left_out, anchors.valid)
-    variance = scale * (inlier_factor(updated, away) * variance + steepness(grid, field.offset))
-    p = wrong(updated, wrong_factor(config, away, scale))
-    variance, inlier = second_moments(config, variance, p, offset, wide)
-    nodes = torch.stack([grid.log_depth, offset, variance, inlier, p, away / config.reach], -1)
-    maps = frame.depth, frame.valid, claimed.nan_to_num()
-    depth, spread, inlier, outlier = read(*maps, nodes, b, grid.mean, grid.size, config)
-    corrected = (has_valid | (running.frames > 0) | has_anchors)[:, None, None]
-    plain = torch.where(frame.valid, frame.depth, torch.nan)
-    calibration = torch.where(updated.below["calibration"] > 0, updated.ratio("calibration"), torch.nan)
-    return memory.to(packed.dtype), Posterior(
-        torch.where(corrected, depth, plain), torch.where(corrected, spread, claimed), calibration,
-        updated.ratio("unseen"), torch.where(corrected, outlier, torch.nan), torch.where(corrected, inlier, claimed),
-    )  # fmt: skip
-
-
-def _none(frame: FrameInput) -> AnchorInput:
-    """One invalid anchor for each stream."""
-    b, camera = len(frame.depth), frame.intrinsics
-    one, zero = camera.new_ones(b, 1), camera.new_zeros(b, 1)
-    index = torch.zeros(b, 1, dtype=torch.int64, device=camera.device)
-    return AnchorInput(camera.new_zeros(b, 1, 2), index, one, one, zero, zero, index.bool())
+    away = away_from(scene, weight * config.weak_sigma**2 >= 1)
+    if has_valid:
+        memory = learnt(scene, field, weight, left_out, running)
+    else:
+        memory = running.drifted(grid.mean) if running.frames and valid.any() else packed
+    node = np.arange(rows * cols)
+    x = features(grid.log_depth - grid.mean, (node % cols + 0.5) / cols, (node // cols + 0.5) / rows)
+    mean, variance = at(field, node, x)
+    b, updated = field.coefficients, Running.of(memory, config)
+    offset, all_anchors = mean - (x * b).sum(1), np.ones(len(scene.noise), np.bool_)
+    unseen = away * updated.ratios["unseen"]
+    variance = inlier_factor(updated, away) * (variance + updated.ratios["roughness"] + unseen)
+    wide = elsewhere_variance(config, spread_around(scene, all_anchors, b[0]), unseen)
+    scale = local_scale(scene, left_out, all_anchors)
+    p = np.minimum(updated.ratios["wrong"] * wrong_factor(config, away, scale), MOST_WRONG)
+    variance, inlier = second_moments(config, scale * (variance + steepness(grid, field.offset)), p, offset, wide)
+    nodes = np.stack([grid.log_depth, offset, variance, inlier, p, away / config.reach], 1)
+    depth, spread, inlier, p = read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
+    return memory, depth, spread, p, inlier, updated

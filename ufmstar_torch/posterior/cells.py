@@ -1,17 +1,21 @@
-"""Means of pixels in the posterior's cells, and interpolation from nodes to pixels, on the CPU (numba)."""
+"""Means of pixels in cells, and interpolation from nodes to pixels, without smoothing across depth edges (numba)."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.anchors.anchors import FARTHEST_OFF
 from ufmstar_torch.kernels.compile_cpu import cached
-from ufmstar_torch.kernels.field_cpu import Floats, fast
 from ufmstar_torch.posterior.config import PosteriorConfig
-from ufmstar_torch.posterior.read import LARGEST
+from ufmstar_torch.posterior.field import fast
+from ufmstar_torch.posterior.running import Floats
 
+# Upper limit of |y|: anchors that are off by more are not valid.
+LARGEST = math.log(FARTHEST_OFF)
 # Kernels whose sums may be reordered, for values with NaN.
 with_nan = cached(fastmath={"contract", "reassoc", "nsz", "arcp"})
 
@@ -42,7 +46,7 @@ def _add_up(logs, valid, total, count):
 
 
 def features(logs: Floats, u: Floats, v: Floats) -> Floats:
-    """[N, 4] features of log d - m_0 [N] at u and v [N] from 0 to 1, as in ``ufmstar_torch.posterior.grid``."""
+    """[N, 4] features for log d - m_0 [N] at u and v [N] from 0 to 1: 1, log d - m_0, u and v from -1 to 1."""
     return np.stack([np.ones_like(logs), logs, 2 * u - 1, 2 * v - 1], 1)
 
 
@@ -91,7 +95,27 @@ def read(
     depth: NDArray[Any], valid: NDArray[np.bool_], logs: NDArray[Any], claimed: NDArray[Any], nodes: Floats,
     coefficients: Floats, mean: float, size: tuple[int, int], config: PosteriorConfig,
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:  # fmt: skip
-    """As :func:`ufmstar_torch.posterior.read.read`, with log d."""
+    """Depth, variances and the probability of another surface at every pixel.
+
+    The four nodes around a pixel have their bilinear weights times 1/(1 + (D/edge_contrast)^2); D is the difference
+    between the pixel's log d and the node's.
+
+    Args:
+        depth: [H, W] d [m].
+        valid: [H, W].
+        logs: [H, W] log d.
+        claimed: [H, W] UfM*'s variance [m^2]; its product with the share without evidence is a lower limit.
+        nodes: [n, 6] log d, y - b . x, variance over the squared depth, the same on the evidence's surface, probability
+            of another surface, and share without evidence.
+        coefficients: [4] of 1, log d - m_0, u, v.
+        mean: m_0.
+        size: R and C of the nodes.
+        config: of the posterior.
+
+    Returns:
+        Depth d e^y [m], its variance [m^2], that on the surface of the evidence, and the probability, [H, W] in
+        depth's dtype, NaN where not valid.
+    """
     rows, cols = size
     width = depth.shape[1]
     u = (np.arange(width) + 0.5) / width
