@@ -13,6 +13,7 @@ from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.anchors.anchors import check_anchors
 from ufmstar_torch.frame import check_frame
+from ufmstar_torch.kernels.host import moved
 from ufmstar_torch.posterior import field
 from ufmstar_torch.posterior.running import FEATURES, SIZE, Running
 from ufmstar_torch.posterior.scene import SIDE, elsewhere_variance, second_moments
@@ -140,15 +141,12 @@ def test_a_frame_without_anchors_equals_one_with_invalid_anchors():
 
 
 def test_on_device_meta_the_results_have_shapes():
-    config = CONFIG.replace(on_bad_frame="skip", max_components=64, initial_capacity=64)
-    depth = torch.ones(2, 24, 32, device="meta")
-    anchors = Anchors(torch.ones(2, 5, 2, device="meta"), *torch.ones(2, 2, 5, device="meta"))
-    out = UfMStar(config).to("meta")(depth, torch.eye(4).repeat(2, 1, 1), K, anchors=anchors)
-    for value in (*out.posterior(), out.posterior_outlier, out.posterior_inlier_variance):
+    frame, anchors, claimed = streams_of((0, 1, 2), torch.float32)
+    arguments = torch.zeros(3, SIZE, dtype=torch.float64), frame, anchors, claimed
+    (expected, real), (packed, out) = (update(*moved(arguments, device), MODEL) for device in ("cpu", "meta"))
+    for value, same in zip((packed, *vars(out).values()), (expected, *vars(real).values()), strict=True):
         assert value.is_meta
-        assert value.shape == depth.shape
-        assert value.dtype == depth.dtype
-    assert out.statistics.calibration.shape == out.statistics.unseen.shape == (2,)
+        assert (value.shape, value.dtype) == (same.shape, same.dtype)
 
 
 def updated(depth, anchors, claimed=None, packed=None):
