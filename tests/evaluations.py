@@ -57,7 +57,12 @@ def write_examples(out: Path, dataset: str, sequence: str, rows: Sequence[Row]) 
         maps = {"depth": truth - 1 + 0.1 * np.float32(n), "variance": np.full(SHAPE, 0.1 + n, np.float32)}
         np.savez(folder / "examples" / f"7@{row.slug}.npz", **maps)
     covariance = np.eye(3)[None].repeat(2, 0)
-    room = {"mean_world": np.ones((2, 3)), "covariance_world": covariance, "disagreement": [0, 1.0], "count": [2, 3]}
+    room = {
+        "mean_world": np.ones((2, 3)),
+        "covariance_world": covariance,
+        "disagreement": [0, 1.0],
+        "views": [1, 2.0],
+    }
     room["path"] = np.zeros((1, 3))
     np.savez(folder / "room" / f"{rows[-1].slug}_7.npz", **room, T_world_cam=np.eye(4))
 

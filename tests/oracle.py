@@ -1,7 +1,7 @@
 """UfM* steps 2 to 6 in NumPy float64 loops, straight from the paper; slow, plain, and independent.
 
 Imports neither torch nor the package. Component lists are plain Python lists of dicts with keys mean, cov, weight, m,
-features, and of the views compared: compared, evidence and view (of the reference: the camera's centre, the network's
+features, and of the views compared: compared, views and reference (the camera's centre, the network's
 index, and the largest change since). The mixture is kept in the first camera's frame.
 """
 
@@ -168,14 +168,14 @@ def correspond(previous_cam, current_cam, K, size, eta, eta_occl, near):
 def view_weight(component, view, baseline, near):
     """Weight of a comparison: 1 if another network predicted (or baseline is None, the paper), else the increase of
     1 - exp(-(b/b0)^2), with the baseline b over the distance, beyond its largest value since the reference view."""
-    if baseline is None or component["view"][3] != view[3]:
+    if baseline is None or component["reference"][3] != view[3]:
         return 1.0
     distance = max(np.linalg.norm(component["mean"] - view[:3]), near)
-    change = 1 - np.exp(-((np.linalg.norm(view[:3] - component["view"][:3]) / distance / baseline) ** 2))
-    return max(change - component["view"][4], 0.0)
+    change = 1 - np.exp(-((np.linalg.norm(view[:3] - component["reference"][:3]) / distance / baseline) ** 2))
+    return max(change - component["reference"][4], 0.0)
 
 
-def fuse(mixture, current, matches, overlaps, view, *, baseline=0.1, near=0.05, overlap_weighted=False,
+def fuse(mixture, current, matches, overlaps, view, *, baseline=0.07, near=0.05, overlap_weighted=False,
          remembered=None, distances=None):  # fmt: skip
     """M_i from M_(i-1) and C_i, both in the first camera's frame; returns a new list. view: centre of the camera there,
     and index of the network."""
@@ -183,10 +183,10 @@ def fuse(mixture, current, matches, overlaps, view, *, baseline=0.1, near=0.05, 
     counts = [view_weight(g, view, baseline, near) for g in mixture]
     for k in {k for ks in matches for k in ks}:
         if counts[k] > 0:
-            fused[k]["evidence"] += counts[k]
-            change = fused[k]["view"][4] + counts[k]
-            reference = fused[k]["view"][:4]
-            fused[k]["view"] = np.append(view, 0.0) if change >= 0.9 else np.append(reference, change)
+            fused[k]["views"] += counts[k]
+            change = fused[k]["reference"][4] + counts[k]
+            reference = fused[k]["reference"][:4]
+            fused[k]["reference"] = np.append(view, 0.0) if change >= 0.9 else np.append(reference, change)
     for c, ks in enumerate(matches):  # increasing c for every k
         for k in ks:
             g, new = fused[k], current[c]
@@ -204,7 +204,7 @@ def fuse(mixture, current, matches, overlaps, view, *, baseline=0.1, near=0.05, 
     for c, ks in enumerate(matches):
         if not ks and (remembered is None or remembered[c]):
             first = 0.0 if baseline is not None else current[c]["weight"]
-            fused.append({**current[c], "m": 0.0, "compared": first, "evidence": 0.0, "view": np.append(view, 0.0)})
+            fused.append({**current[c], "m": 0.0, "compared": first, "views": 0.0, "reference": np.append(view, 0.0)})
     return fused
 
 
@@ -262,7 +262,7 @@ def dense(mixture_cam, depth, valid, K, **prior):
 def compared_share(mixture_cam, depth, valid, K, **prior):
     """Share to which every valid pixel is measured, sum of w_k (1 - exp(-n_k)); NaN elsewhere."""
     out = np.full(depth.shape, np.nan)
-    mixture = prepared([{**g, "features": np.array([1 - np.exp(-g["evidence"])])} for g in mixture_cam])
+    mixture = prepared([{**g, "features": np.array([1 - np.exp(-g["views"])])} for g in mixture_cam])
     for v, u in np.argwhere(valid):
         d = depth[v, u]
         x = np.array([(u - K[0, 2]) / K[0, 0] * d, (v - K[1, 2]) / K[1, 1] * d, d])
@@ -289,7 +289,7 @@ class Oracle:
 
     def __init__(self, spgf, *, eta=0.5, eta_occl=0.7, near=0.05, prior_weight=1.0, prior_mean=0.0,
                  alpha=0.5, overlap_weighted=False, neighbourhood=None, disagreement="w2",
-                 unmeasured="paper", unmeasured_relative=0.1, baseline=0.1):  # fmt: skip
+                 unmeasured="paper", unmeasured_relative=0.1, baseline=0.07):  # fmt: skip
         self.baseline = baseline
         self.unmeasured, self.unmeasured_relative = unmeasured, unmeasured_relative
         self.disagreement = disagreement

@@ -19,8 +19,8 @@ def joint(g, h):
         "weight": weight,
         "m": (g["compared"] * g["m"] + h["compared"] * h["m"]) / max(g["compared"] + h["compared"], 1e-300),
         "compared": g["compared"] + h["compared"],
-        "evidence": g["evidence"] + h["evidence"],
-        "view": (g if a >= b else h)["view"],
+        "views": g["views"] + h["views"],
+        "reference": (g if a >= b else h)["reference"],
         "features": a * g["features"] + b * h["features"],
         "sums": g["sums"] + h["sums"],
     }
@@ -29,7 +29,7 @@ def joint(g, h):
 def loss(g, h):
     """Bound on the divergence per pixel of the lighter component [nat]; infinite for a pair that must not join."""
     lighter, heavier = (g, h) if g["weight"] < h["weight"] else (h, g)
-    if lighter["evidence"] > 0 and heavier["evidence"] == 0:
+    if lighter["views"] > 0 and heavier["views"] == 0:
         return np.inf
     weight = g["weight"] + h["weight"]
     volume = [np.linalg.slogdet(x["cov"])[1] for x in (joint(g, h), g, h)]

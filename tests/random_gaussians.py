@@ -40,8 +40,8 @@ def mixture(streams: int, capacity: int, seed: int, *, empty: int = 2, features:
         weight=(100 + 2000 * draw()) * mask,
         disagreement=draw() * mask,
         compared=2000 * draw() * mask,
-        evidence=3 * draw() * mask,
-        view=torch.cat([0.5 * draw(3), (2 * draw(1)).round(), 0.8 * draw(1)], -1) * mask[..., None],
+        views=3 * draw() * mask,
+        reference=torch.cat([0.5 * draw(3), (2 * draw(1)).round(), 0.8 * draw(1)], -1) * mask[..., None],
         features=draw(features) * mask[..., None],
     )
 
@@ -56,8 +56,8 @@ def as_lists(m: GaussianMixture, stream: int) -> list[dict]:
             "weight": m.weight[stream, k].item(),
             "m": m.disagreement[stream, k].item(),
             "compared": m.compared[stream, k].item(),
-            "evidence": m.evidence[stream, k].item(),
-            "view": m.view[stream, k].numpy(),
+            "views": m.views[stream, k].item(),
+            "reference": m.reference[stream, k].numpy(),
             "features": m.features[stream, k].numpy(),
         }
         for k in range(n)

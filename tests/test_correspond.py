@@ -24,13 +24,10 @@ def blob(*components: tuple[float, float, float, float]) -> GaussianMixture:
     """Round Gaussians: x, y, z, sigma [m]."""
     n = len(components)
     values = torch.tensor(components, dtype=torch.float64)
-    return GaussianMixture(
-        values[None, :, :3],
-        (values[:, 3] ** 2)[None, :, None, None] * torch.eye(3, dtype=torch.float64),
-        torch.ones(1, n, dtype=torch.float64),
-        torch.zeros(1, n, dtype=torch.float64),
-        torch.ones(1, n, dtype=torch.int64),
-        torch.zeros(1, n, 0, dtype=torch.float64),
+    return GaussianMixture.empty(1, n, dtype=torch.float64, device="cpu").replace(
+        mean=values[None, :, :3],
+        covariance=(values[:, 3] ** 2)[None, :, None, None] * torch.eye(3, dtype=torch.float64),
+        weight=torch.ones(1, n, dtype=torch.float64),
     )
 
 

@@ -46,7 +46,7 @@ def test_agrees_with_the_oracle(backend, weighted, baseline, seed):
         ours = as_lists(fused, b)
         assert len(ours) == len(expected)
         for mine, theirs in zip(ours, expected, strict=True):
-            for name in ("mean", "cov", "weight", "m", "compared", "evidence", "view", "features"):
+            for name in ("mean", "cov", "weight", "m", "compared", "views", "reference", "features"):
                 np.testing.assert_allclose(mine[name], theirs[name], rtol=1e-10, atol=1e-11)
     single = backend.kernels.fuse(previous.to(torch.float32), current, pairs, view, config)
     for name, value in fuse(previous.to(torch.float32), current, pairs, view, config).tensors().items():
@@ -125,8 +125,8 @@ def test_append_counts_what_has_no_slot():
     assert torch.equal(filled.mean[0, 5], current.mean[0, 2])
     assert torch.equal(filled.mean[1, 4], current.mean[1, 1])
     assert filled.disagreement[0, 4:].tolist() == [0, 0]
-    assert filled.evidence[0, 4:].tolist() == filled.compared[0, 4:].tolist() == [0, 0]
-    assert torch.equal(filled.view[0, 4:, :4], view[0].expand(2, 4))
+    assert filled.views[0, 4:].tolist() == filled.compared[0, 4:].tolist() == [0, 0]
+    assert torch.equal(filled.reference[0, 4:, :4], view[0].expand(2, 4))
     papers = append(previous, current, new, view, UfMStarConfig.paper())[0]
     assert torch.equal(papers.compared[0, 4:], papers.weight[0, 4:])
     for name, value in filled.tensors().items():

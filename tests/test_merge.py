@@ -33,7 +33,7 @@ def crowd(seed: int, capacity: int = 14) -> tuple[GaussianMixture, torch.Tensor]
         mean=0.3 * m.mean,
         covariance=shape * m.valid[..., None, None],
         weight=m.weight ** torch.tensor([[1.0], [1.4]]),
-        count=torch.randint(1, 4, m.count.shape, generator=generator) * m.valid,
+        views=m.views * (torch.rand(m.views.shape, generator=generator) < 0.7),
     )
     return m, torch.rand(2, capacity, 3, generator=generator, dtype=torch.float64) * m.valid[..., None]
 
@@ -42,13 +42,14 @@ def as_dicts(m: GaussianMixture, sums: torch.Tensor, stream: int) -> list[dict]:
     return [g | {"sums": sums[stream, k].numpy()} for k, g in enumerate(as_lists(m, stream))]
 
 
-def one(mean: list[list[float]], spread: list[float], weight: list[float], m: list[float], count: list[int]):
-    """One stream of round components with the variances ``spread``."""
+def one(mean: list[list[float]], spread: list[float], weight: list[float], m: list[float], evidence: list[float]):
+    """One stream of round components with the variances ``spread``; m has the weight pi where there is evidence."""
     cov = torch.tensor(spread, dtype=torch.float64)[:, None, None] * torch.eye(3, dtype=torch.float64)
-    values = [torch.tensor([v], dtype=torch.float64) for v in (mean, weight, m)]
-    return GaussianMixture(
-        values[0], cov[None], values[1], values[2], torch.tensor([count]), values[1].new_zeros(1, len(m), 0)
-    )
+    fields = {"mean": mean, "weight": weight, "disagreement": m, "views": evidence}
+    values = {name: torch.tensor([value], dtype=torch.float64) for name, value in fields.items()}
+    compared = values["weight"] * (values["views"] > 0)
+    empty = GaussianMixture.empty(1, len(m), dtype=torch.float64, device="cpu")
+    return empty.replace(**values, covariance=cov[None], compared=compared)
 
 
 def merge_one(m: GaussianMixture, **changes: float) -> GaussianMixture:
@@ -68,15 +69,14 @@ def test_agrees_with_the_oracle(seed, apart):
         ours = as_dicts(after, merged_sums, b)
         assert len(ours) == len(expected)
         for mine, theirs in zip(ours, expected, strict=True):
-            assert mine["count"] == theirs["count"]
-            for name in ("mean", "cov", "weight", "m", "features", "sums"):
+            for name in ("mean", "cov", "weight", "m", "compared", "views", "reference", "features", "sums"):
                 np.testing.assert_allclose(mine[name], theirs[name], rtol=1e-9, atol=1e-11)
 
 
 @given(st.integers(0, 10**6))
 @settings(max_examples=10)
 def test_sums_over_the_mixture_stay(seed):
-    """Both rules conserve the sums of pi, pi m, pi h and of the anchors' evidence. Joining also conserves the
+    """Both rules conserve the sums of pi, pi h, W, W m and of the anchors' evidence. Joining also conserves the
     moments."""
     before, sums = crowd(seed)
     after, merged_sums = merge(before, sums, ALL, CONFIG)
@@ -84,8 +84,9 @@ def test_sums_over_the_mixture_stay(seed):
     joined, _ = merge(before, sums, ALL, CONFIG.with_values({"merge.share": 0.0}))
 
     def zeroth(m: GaussianMixture) -> torch.Tensor:
-        w = m.weight[..., None]
-        return (w * torch.cat([torch.ones_like(w), m.disagreement[..., None], m.features], -1)).sum(1)
+        w, compared = m.weight[..., None], m.compared[..., None]
+        means = w * torch.cat([torch.ones_like(w), m.features], -1)
+        return torch.cat([means, compared, compared * m.disagreement[..., None]], -1).sum(1)
 
     def moments(m: GaussianMixture) -> torch.Tensor:
         second = m.covariance + m.mean[..., :, None] * m.mean[..., None, :]
@@ -100,7 +101,7 @@ def test_sums_over_the_mixture_stay(seed):
 def test_the_limit_is_the_divergence_of_the_lighter_from_the_heavier(step):
     """A vanishing weight at distance d of an equal shape: l -> d^2 / (2 sigma^2), 1 nat at sqrt(2) sigma."""
     d = (math.sqrt(2) + step) * 0.1
-    two = one([[0.0, 0.0, 2.0], [d, 0.0, 2.0]], [0.01, 0.01], [1e9, 1.0], [0.5, 0.5], [3, 3])
+    two = one([[0.0, 0.0, 2.0], [d, 0.0, 2.0]], [0.01, 0.01], [1e9, 1.0], [0.5, 0.5], [2.0, 2.0])
     assert int(merge_one(two, share=0.0).components) == (1 if step < 0 else 2)
 
 
@@ -108,24 +109,24 @@ def test_what_was_seen_from_one_view_stays_unmeasured():
     """The join of two single-view components is unmeasured. A measured component does not join a heavier single-view
     component, which would then count as measured."""
     means = [[0.0, 0.0, 2.0], [0.01, 0.0, 2.0]]
-    firsts = merge_one(one(means, [0.01, 0.01], [50.0, 40.0], [0.0, 0.0], [1, 1]))
+    firsts = merge_one(one(means, [0.01, 0.01], [50.0, 40.0], [0.0, 0.0], [0.0, 0.0]))
     assert firsts.components.tolist() == [1]
-    assert firsts.count[0, 0] == 1
-    assert int(merge_one(one(means, [0.01, 0.01], [50.0, 40.0], [0.0, 0.2], [1, 2])).components) == 2
-    assert int(merge_one(one(means, [0.01, 0.01], [40.0, 50.0], [0.0, 0.2], [1, 2])).components) == 1
+    assert firsts.views[0, 0] == 0
+    assert int(merge_one(one(means, [0.01, 0.01], [50.0, 40.0], [0.0, 0.2], [0.0, 1.0])).components) == 2
+    assert int(merge_one(one(means, [0.01, 0.01], [40.0, 50.0], [0.0, 0.2], [0.0, 1.0])).components) == 1
 
 
 def test_a_superseded_component_is_dissolved_and_a_lonely_one_is_not():
     """A thin fragment inside a wide component is dissolved when the wide one has been observed often. Away from other
     components it stays, at any weight."""
     for weight, distance, left in ((2e4, 0.0, 2), (1e9, 0.0, 1), (1e9, 9.0, 2)):
-        two = one([[0.0, 0.0, 2.0], [distance, 0.0, 2.0]], [0.25, 0.001], [weight, 100.0], [0.1, 0.0], [9, 1])
+        two = one([[0.0, 0.0, 2.0], [distance, 0.0, 2.0]], [0.25, 0.001], [weight, 100.0], [0.1, 0.0], [8.0, 0.0])
         after = merge_one(two)
         assert int(after.components) == left, (weight, distance)
         if left == 1:
             assert torch.equal(after.mean[0, 0], two.mean[0, 0])
             assert after.weight[0, 0] == weight + 100.0
-            assert after.count[0, 0] == 9
+            assert after.views[0, 0] == 8
 
 
 @given(st.integers(0, 10**6))

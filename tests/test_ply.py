@@ -61,7 +61,9 @@ def mixture(k: int = 7, *, streams: int = 2, seed: int = 0, dtype: torch.dtype =
         covariance=torch.tensor(covariance * used[..., None, None], dtype=dtype),
         weight=torch.tensor(weight, dtype=dtype),
         disagreement=torch.tensor(rng.uniform(0, 0.2, (streams, k)) * used, dtype=dtype),
-        count=torch.tensor(rng.integers(1, 50, (streams, k)) * used),
+        compared=torch.tensor(weight / 2, dtype=dtype),
+        views=torch.tensor(rng.uniform(0.1, 9, (streams, k)) * used, dtype=dtype),
+        reference=torch.tensor(rng.uniform(0, 1, (streams, k, 5)) * used[..., None], dtype=dtype),
         features=torch.zeros(streams, k, 0, dtype=dtype),
     )
 
@@ -93,7 +95,7 @@ class TestSplats:
         assert table.dtype.names == (
             *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
             *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
-            *("weight", "disagreement", "count"),
+            *("weight", "disagreement", "views"),
         )  # the order of splat viewers
         used = mix.valid[stream]
         R = world()[:3, :3] if moved else torch.eye(3, dtype=torch.float64)
@@ -106,16 +108,16 @@ class TestSplats:
         covariance = np.einsum("kij,kj,klj->kil", axes, sigma**2, axes)
         np.testing.assert_allclose(covariance, R @ mix.covariance[stream][used] @ R.T, atol=1e-6)
         assert np.abs(np.linalg.norm(stack(table, "rot_0", "rot_1", "rot_2", "rot_3"), axis=-1) - 1).max() < 1e-6
-        for name in ("weight", "disagreement", "count"):
+        for name in ("weight", "disagreement", "views"):
             np.testing.assert_allclose(table[name], getattr(mix, name)[stream][used], rtol=1e-7)
         np.testing.assert_allclose(1 / (1 + np.exp(-table["opacity"])), OPACITY, rtol=1e-6)
 
     def test_colour_follows_disagreement(self, tmp_path: Path) -> None:
         mix = mixture(30, streams=1)
-        mix = mix.replace(count=torch.where(torch.arange(30) % 5 == 0, 1, mix.count + mix.valid))
+        mix = mix.replace(views=torch.where(torch.arange(30) % 5 == 0, 0, mix.views))
         write_mixture_ply(tmp_path / "m.ply", mix)
         vertex = parse(tmp_path / "m.ply")[0]["vertex"]
-        rgb, compared = 0.5 + 0.28209479177387814 * stack(vertex, "f_dc_0", "f_dc_1", "f_dc_2"), vertex["count"] > 1
+        rgb, compared = 0.5 + 0.28209479177387814 * stack(vertex, "f_dc_0", "f_dc_1", "f_dc_2"), vertex["views"] > 0
         brightness = (rgb @ [0.3, 0.6, 0.1])[compared][np.argsort(vertex["disagreement"][compared])]
         assert (np.diff(brightness) >= -1e-6).all()
         np.testing.assert_allclose(rgb[~compared], 150 / 255, atol=1e-6)

@@ -57,7 +57,7 @@ def fuse(
         turn = pairs.match & (order == position)  # [B, C, K], at most one c for every k
         mixture = _fuse_one_each(mixture, current, turn, pairs, weight, config)
     counts = pairs.match.any(dim=1) & (weight > 0)
-    changes = {"evidence": mixture.evidence.double() + weight, "view": after_view(mixture, view, weight)}
+    changes = {"views": mixture.views.double() + weight, "reference": after_view(mixture, view, weight)}
     return mixture.replace(**{name: _where(counts, value, getattr(mixture, name)) for name, value in changes.items()})
 
 
@@ -115,7 +115,7 @@ def _where(used: Tensor, new: Tensor, old: Tensor) -> Tensor:
 def append(
     mixture: GaussianMixture, current: GaussianMixture, new: Tensor, view: Tensor, config: UfMStarConfig
 ) -> tuple[GaussianMixture, Tensor]:
-    """Add first observations to the mixture, M_i <- M_(i-1) with G_c: m = 0, no evidence.
+    """Add first observations to the mixture, M_i <- M_(i-1) with G_c: m = 0, n = 0.
 
     Occupied slots come first; the new components follow in increasing c. Their covariances must survive rounding to the
     mixture's dtype (``gaussian.storage_floor``).
@@ -139,10 +139,10 @@ def append(
 
     placed = {name: scattered(old, getattr(current, name)) for name, old in mixture.tensors().items()}
     zero = torch.zeros_like(current.weight)
-    placed["disagreement"], placed["evidence"] = (scattered(x, zero) for x in (mixture.disagreement, mixture.evidence))
+    placed["disagreement"], placed["views"] = (scattered(x, zero) for x in (mixture.disagreement, mixture.views))
     placed["compared"] = scattered(mixture.compared, first_weight(current.weight, config))
     first = torch.cat([view, torch.zeros_like(view[:, :1])], 1)
-    placed["view"] = scattered(mixture.view, first[:, None].expand(b, current.capacity, first.shape[1]))
+    placed["reference"] = scattered(mixture.reference, first[:, None].expand(b, current.capacity, first.shape[1]))
     return GaussianMixture(**placed), (new & ~fits).sum(dim=1)
 
 

@@ -38,7 +38,7 @@ def reduced(image: Tensor) -> Tensor:
 
 
 def shows_something(grey: Tensor) -> Tensor:
-    """[B] False where a reduced image [B, 1, h, w] has too little detail, or is almost everywhere black or saturated."""
+    """[B] False where a reduced image [B, 1, h, w] lacks detail, or is almost everywhere black or saturated."""
     around = avg_pool2d(grey, 3, 1, 1, count_include_pad=False)
     detail = (grey - around).square().mean((1, 2, 3)).sqrt()
     exposed = ((grey > _DARK) & (grey < _BRIGHT)).float().mean((1, 2, 3))
@@ -103,7 +103,9 @@ class ImageCheck:
             text = f"{_IMAGES} images in a row show nothing (black, saturated, blurred, or a covered lens): their "
             yield b, "empty", text + "depth is a guess, so it counts as unmeasured"
         for b in (self._frozen == _IMAGES).nonzero().flatten().tolist():
-            text = f"the image was the same in {_IMAGES + 1} frames of a moving camera: is it updated? Its depth counts "
+            text = (
+                f"the image was the same in {_IMAGES + 1} frames of a moving camera: is it updated? Its depth counts "
+            )
             yield b, "frozen", text + "as unmeasured"
 
     def _moving(self, grey: Tensor) -> Iterator[tuple[int, str, str]]:
@@ -111,7 +113,9 @@ class ImageCheck:
         for b in due.nonzero().flatten().tolist():
             both = torch.stack([grey[b].flatten(), self._first[b].flatten()])
             if float(torch.corrcoef(both)[0, 1]) < _SAME_SCENE:
-                text = f"the pose was the same in {int(self._still[b]) + 1} images, which show different scenes: is the "
+                text = (
+                    f"the pose was the same in {int(self._still[b]) + 1} images, which show different scenes: is the "
+                )
                 yield b, "pose", text + "pose updated, and has SLAM started?"
 
 

@@ -9,7 +9,7 @@ Every ``merge.every`` frames, two rules reduce the mixture; both are pure functi
     W = W_i + W_j,      m = (W_i m_i + W_j m_j) / W,                 n = n_i + n_j,
     Sigma = a Sigma_i + (1-a) Sigma_j + a (1-a) (mu_i - mu_j)(mu_i - mu_j)^T,
 
-which preserve the sums of pi, pi mu, pi (Sigma + mu mu^T) and W m over the mixture (in the paper W = pi); the last view
+which preserve the sums of pi, pi mu, pi (Sigma + mu mu^T) and W m over the mixture (in the paper W = pi); the reference view
 is that of the heavier component. Runnalls (IEEE TAES 43, 2007)
 bounds the Kullback-Leibler divergence of the reduced mixture from the original; per pixel of the lighter component, the
 bound is
@@ -19,7 +19,7 @@ bound is
 0 for equal components and KL(lighter || heavier) in the limit of a weightless lighter one. A pair within ``merge.loss``
 overlaps so much that the regression mixes the two anyway. In each round, pairs join that are mutually best.
 
-A component with evidence does not join a heavier one without, because the unmeasured surface would then count as
+A component of which views were compared does not join a heavier one without, because the unmeasured surface would then count as
 measured.
 
 **Dissolve.** A component's weight share at its own points, s_k = mean of w_k(x) over the cubature points
@@ -90,7 +90,7 @@ class _MergeFrame(FrameExtension):
     def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
         """Merge the due streams, and count the components."""
         state = merged(state, self._frame.fault == 0, self._config)
-        alone = state.mixture.valid & (state.evidence == 0)
+        alone = state.mixture.valid & (state.views == 0)
         counts = {"components": state.mixture.components, "single_view": alone.sum(1)}
         return state, replace(out, statistics=replace(out.statistics, **counts))
 
@@ -199,8 +199,8 @@ def _close_pairs(g: Components, fresh: Tensor, limit: float) -> tuple[Tensor, Te
         volume = _log_det(_joint(first, second)["covariance"]) - a * log_det[pair[0]] - b * log_det[pair[1]]
         loss = 0.5 * volume / torch.minimum(a, b)
         lighter_first = first["weight"] < second["weight"]
-        lighter = torch.where(lighter_first, first["evidence"], second["evidence"])
-        heavier = torch.where(lighter_first, second["evidence"], first["evidence"])
+        lighter = torch.where(lighter_first, first["views"], second["views"])
+        heavier = torch.where(lighter_first, second["views"], first["views"])
         within = (loss <= limit) & ~((lighter > 0) & (heavier == 0))
         found.append((pair[:, within], loss[within]))
     return torch.cat([pair for pair, _ in found], 1), torch.cat([loss for _, loss in found])
@@ -236,8 +236,8 @@ def _joint(g: Components, h: Components) -> Components:
     return {name: average(name) for name in ("mean", "features")} | {
         "covariance": average("covariance") + between,
         "disagreement": torch.where(compared > 0, weighted / compared, torch.zeros_like(weighted)),
-        "view": torch.where((a >= b)[:, None], g["view"], h["view"]),
-        **{name: g[name] + h[name] for name in ("weight", "compared", "evidence", "sums")},
+        "reference": torch.where((a >= b)[:, None], g["reference"], h["reference"]),
+        **{name: g[name] + h[name] for name in ("weight", "compared", "views", "sums")},
     }
 
 

@@ -22,8 +22,8 @@ class GaussianMixture:
         weight: [B, K] pi, the number of pixels observed so far [px]; 0 = empty slot.
         disagreement: [B, K] m, the mean squared 2-Wasserstein distance of the comparisons that counted [m^2].
         compared: [B, K] weight of m, the sum of w pi_c over these comparisons (``views``) [px].
-        evidence: [B, K] n, the sum of w over the views that were compared; 0 = seen in a single view.
-        view: [B, K, 5] the reference view (``views``): the camera's centre in the first camera's frame [m], the index
+        views: [B, K] n, the sum of w over the views that were compared; 0 = seen in a single view.
+        reference: [B, K, 5] the reference view (``views``): the camera's centre in the first camera's frame [m], the index
             of the network, and the largest change q of the view since.
         features: [B, K, F] further entries of H, running averages in the caller's units.
     """
@@ -33,8 +33,8 @@ class GaussianMixture:
     weight: Tensor
     disagreement: Tensor
     compared: Tensor
-    evidence: Tensor
-    view: Tensor
+    views: Tensor
+    reference: Tensor
     features: Tensor
 
     @classmethod
@@ -87,7 +87,7 @@ class GaussianMixture:
     def rigid(self, R: Tensor, t: Tensor) -> GaussianMixture:
         """The mixture in another frame (section "Projection to the Image Plane", step 1).
 
-        mu <- R mu + t, Sigma <- R Sigma R^T; empty slots stay zero. ``view`` stays in the frame of the mixture's first
+        mu <- R mu + t, Sigma <- R Sigma R^T; empty slots stay zero. ``reference`` stays in the frame of the mixture's first
         camera.
 
         Args:
@@ -122,7 +122,7 @@ class GaussianMixture:
         slots = b, k = self.weight.shape
         expected = {
             "mean": (b, k, 3), "covariance": (b, k, 3, 3), "disagreement": slots, "compared": slots,
-            "evidence": slots, "view": (b, k, 5),
+            "views": slots, "reference": (b, k, 5),
         }  # fmt: skip
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:

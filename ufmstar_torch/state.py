@@ -19,7 +19,7 @@ class UfMStarState:
     """The state of B streams. The tensors' names are the keys of a saved state (``UfMStar.state_dict``).
 
     Attributes:
-        mean, covariance, weight, disagreement, compared, evidence, view, features: M_i (:class:`GaussianMixture`) in
+        mean, covariance, weight, disagreement, compared, views, reference, features: M_i (:class:`GaussianMixture`) in
             the frame of each stream's first camera.
         T_world_first: [B, 4, 4] float64 pose of that camera; identity before the first frame.
         started: [B] bool, True after the first frame of a stream.
@@ -36,8 +36,8 @@ class UfMStarState:
     weight: Tensor
     disagreement: Tensor
     compared: Tensor
-    evidence: Tensor
-    view: Tensor
+    views: Tensor
+    reference: Tensor
     features: Tensor
     T_world_first: Tensor
     started: Tensor
@@ -87,7 +87,7 @@ class UfMStarState:
         image = tuple(self.smoothed.shape[1:]) if self.smoothed.dim() == 3 else ("H", "W")
         shapes = {
             "mean": (b, k, 3), "covariance": (b, k, 3, 3), "disagreement": (b, k), "compared": (b, k),
-            "evidence": (b, k), "view": (b, k, 5),
+            "views": (b, k), "reference": (b, k, 5),
             "features": (b, k, config.entries), "T_world_first": (b, 4, 4), "started": (b,), "frames": (b,),
             "skipped": (b,), "smoothed": (b, *image),
             **{name: (b, k, *value.shape[2:]) for name, value in like.by_component.items()},
@@ -104,7 +104,7 @@ class UfMStarState:
         for name, value in self.tensors().items():
             if not bool((value.isfinite() | value.isnan() if name == "smoothed" else value.isfinite()).all()):
                 raise ValueError(f"{name} holds NaN or infinity")
-        for name in ("weight", "disagreement", "compared", "evidence", "frames", "skipped", "smoothed"):
+        for name in ("weight", "disagreement", "compared", "views", "frames", "skipped", "smoothed"):
             if bool((getattr(self, name) < 0).any()):
                 raise ValueError(f"{name} holds negative values")
         occupied = self.weight > 0

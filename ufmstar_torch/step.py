@@ -126,7 +126,7 @@ def step(
         "dropped": gone + dropped + (current_cam.valid & ~far_enough).sum(1),
         "valid_pixels": frame.valid.sum((1, 2)),
         "unmeasured": (measured < unmeasured.HALF).flatten(1).sum(1),
-        "single_view": (mixture.valid & (mixture.evidence == 0)).sum(1),
+        "single_view": (mixture.valid & (mixture.views == 0)).sum(1),
     }
     disagreement, smoothed = result.disagreement, state.smoothed
     if smooth and config.ema_alpha < 1.0:

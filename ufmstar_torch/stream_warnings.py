@@ -286,5 +286,3 @@ def hardly_compared(alone: int, components: int, frames: int) -> str:
         f"after {frames} frames {alone} of {components} Gaussians were seen in one view alone, so hardly anything is "
     )
     return text + f"compared between views. {_CAUSES}, or views that do not overlap"
-
-

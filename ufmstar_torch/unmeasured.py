@@ -3,7 +3,7 @@
 A surface seen from one view has m = 0 because nothing was compared. Far from all components, M is the prior's mean. In
 the paper both count as certain. The share of a pixel's M that rests on surfaces seen from two or more views,
 
-    s(x) = sum of w_k(x) (1 - exp(-n_k))  with the evidence n_k (``views``),
+    s(x) = sum of w_k(x) (1 - exp(-n_k))  with the number of views n_k (``views``),
 
 is regressed as an additional feature. It is 0 for an image that shows nothing (``FrameInput.informative``). A pixel
 counts as measured where s is at least one half.
@@ -26,7 +26,7 @@ HALF = 0.5
 
 def before_regression(mixture: GaussianMixture) -> GaussianMixture:
     """The mixture [B, K] with an additional feature, the share 1 - exp(-n) to which a component is measured."""
-    share = measured_share(mixture.evidence).to(mixture.features.dtype)
+    share = measured_share(mixture.views).to(mixture.features.dtype)
     return mixture.replace(features=torch.cat([mixture.features, share[..., None]], dim=-1))
 
 

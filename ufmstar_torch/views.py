@@ -11,7 +11,7 @@ reaches ``COMPLETE``, the present view becomes the reference, with q_max = 0. In
 trembles, adds nothing, and a slow one adds as much as a fast one on the same path. A comparison with another network,
 or another random sample of one, has w = 1.
 
-m is the mean of W2^2 with the weights w pi_c. The evidence of a component is n = sum of w, each view once. In the paper
+m is the mean of W2^2 with the weights w pi_c. The number of views of a component is n = sum of w, each view once. In the paper
 every comparison has w = 1, and the first view has the distance 0 in m: ``view_baseline=None``.
 """
 
@@ -38,7 +38,7 @@ def view_weights(mixture: GaussianMixture, view: Tensor, config: UfMStarConfig) 
     weight = torch.ones(mixture.weight.shape, dtype=torch.float64, device=view.device)
     if config.view_baseline is None:
         return weight
-    reference, centre = mixture.view.double(), view[:, None, :3]
+    reference, centre = mixture.reference.double(), view[:, None, :3]
     squared = (centre - reference[..., :3]).square().sum(-1)
     reach = (mixture.mean.double() - centre).square().sum(-1).clamp_min(config.near_plane**2)
     change = -torch.expm1(-squared / (reach * config.view_baseline**2))
@@ -48,7 +48,7 @@ def view_weights(mixture: GaussianMixture, view: Tensor, config: UfMStarConfig) 
 
 def after_view(mixture: GaussianMixture, view: Tensor, weight: Tensor) -> Tensor:
     """The reference views [B, K, 5] after comparisons of ``weight`` [B, K] with a new ``view`` [B, 4]."""
-    reference = mixture.view.double()
+    reference = mixture.reference.double()
     change = reference[..., 4] + weight
     new = torch.cat([view, torch.zeros_like(view[:, :1])], 1)[:, None].expand_as(reference)
     old = torch.cat([reference[..., :4], change[..., None]], -1)
@@ -60,6 +60,6 @@ def first_weight(weight: Tensor, config: UfMStarConfig) -> Tensor:
     return weight if config.view_baseline is None else torch.zeros_like(weight)
 
 
-def measured_share(evidence: Tensor) -> Tensor:
-    """Share in [0, 1] to which a component of evidence n [...] is measured: 1 - exp(-n)."""
-    return -torch.expm1(-evidence)
+def measured_share(views: Tensor) -> Tensor:
+    """Share in [0, 1] to which a component with n ``views`` [...] is measured: 1 - exp(-n)."""
+    return -torch.expm1(-views)

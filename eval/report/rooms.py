@@ -21,7 +21,7 @@ SIGMAS = float(np.sqrt(3.0))
 HEADROOM = 0.3
 ELEVATION = 35.0  # degrees
 _PATH = "#00a6d6"
-_STORED = ("mean_world", "covariance_world", "disagreement", "count", "T_world_cam", "path")
+_STORED = ("mean_world", "covariance_world", "disagreement", "views", "T_world_cam", "path")
 _CELL, _LEFT, _TOP, _BOTTOM = 3.1, 0.1, 0.62, 0.66  # inches
 
 
@@ -33,19 +33,19 @@ class Snapshot:
     mean: Array  # [K, 3] [m]
     covariance: Array  # [K, 3, 3] [m^2]
     disagreement: Array  # [K] m [m^2]
-    count: Array  # [K] views
+    views: Array  # [K], 0 = seen from one view only
     T_world_cam: Array  # [4, 4]
     path: Array  # [n, 3] positions of the camera up to the frame [m]
 
     @property
     def root(self) -> Array:
         """[K] sqrt(m) [m], NaN for Gaussians seen from one view only."""
-        root: Array = np.where(self.count > 1, np.sqrt(np.maximum(self.disagreement, 0)), np.nan)
+        root: Array = np.where(self.views > 0, np.sqrt(np.maximum(self.disagreement, 0)), np.nan)
         return root
 
     def take(self, chosen: NDArray[Any]) -> Snapshot:
         """The snapshot with the Gaussians chosen by an index or a mask."""
-        arrays = {name: getattr(self, name)[chosen] for name in ("mean", "covariance", "disagreement", "count")}
+        arrays = {name: getattr(self, name)[chosen] for name in ("mean", "covariance", "disagreement", "views")}
         return replace(self, **arrays)
 
 

@@ -36,17 +36,18 @@ def write_mixture_ply(path: str | Path, mixture: GaussianMixture, *, T_world_fir
 
     The first attributes are those of 3D Gaussian splatting viewers: x y z [m], nx ny nz (the shortest axis), f_dc_0..2
     (colour), opacity (logit), scale_0..2 = ln sigma [ln m], rot_0..3 = unit quaternion w x y z, so that
-    Sigma = R diag(exp(scale))^2 R^T. The last ones are weight [px], disagreement [m^2] and count. The colour is
-    sqrt(disagreement) in magma from 0 to its 99th percentile, which the header states; components seen from one view
-    are grey. ``T_world_first`` [4, 4] or [1, 4, 4] maps the mixture's frame to the world; None = keep the frame.
+    Sigma = R diag(exp(scale))^2 R^T. The last ones are weight [px], disagreement [m^2] and views (n). The
+    colour is sqrt(disagreement) in magma from 0 to its 99th percentile, which the header states; components seen from
+    one view are grey. ``T_world_first`` [4, 4] or [1, 4, 4] maps the mixture's frame to the world; None = keep the
+    frame.
     """
     parts = Components(mixture, T_world_first)
     quaternion = Rotation.from_matrix(parts.axes).as_quat(canonical=True, scalar_first=True)
     opacity = np.full(len(parts.mean), np.log(OPACITY / (1 - OPACITY)))
     columns = (parts.mean, parts.axes[:, :, 0], (parts.colour / 255 - 0.5) / SH_DC, opacity, np.log(parts.sigma))
     names = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
-    kinds = dict.fromkeys((*names.split(), "weight", "disagreement"), "<f4") | {"count": "<i4"}
-    table = vertex_table(kinds, *columns, quaternion, parts.weight, parts.disagreement, parts.count)
+    kinds = dict.fromkeys((*names.split(), "weight", "disagreement", "views"), "<f4")
+    table = vertex_table(kinds, *columns, quaternion, parts.weight, parts.disagreement, parts.views)
     write_ply(Path(path), table, parts.legend)
     return len(table)
 
@@ -64,14 +65,14 @@ def write_mixture_npz(path: str | Path, mixture: GaussianMixture, *, T_world_fir
 class Components:
     """The occupied components of the first stream in float64, in the world or in the mixture's frame (without
     ``T_world_first``): mean [K, 3] [m]; axes [K, 3, 3], rotations whose columns are the principal axes, shortest first;
-    sigma [K, 3], standard deviations along them [m]; weight, disagreement, count [K]; colour [K, 3] uint8 and its
+    sigma [K, 3], standard deviations along them [m]; weight, disagreement, views [K]; colour [K, 3] uint8 and its
     legend."""
 
     def __init__(self, mixture: GaussianMixture, T_world_first: Tensor | None) -> None:
         used = mixture.valid[0]
-        mean, covariance, self.weight, self.disagreement, self.count = (
+        mean, covariance, self.weight, self.disagreement, self.views = (
             value[0][used].detach().cpu().to(torch.float64).numpy()
-            for value in (mixture.mean, mixture.covariance, mixture.weight, mixture.disagreement, mixture.count)
+            for value in (mixture.mean, mixture.covariance, mixture.weight, mixture.disagreement, mixture.views)
         )
         variance, axes = np.linalg.eigh((covariance + covariance.transpose(0, 2, 1)) / 2)
         axes[np.linalg.det(axes) < 0, :, 2] *= -1
@@ -81,7 +82,7 @@ class Components:
         self.axes: NDArray[np.float64] = R @ axes
         self.sigma: NDArray[np.float64] = np.sqrt(np.maximum(variance, SIGMA_FLOOR**2))
         root = np.sqrt(np.maximum(self.disagreement, 0))
-        root[self.count < 2] = np.nan
+        root[self.views <= 0] = np.nan
         scale = ColourScale(*robust_range([root], from_zero=True), ERROR_MAP)
         self.colour = scale.rgb(root)
         self.legend = f"colour: sqrt(disagreement), {ERROR_MAP} from 0 to {scale.high:.4g} m; grey: seen from one view"

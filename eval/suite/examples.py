@@ -111,7 +111,7 @@ def _room(estimator: Gaussians) -> dict[str, NDArray]:
         "covariance_world": world.covariance,
         "weight": world.weight,
         "disagreement": world.disagreement,
-        "count": world.count,
+        "views": world.views,
     }
     return {name: value[0][world.valid[0]].cpu().numpy() for name, value in named.items()}
 

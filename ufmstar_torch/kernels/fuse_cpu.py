@@ -177,7 +177,7 @@ def view_weight(mean, reference, view, baseline, near):
 
 @leaf
 def fuse_pairs(
-    mean, covariance, weight, disagreement, compared, evidence, views, features,
+    mean, covariance, weight, disagreement, compared, views, references, features,
     mean_c, cov_c, weight_c, features_c, pair_c, pair_k, overlap, distance, view, settings, w, work,
 ):  # fmt: skip
     """Fuse the pairs [P] of one stream in their order, in place.
@@ -193,15 +193,15 @@ def fuse_pairs(
     for p in range(pair_k.size):
         k = pair_k[p]
         if w[k] < 0:
-            w[k] = view_weight(mean[k], views[k], view, baseline, near)
+            w[k] = view_weight(mean[k], references[k], view, baseline, near)
             if w[k] > 0:
-                evidence[k] = np.float64(evidence[k]) + w[k]
-                change = np.float64(views[k, 4]) + w[k]
+                views[k] = np.float64(views[k]) + w[k]
+                change = np.float64(references[k, 4]) + w[k]
                 if change >= COMPLETE:
                     for i in range(4):
-                        views[k, i] = view[i]
+                        references[k, i] = view[i]
                     change = 0.0
-                views[k, 4] = change
+                references[k, 4] = change
     for p in range(pair_c.size):
         c, k = pair_c[p], pair_k[p]
         pi_k = np.float64(weight[k])
@@ -232,7 +232,7 @@ def fuse_pairs(
 
 @leaf
 def append(
-    mean, covariance, weight, disagreement, compared, evidence, views, features,
+    mean, covariance, weight, disagreement, compared, views, references, features,
     mean_c, cov_c, weight_c, features_c, new, occupied, view, baseline,
 ):  # fmt: skip
     """Append the components c where ``new`` [C] from slot ``occupied`` on, in place, until the slots are full; return
@@ -247,10 +247,10 @@ def append(
                 covariance[slot, i, j] = cov_c[c, i, j]
         for g in range(features.shape[1]):
             features[slot, g] = features_c[c, g]
-        weight[slot], disagreement[slot], evidence[slot] = weight_c[c], 0.0, 0.0
+        weight[slot], disagreement[slot], views[slot] = weight_c[c], 0.0, 0.0
         compared[slot] = weight_c[c] if baseline == 0 else 0.0
         for i in range(4):
-            views[slot, i] = view[i]
-        views[slot, 4] = 0.0
+            references[slot, i] = view[i]
+        references[slot, 4] = 0.0
         slot += 1
     return slot

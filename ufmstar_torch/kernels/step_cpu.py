@@ -261,7 +261,7 @@ def _counts(
 ) -> dict[str, Tensor]:
     """Count the step's statistics [B]; ``unmeasured`` holds the pixels that no two views compare."""
     totals = np.zeros((len(_COUNTS), len(pairs)), np.int64)
-    valid, evidence = array(frame.valid), array(joined.mixture["evidence"])
+    valid, views = array(frame.valid), array(joined.mixture["views"])
     for b, (pair, one, new, removed) in enumerate(zip(pairs, joined.seen, joined.new, joined.dropped, strict=True)):
         totals[:, b] = (
             len(one.disagreement),
@@ -272,6 +272,6 @@ def _counts(
             removed + pair.segments - pair.matched - new,  # too many, or too near
             np.count_nonzero(valid[b]),
             unmeasured[b],
-            np.count_nonzero(evidence[b, : len(one.disagreement)] == 0),
+            np.count_nonzero(views[b, : len(one.disagreement)] == 0),
         )
     return dict(zip(_COUNTS, map(torch.from_numpy, totals), strict=True))

@@ -214,7 +214,7 @@ def device_step(
         beyond=frame.beyond,
         out_of_range=frame.out_of_range,
         unmeasured=counts[ends.UNMEASURED],
-        single_view=(mixture.valid & (mixture.evidence == 0)).sum(1),
+        single_view=(mixture.valid & (mixture.views == 0)).sum(1),
         fault=frame.fault,
         rotation_deviation=frame.rotation_deviation,
     )

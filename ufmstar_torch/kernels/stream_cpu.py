@@ -67,7 +67,7 @@ def join(pose, first, member, slots, segments, pairs, distance, new, occupied, s
     Args:
         pose, first: camera-to-world [4, 4] of this frame and of the first.
         member: index of the network.
-        slots: mean, covariance, weight, disagreement, compared, evidence, view and features [K, ...] of the mixture;
+        slots: mean, covariance, weight, disagreement, compared, views, view and features [K, ...] of the mixture;
             changed.
         segments: mean, covariance, weight and features [C, ...] of C_i.
         pairs: c, k and overlap [P].
@@ -80,7 +80,7 @@ def join(pose, first, member, slots, segments, pairs, distance, new, occupied, s
     Returns:
         The n components by field [13, n and more], their disagreement [n] and features [n, F] for the regression.
     """
-    mean, covariance, weight, disagreement, compared, evidence, views, features = slots
+    mean, covariance, weight, disagreement, compared, views, references, features = slots
     mean_c, cov_c, weight_c, features_c = segments
     c, k, overlap = pairs
     work, motion = empty(WORK, np.float64), empty((3, 4), np.float64)
@@ -95,11 +95,11 @@ def join(pose, first, member, slots, segments, pairs, distance, new, occupied, s
         view[i] = motion[i, 3]
     view[3] = member
     fuse_pairs(
-        mean, covariance, weight, disagreement, compared, evidence, views, features, moved, turned, weight_c,
+        mean, covariance, weight, disagreement, compared, views, references, features, moved, turned, weight_c,
         features_c, c, k, overlap, distance, view, settings, empty(weight.size, np.float64), work,
     )  # fmt: skip
     n = append(
-        mean, covariance, weight, disagreement, compared, evidence, views, features, moved, turned, weight_c,
+        mean, covariance, weight, disagreement, compared, views, references, features, moved, turned, weight_c,
         features_c, new, occupied, view, settings[2],
     )  # fmt: skip
     components = empty((FIELDS, padded(n)), np.float64)
@@ -111,5 +111,5 @@ def join(pose, first, member, slots, segments, pairs, distance, new, occupied, s
         m[i] = disagreement[i]
         for f in range(features.shape[1]):
             columns[i, f] = features[i, f]
-        columns[i, columns.shape[1] - 1] = -math.expm1(-np.float64(evidence[i]))
+        columns[i, columns.shape[1] - 1] = -math.expm1(-np.float64(views[i]))
     return components, m, columns

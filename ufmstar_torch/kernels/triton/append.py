@@ -145,7 +145,7 @@ def _cameras(
 @triton.jit
 def _append(
     mean_c, covariance_c, weight_c, features_c, R, t, view, chosen,
-    mean, covariance, weight, disagreement, compared, evidence, reference, features, counts, waiting_mask, needed,
+    mean, covariance, weight, disagreement, compared, views, reference, features, counts, waiting_mask, needed,
     capacity_c, capacity_k, streams,
     near_plane: tl.constexpr, paper: tl.constexpr, again: tl.constexpr, last: tl.constexpr, channels: tl.constexpr,
     padded: tl.constexpr, chunk: tl.constexpr,
@@ -188,7 +188,7 @@ def _append(
         tl.store(weight + k, pi, mask=has_slot)
         tl.store(disagreement + k, pi * 0.0, mask=has_slot)
         tl.store(compared + k, pi if paper else pi * 0.0, mask=has_slot)
-        tl.store(evidence + k, pi * 0.0, mask=has_slot)
+        tl.store(views + k, pi * 0.0, mask=has_slot)
         for i in tl.static_range(4):
             tl.store(reference + 5 * k + i, pi * 0.0 + tl.load(view + 4 * b + i), mask=has_slot)
         tl.store(reference + 5 * k + 4, pi * 0.0, mask=has_slot)

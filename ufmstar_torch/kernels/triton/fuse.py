@@ -124,10 +124,10 @@ def _view(view):
 
 @triton.jit
 def _fuse(
-    mean, covariance, weight, disagreement, compared, evidence, reference, features,
+    mean, covariance, weight, disagreement, compared, views, reference, features,
     mean_c, covariance_c, weight_c, features_c,
     R, t, bits, index_c, position, listed_c, overlap, distances, view,
-    mean_o, covariance_o, weight_o, disagreement_o, compared_o, evidence_o, reference_o, features_o,
+    mean_o, covariance_o, weight_o, disagreement_o, compared_o, views_o, reference_o, features_o,
     capacity_k, capacity_c, words,
     epsilon: tl.constexpr, baseline: tl.constexpr, near: tl.constexpr, complete: tl.constexpr, weighted: tl.constexpr,
     has_distance: tl.constexpr, channels: tl.constexpr, padded: tl.constexpr, word: tl.constexpr, lanes: tl.constexpr,
@@ -150,7 +150,7 @@ def _fuse(
     pi = tl.load(weight + k, mask=inside, other=0.0).to(tl.float64)
     m = tl.load(disagreement + k, mask=inside, other=0.0).to(tl.float64)
     compared_k = tl.load(compared + k, mask=inside, other=0.0).to(tl.float64)
-    n_k = tl.load(evidence + k, mask=inside, other=0.0).to(tl.float64)
+    n_k = tl.load(views + k, mask=inside, other=0.0).to(tl.float64)
     vx, vy, vz, v_member = _view(view + 4 * b)
     rx = tl.load(reference + 5 * k, mask=inside, other=0.0).to(tl.float64)
     ry = tl.load(reference + 5 * k + 1, mask=inside, other=0.0).to(tl.float64)
@@ -232,7 +232,7 @@ def _fuse(
     tl.store(disagreement_o + k, m, mask=inside)
     tl.store(compared_o + k, compared_k, mask=inside)
     any_match = any_match & (w > 0)
-    tl.store(evidence_o + k, tl.where(any_match, n_k + w, n_k), mask=inside)
+    tl.store(views_o + k, tl.where(any_match, n_k + w, n_k), mask=inside)
     change = tl.where(any_match, change + w, change)
     new = any_match & (change >= complete)
     tl.store(reference_o + 5 * k, tl.where(new, vx, rx), mask=inside)

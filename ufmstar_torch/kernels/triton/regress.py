@@ -80,7 +80,7 @@ def regress_frame(
     listed = prepare(mixture, camera, frame.size, depth.dtype, config, to_camera)
     _launch(
         mixture, listed, depth, frame.valid, camera, depth, maps, features, config, subset=False,
-        stepped=(mixture.evidence, _informative(frame), memory, updated, measured, counts),
+        stepped=(mixture.views, _informative(frame), memory, updated, measured, counts),
         alpha=config.ema_alpha if average else 1.0,
     )  # fmt: skip
     return FrameRegression(maps, features, measured, updated)
@@ -119,7 +119,7 @@ def _launch(
     launch(
         _regress, (triton.cdiv(chosen, _SIDE * _SIDE) if subset else tiles, b),
         depth, valid.contiguous(), camera, pixels, *listed, mixture.disagreement.contiguous(),
-        mixture.features.contiguous(), maps, features, *(stepped or (mixture.evidence, *5 * [depth])),
+        mixture.features.contiguous(), maps, features, *(stepped or (mixture.views, *5 * [depth])),
         height, width, chosen, mixture.capacity, b, fused=True,
         prior=config.prior_weight, prior_total=config.prior_weight * config.prior_mean,
         least=math.log2(PRIOR * config.prior_weight), share=math.log2(EPSILON[depth.dtype] / 3) - 0.01,
@@ -172,7 +172,7 @@ def _bounds(means, fields, capacity, j, listed, cx, cy, cz, hx, hy, hz, slack: t
 @triton.jit
 def _regress(
     depth, valid, camera, pixels, means, fields, index, count, m, features, out, out_f,
-    evidence_k, informative, running, memory, measured, counts, height, width, chosen, capacity, streams,
+    views_k, informative, running, memory, measured, counts, height, width, chosen, capacity, streams,
     prior: tl.constexpr, prior_total: tl.constexpr, least: tl.constexpr, share: tl.constexpr, slack: tl.constexpr,
     channels: tl.constexpr, padded: tl.constexpr, side: tl.constexpr, chunk: tl.constexpr, subset: tl.constexpr,
     stepped: tl.constexpr, alpha: tl.constexpr, mode: tl.constexpr, relative: tl.constexpr,
@@ -251,7 +251,7 @@ def _regress(
             k = b * capacity + tl.load(index + j)
             evidence += w
             if stepped:
-                compared_sum += w * (1 - tl.exp(-tl.load(evidence_k + k).to(tl.float64))).to(real)
+                compared_sum += w * (1 - tl.exp(-tl.load(views_k + k).to(tl.float64))).to(real)
             total += w * tl.load(m + k).to(real)
             if channels > 0:
                 value = tl.load(features + k * channels + f, mask=f < channels, other=0.0).to(real)
