@@ -78,7 +78,7 @@ class ImageCheck:
             self._empty, self._frozen = self._still.clone(), self._still.clone()
             moved = same = torch.zeros_like(self._still, dtype=torch.bool)
         else:
-            moved = (T != self._last[1]).flatten(1).any(1)
+            moved = (self._last[1] != T).flatten(1).any(1)
             same = (grey == self._last[0]).flatten(1).all(1)
         shows = shows_something(grey)
         frozen = same & moved

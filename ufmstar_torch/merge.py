@@ -9,18 +9,17 @@ Every ``merge.every`` frames, two rules reduce the mixture; both are pure functi
     W = W_i + W_j,      m = (W_i m_i + W_j m_j) / W,                 n = n_i + n_j,
     Sigma = a Sigma_i + (1-a) Sigma_j + a (1-a) (mu_i - mu_j)(mu_i - mu_j)^T,
 
-which preserve the sums of pi, pi mu, pi (Sigma + mu mu^T) and W m over the mixture (in the paper W = pi); the reference view
-is that of the heavier component. Runnalls (IEEE TAES 43, 2007)
-bounds the Kullback-Leibler divergence of the reduced mixture from the original; per pixel of the lighter component, the
-bound is
+which preserve the sums of pi, pi mu, pi (Sigma + mu mu^T) and W m over the mixture (in the paper W = pi); the reference
+view is that of the heavier component. Runnalls (IEEE TAES 43, 2007) bounds the Kullback-Leibler divergence of the
+reduced mixture from the original; per pixel of the lighter component, the bound is
 
     l(i, j) = [log|Sigma| - a log|Sigma_i| - (1-a) log|Sigma_j|] / (2 min(a, 1-a))   [nat],
 
 0 for equal components and KL(lighter || heavier) in the limit of a weightless lighter one. A pair within ``merge.loss``
 overlaps so much that the regression mixes the two anyway. In each round, pairs join that are mutually best.
 
-A component of which views were compared does not join a heavier one without, because the unmeasured surface would then count as
-measured.
+A component of which views were compared does not join a heavier one without, because the unmeasured surface would then
+count as measured.
 
 **Dissolve.** A component's weight share at its own points, s_k = mean of w_k(x) over the cubature points
 mu_k +- sqrt(3) L_k e_i (L_k L_k^T = Sigma_k), falls as others are observed repeatedly. Removing it changes a regressed

@@ -23,8 +23,8 @@ class GaussianMixture:
         disagreement: [B, K] m, the mean squared 2-Wasserstein distance of the comparisons that counted [m^2].
         compared: [B, K] weight of m, the sum of w pi_c over these comparisons (``views``) [px].
         views: [B, K] n, the sum of w over the views that were compared; 0 = seen in a single view.
-        reference: [B, K, 5] the reference view (``views``): the camera's centre in the first camera's frame [m], the index
-            of the network, and the largest change q of the view since.
+        reference: [B, K, 5] the reference view (``views``): the camera's centre in the first camera's frame [m], the
+            index of the network, and the largest change q of the view since.
         features: [B, K, F] further entries of H, running averages in the caller's units.
     """
 
@@ -87,8 +87,8 @@ class GaussianMixture:
     def rigid(self, R: Tensor, t: Tensor) -> GaussianMixture:
         """The mixture in another frame (section "Projection to the Image Plane", step 1).
 
-        mu <- R mu + t, Sigma <- R Sigma R^T; empty slots stay zero. ``reference`` stays in the frame of the mixture's first
-        camera.
+        mu <- R mu + t, Sigma <- R Sigma R^T; empty slots stay zero. ``reference`` stays in the frame of the
+        mixture's first camera.
 
         Args:
             R: [B, 3, 3] rotation from the current frame into the new one.

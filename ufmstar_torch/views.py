@@ -11,8 +11,8 @@ reaches ``COMPLETE``, the present view becomes the reference, with q_max = 0. In
 trembles, adds nothing, and a slow one adds as much as a fast one on the same path. A comparison with another network,
 or another random sample of one, has w = 1.
 
-m is the mean of W2^2 with the weights w pi_c. The number of views of a component is n = sum of w, each view once. In the paper
-every comparison has w = 1, and the first view has the distance 0 in m: ``view_baseline=None``.
+m is the mean of W2^2 with the weights w pi_c. The number of views of a component is n = sum of w, each view once. In
+the paper every comparison has w = 1, and the first view has the distance 0 in m: ``view_baseline=None``.
 """
 
 from __future__ import annotations

@@ -67,8 +67,8 @@ def join(pose, first, member, slots, segments, pairs, distance, new, occupied, s
     Args:
         pose, first: camera-to-world [4, 4] of this frame and of the first.
         member: index of the network.
-        slots: mean, covariance, weight, disagreement, compared, views, view and features [K, ...] of the mixture;
-            changed.
+        slots: mean, covariance, weight, disagreement, compared, views, reference and features [K, ...] of the
+            mixture; changed.
         segments: mean, covariance, weight and features [C, ...] of C_i.
         pairs: c, k and overlap [P].
         distance: as :func:`fuse_pairs`.

@@ -1,0 +1,217 @@
+"""Two views from one place are one view, and an image that shows nothing is no view."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from modules import CONFIG, DEPTHS, POSES, H, K, W
+
+import scenes
+from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch.image_check import ImageCheck, reduced, shows_something
+from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.models import Preprocess, wrap_network
+from ufmstar_torch.views import COMPLETE, after_view, view_weights
+
+pytestmark = pytest.mark.numerics
+CONFIG = CONFIG.replace(unmeasured="relative")
+REST = 60  # frames
+
+
+def at_rest(ufm: UfMStar, *, frames: int = REST, tremble: float = 0.0, members: int = 1, seed: int = 0):
+    """The output after ``frames`` flickering views of one scene from one place."""
+    rng = np.random.default_rng(seed)
+    for i in range(frames):
+        pose = POSES[0].copy()
+        pose[:3, 3] += tremble * rng.standard_normal(3)
+        depth = scenes.flicker(DEPTHS[0], 0.002, i) * (1 + 0.2 * (i % members))
+        out = ufm(torch.tensor(depth)[None].float(), torch.tensor(pose)[None], K[None], member=i % members)
+    return out
+
+
+@pytest.mark.parametrize("tremble", [0.0, 0.002])
+def test_a_camera_at_rest_measures_nothing(tremble):
+    """Sigma stays that of an unmeasured pixel, 20 % of the depth, also if the camera trembles by 2 mm; with the paper's
+    rule it falls to a share of that."""
+    out = at_rest(UfMStar(CONFIG), tremble=tremble)
+    assert float(out.measured.nanmean()) < 0.1
+    ratio = (out.std / out.depth)[out.valid]
+    torch.testing.assert_close(ratio, torch.full_like(ratio, 0.2), rtol=0.05, atol=0)
+    paper = at_rest(UfMStar(CONFIG.replace(view_baseline=None)), tremble=tremble)
+    assert float((paper.std / paper.depth)[paper.valid].median()) < 0.05
+
+
+def test_networks_in_turn_measure_at_rest():
+    """That is what alternating is for: two networks that differ by 20 % disagree, from one place as well."""
+    out = at_rest(UfMStar(CONFIG), members=2)
+    assert float(out.measured.nanmean()) > 0.9
+    ratio = (out.std / out.depth)[out.valid]
+    assert 0.03 < float(ratio.median()) < 0.15
+
+
+def test_standing_still_after_a_walk_changes_little():
+    ufm, rng = UfMStar(CONFIG), np.random.default_rng(1)
+    for depth, pose in zip(DEPTHS, POSES, strict=True):
+        walked = ufm(torch.tensor(depth)[None].float(), torch.tensor(pose)[None], K[None])
+    before = walked.std.clone()
+    for i in range(300):
+        pose = POSES[-1].copy()
+        pose[:3, 3] += 0.001 * rng.standard_normal(3)
+        depth = scenes.flicker(DEPTHS[-1], 0.002, i)
+        out = ufm(torch.tensor(depth)[None].float(), torch.tensor(pose)[None], K[None])
+    both = out.valid & walked.valid
+    change = float(out.std[both].mean() / before[both].mean())
+    assert change == pytest.approx(1, abs=0.1)
+    assert abs(float(out.measured.nanmean() - walked.measured.nanmean())) < 0.1
+
+
+def component(distance: float) -> GaussianMixture:
+    """One component at this distance along z, first seen from the origin."""
+    fields = {"mean": torch.tensor([[[0.0, 0.0, distance]]]).double(), "weight": torch.ones(1, 1).double()}
+    return GaussianMixture.empty(1, 1, dtype=torch.float64, device="cpu").replace(**fields)
+
+
+def counted(mixture: GaussianMixture, positions: np.ndarray) -> float:
+    """n after comparisons from these positions of the camera [N, 3]."""
+    total = 0.0
+    for position in positions:
+        view = torch.tensor([[*position, 0.0]]).double()
+        weight = view_weights(mixture, view, UfMStarConfig())
+        mixture = mixture.replace(reference=after_view(mixture, view, weight))
+        total += float(weight)
+    return total
+
+
+@given(steps=st.integers(1, 400), share=st.floats(0.05, 0.99), distance=st.floats(0.5, 20))
+def test_a_slow_camera_counts_as_much_as_a_fast_one(steps, share, distance):
+    """On a path to the side that ends before the reference changes, n = 1 - exp(-(b/b_0)^2), however many views there
+    are, and back at the start it is the same."""
+    b_0 = UfMStarConfig().view_baseline
+    longest = b_0 * math.sqrt(-math.log(1 - COMPLETE))
+    b = share * longest
+    x = b * distance / math.sqrt(1 - b * b)  # b = x / sqrt(x^2 + distance^2)
+    path = np.zeros((steps, 3))
+    path[:, 0] = np.linspace(x / steps, x, steps)
+    expected = 1 - math.exp(-((b / b_0) ** 2))
+    there_and_back = np.concatenate([path, path[::-1]])
+    for positions in (path, there_and_back, np.repeat(path, 3, 0)):
+        assert counted(component(distance), positions) == pytest.approx(expected, rel=1e-9)
+
+
+@given(seed=st.integers(0, 10**6), frames=st.integers(1, 200))
+def test_trembling_counts_no_more_than_its_largest_step(seed, frames):
+    positions = 0.004 * np.random.default_rng(seed).uniform(-1, 1, (frames, 3))
+    largest = np.linalg.norm(positions, axis=1).max() / (2 - 0.004)
+    limit = 1 - math.exp(-((largest / UfMStarConfig().view_baseline) ** 2))
+    assert counted(component(2.0), positions) <= limit
+
+
+def test_a_path_of_any_length_counts_by_its_baselines():
+    """Ten references on, n is at least ten times ``COMPLETE``."""
+    b_0 = UfMStarConfig().view_baseline
+    step = b_0 * math.sqrt(-math.log(1 - COMPLETE)) * 50
+    path = np.zeros((10, 3))
+    path[:, 1] = 1.01 * step * np.arange(1, 11)
+    n = counted(component(50.0), path)
+    assert 10 * 0.8 < n <= 10
+
+
+def scene(seed: int = 0, height: int = 120, width: int = 160) -> np.ndarray:
+    """A textured image of bytes."""
+    coarse = np.random.default_rng(seed).integers(0, 256, (height // 8, width // 8, 3), dtype=np.uint8)
+    return np.kron(coarse, np.ones((8, 8, 1), np.uint8))
+
+
+def nothing(kind: str) -> np.ndarray:
+    image, rng = scene().astype(float), np.random.default_rng(3)
+    if kind == "covered":  # black with the noise of a sensor
+        return np.clip(rng.normal(4, 3, image.shape), 0, 255).astype(np.uint8)
+    if kind == "blurred":
+        flat = torch.tensor(image).permute(2, 0, 1)[None]
+        small = torch.nn.functional.adaptive_avg_pool2d(flat, 2)
+        return (
+            torch.nn.functional.interpolate(small, image.shape[:2], mode="bicubic")[0].permute(1, 2, 0).byte().numpy()
+        )
+    return np.full_like(image, {"black": 0, "saturated": 255}[kind]).astype(np.uint8)
+
+
+@pytest.mark.parametrize("kind", ["black", "saturated", "covered", "blurred"])
+def test_images_that_show_nothing_are_found(kind):
+    def shows(image):
+        return bool(shows_something(reduced(torch.from_numpy(image).permute(2, 0, 1)[None])))
+
+    assert not shows(nothing(kind))
+    assert shows(scene())
+    noisy = np.clip(scene() + np.random.default_rng(0).normal(0, 20, scene().shape), 0, 255).astype(np.uint8)
+    assert shows(noisy)
+    floats = torch.from_numpy(nothing(kind)).permute(2, 0, 1)[None] / 255
+    assert not bool(ImageCheck().informative(floats, torch.eye(4)))
+
+
+class Guess(torch.nn.Module):
+    """Predicts almost the same depth for every image."""
+
+    def forward(self, x):
+        return 2.6 + 0.3 * (torch.nn.functional.avg_pool2d(x.mean(1, keepdim=True), 21, 1, 10) - 0.5)
+
+
+def walk_of(images, *, moving: bool = True):
+    """The output after the images of a camera that moves to the right, plain UfM*, and the messages logged."""
+    model = UncertainDepth(
+        wrap_network(Guess(), preprocess=Preprocess()), CONFIG.replace(segment=UfMStarConfig().segment)
+    )
+    camera = np.array([[150.0, 0, 79.5], [0, 150, 59.5], [0, 0, 1]])
+    for i, image in enumerate(images):
+        pose = np.eye(4)
+        pose[0, 3] = 0.1 * i * moving
+        out = model(image, pose, camera)
+    return out.ufm
+
+
+def test_a_covered_lens_is_named_and_measures_nothing(caplog):
+    rng = np.random.default_rng(0)
+    images = [np.roll(scene(), -7 * i, 1) for i in range(12)]
+    seen = walk_of(images)
+    assert float(seen.measured.nanmean()) > 0.5
+    assert not [text for text in caplog.messages if "show nothing" in text]
+    covered = [np.clip(rng.normal(4, 3, scene().shape), 0, 255).astype(np.uint8) for _ in range(12)]
+    with caplog.at_level(logging.WARNING, "ufmstar_torch"):
+        out = walk_of(images + covered)
+    assert float(out.measured.nanmean()) == 0
+    assert len([text for text in caplog.messages if "images in a row show nothing" in text]) == 1
+    assert int(out.statistics.segments) == 0
+    assert torch.equal(out.statistics.components, seen.statistics.components)  # the map is as before
+    ratio = (out.std / out.depth)[out.valid]
+    torch.testing.assert_close(ratio, torch.full_like(ratio, 0.2), rtol=0.02, atol=0)
+
+
+def test_a_frozen_image_of_a_moving_camera_measures_nothing(caplog):
+    with caplog.at_level(logging.WARNING, "ufmstar_torch"):
+        out = walk_of([scene()] * 14)
+    assert float(out.measured.nanmean()) == 0
+    assert [text for text in caplog.messages if "the image was the same in 9 frames of a moving camera" in text]
+
+
+def test_equal_poses_of_moving_images_are_named(caplog):
+    with caplog.at_level(logging.WARNING, "ufmstar_torch"):
+        out = walk_of([scene(seed) for seed in range(10)], moving=False)
+    assert [text for text in caplog.messages if "the pose was the same in 9 images, which show different" in text]
+    assert float(out.measured.nanmean()) < 0.1
+    caplog.clear()
+    rng = np.random.default_rng(0)
+    still = [np.clip(scene() + rng.normal(0, 8, scene().shape), 0, 255).astype(np.uint8) for _ in range(20)]
+    with caplog.at_level(logging.WARNING, "ufmstar_torch"):
+        walk_of(still, moving=False)
+    assert not caplog.messages
+
+
+def test_the_arguments_of_a_view_are_checked():
+    ufm, depth = UfMStar(CONFIG), torch.full((1, H, W), 2.0)
+    with pytest.raises(ValueError, match=r"informative must be a bool tensor \[1\]"):
+        ufm(depth, torch.eye(4), K, informative=torch.ones(1))
