@@ -167,12 +167,14 @@ def correspond(previous_cam, current_cam, K, size, eta, eta_occl, near):
 
 def view_weight(component, view, baseline, near):
     """Weight of a comparison: 1 if another network predicted (or baseline is None, the paper), else the increase of
-    1 - exp(-(b/b0)^2), with the baseline b over the distance, beyond its largest value since the reference view."""
+    1 - exp(-(b/b0)^2), with the baseline b over the distance, beyond its largest value since the reference view;
+    0 if that is below .01."""
     if baseline is None or component["reference"][3] != view[3]:
         return 1.0
     distance = max(np.linalg.norm(component["mean"] - view[:3]), near)
     change = 1 - np.exp(-((np.linalg.norm(view[:3] - component["reference"][:3]) / distance / baseline) ** 2))
-    return max(change - component["reference"][4], 0.0)
+    increase = change - component["reference"][4]
+    return increase if increase >= 0.01 else 0.0
 
 
 def fuse(mixture, current, matches, overlaps, view, *, baseline=0.07, near=0.05, overlap_weighted=False,
@@ -189,6 +191,8 @@ def fuse(mixture, current, matches, overlaps, view, *, baseline=0.07, near=0.05,
             fused[k]["reference"] = np.append(view, 0.0) if change >= 0.9 else np.append(reference, change)
     for c, ks in enumerate(matches):  # increasing c for every k
         for k in ks:
+            if counts[k] == 0:
+                continue
             g, new = fused[k], current[c]
             pi_c = new["weight"] * (overlaps[c, k] if overlap_weighted else 1.0)
             lam = pi_c / (g["weight"] + pi_c)
@@ -196,9 +200,8 @@ def fuse(mixture, current, matches, overlaps, view, *, baseline=0.07, near=0.05,
             if distances is not None:
                 distance = distances[c, k]
             g["mean"], g["cov"] = geodesic(g["mean"], g["cov"], new["mean"], new["cov"], lam)
-            if counts[k] > 0:
-                g["m"] = (g["compared"] * g["m"] + counts[k] * pi_c * distance) / (g["compared"] + counts[k] * pi_c)
-                g["compared"] += counts[k] * pi_c
+            g["m"] = (g["compared"] * g["m"] + counts[k] * pi_c * distance) / (g["compared"] + counts[k] * pi_c)
+            g["compared"] += counts[k] * pi_c
             g["features"] = (1 - lam) * g["features"] + lam * new["features"]
             g["weight"] += pi_c
     for c, ks in enumerate(matches):

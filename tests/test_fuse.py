@@ -16,6 +16,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
 from ufmstar_torch.fuse import append, fuse
 from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.views import view_weights
 
 pytestmark = pytest.mark.numerics
 
@@ -59,10 +60,12 @@ def test_each_fusion_adds_exactly_its_weight(backend, seed):
     previous = previous.replace(weight=previous.weight.round())
     current = current.replace(weight=current.weight.round())
     pairs = random_pairs(1, previous, current, seed)
-    fused = backend.kernels.fuse(previous, current, pairs, views(1, seed), UfMStarConfig())
-    added = torch.einsum("bck,bc->bk", pairs.match.double(), current.weight)
+    config, view = UfMStarConfig(), views(1, seed)
+    fused = backend.kernels.fuse(previous, current, pairs, view, config)
+    match = pairs.match & (view_weights(previous, view, config) > 0)[:, None]
+    added = torch.einsum("bck,bc->bk", match.double(), current.weight)
     assert torch.equal(fused.weight, previous.weight + added)
-    untouched = ~pairs.match.any(1)
+    untouched = ~match.any(1)
     for name, value in fused.tensors().items():
         assert torch.equal(value[untouched], getattr(previous, name)[untouched])
 

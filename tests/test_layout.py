@@ -145,6 +145,8 @@ def test_kernels_import_back_only_plain_types():
         "FOCAL_RANGE",
         "LARGEST",
         "POLAR_STEPS",
+        "COMPLETE",
+        "LEAST",
     }
     for path in (ROOT / "ufmstar_torch" / "kernels").glob("*_cpu.py"):
         if path.stem in ("step_cpu", "anchors_cpu", "neighbours_cpu"):

@@ -10,28 +10,43 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from modules import CONFIG, DEPTHS, POSES, H, K, W
 
-import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.image_check import ImageCheck, reduced, shows_something
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.models import Preprocess, wrap_network
-from ufmstar_torch.views import COMPLETE, after_view, view_weights
+from ufmstar_torch.views import COMPLETE, LEAST, after_view, view_weights
 
 pytestmark = pytest.mark.numerics
-CONFIG = CONFIG.replace(unmeasured="relative")
+CONFIG = UfMStarConfig()
 REST = 60  # frames
+H, W = 96, 128
+K = torch.tensor([[100.0, 0, 63.5], [0, 100, 47.5], [0, 0, 1]])
+
+
+def room(x: float, flicker: int) -> torch.Tensor:
+    """Depth of a wall at 2.5 m and a box in front of it, seen from ``x`` m to the right, with a flicker of .2 %."""
+    u = torch.arange(W)[None] + 0 * torch.arange(H)[:, None]
+    box = ((u - 63.5) / 100 * 1.8 + x).abs() < 0.5
+    noise = 0.002 * torch.randn(6, 8, generator=torch.Generator().manual_seed(flicker))
+    smooth = torch.nn.functional.interpolate(noise[None, None], (H, W), mode="bilinear")[0, 0]
+    return torch.where(box, 1.8, 2.5) * (1 + smooth)
+
+
+def pose_at(x: float, tremble: float = 0.0, rng: np.random.Generator | None = None) -> torch.Tensor:
+    T = torch.eye(4, dtype=torch.float64)
+    T[0, 3] = x
+    if rng is not None:
+        T[:3, 3] += torch.tensor(tremble * rng.standard_normal(3))
+    return T
 
 
 def at_rest(ufm: UfMStar, *, frames: int = REST, tremble: float = 0.0, members: int = 1, seed: int = 0):
     """The output after ``frames`` flickering views of one scene from one place."""
     rng = np.random.default_rng(seed)
     for i in range(frames):
-        pose = POSES[0].copy()
-        pose[:3, 3] += tremble * rng.standard_normal(3)
-        depth = scenes.flicker(DEPTHS[0], 0.002, i) * (1 + 0.2 * (i % members))
-        out = ufm(torch.tensor(depth)[None].float(), torch.tensor(pose)[None], K[None], member=i % members)
+        depth = room(0, i) * (1 + 0.2 * (i % members))
+        out = ufm(depth[None], pose_at(0, tremble, rng)[None], K[None], member=i % members)
     return out
 
 
@@ -57,18 +72,15 @@ def test_networks_in_turn_measure_at_rest():
 
 def test_standing_still_after_a_walk_changes_little():
     ufm, rng = UfMStar(CONFIG), np.random.default_rng(1)
-    for depth, pose in zip(DEPTHS, POSES, strict=True):
-        walked = ufm(torch.tensor(depth)[None].float(), torch.tensor(pose)[None], K[None])
-    before = walked.std.clone()
+    end = 0.4
+    for i, x in enumerate([*np.linspace(0, end, 15), *[end] * 10]):  # the moving average follows
+        walked = ufm((room(x, i) * (1 + 0.1 * math.sin(9 * x)))[None], pose_at(x)[None], K[None])
     for i in range(300):
-        pose = POSES[-1].copy()
-        pose[:3, 3] += 0.001 * rng.standard_normal(3)
-        depth = scenes.flicker(DEPTHS[-1], 0.002, i)
-        out = ufm(torch.tensor(depth)[None].float(), torch.tensor(pose)[None], K[None])
-    both = out.valid & walked.valid
-    change = float(out.std[both].mean() / before[both].mean())
-    assert change == pytest.approx(1, abs=0.1)
-    assert abs(float(out.measured.nanmean() - walked.measured.nanmean())) < 0.1
+        depth = room(end, 100 + i) * (1 + 0.1 * math.sin(9 * end))
+        out = ufm(depth[None], pose_at(end, 0.001, rng)[None], K[None])
+    assert float(walked.measured.mean()) > 0.5
+    assert float(out.std.mean() / walked.std.mean()) == pytest.approx(1, abs=0.1)
+    assert float(out.measured.mean() - walked.measured.mean()) == pytest.approx(0, abs=0.05)
 
 
 def component(distance: float) -> GaussianMixture:
@@ -101,7 +113,7 @@ def test_a_slow_camera_counts_as_much_as_a_fast_one(steps, share, distance):
     expected = 1 - math.exp(-((b / b_0) ** 2))
     there_and_back = np.concatenate([path, path[::-1]])
     for positions in (path, there_and_back, np.repeat(path, 3, 0)):
-        assert counted(component(distance), positions) == pytest.approx(expected, rel=1e-9)
+        assert counted(component(distance), positions) == pytest.approx(expected, abs=LEAST)
 
 
 @given(seed=st.integers(0, 10**6), frames=st.integers(1, 200))
@@ -113,13 +125,11 @@ def test_trembling_counts_no_more_than_its_largest_step(seed, frames):
 
 
 def test_a_path_of_any_length_counts_by_its_baselines():
-    """Ten references on, n is at least ten times ``COMPLETE``."""
-    b_0 = UfMStarConfig().view_baseline
-    step = b_0 * math.sqrt(-math.log(1 - COMPLETE)) * 50
+    """Ten steps up and down, each as long as to the next reference, are ten views."""
+    step = CONFIG.view_baseline * math.sqrt(-math.log(1 - COMPLETE)) * 50
     path = np.zeros((10, 3))
-    path[:, 1] = 1.01 * step * np.arange(1, 11)
-    n = counted(component(50.0), path)
-    assert 10 * 0.8 < n <= 10
+    path[::2, 1] = 1.05 * step
+    assert 10 * COMPLETE < counted(component(50.0), path) <= 10
 
 
 def scene(seed: int = 0, height: int = 120, width: int = 160) -> np.ndarray:
@@ -163,9 +173,7 @@ class Guess(torch.nn.Module):
 
 def walk_of(images, *, moving: bool = True):
     """The output after the images of a camera that moves to the right, plain UfM*, and the messages logged."""
-    model = UncertainDepth(
-        wrap_network(Guess(), preprocess=Preprocess()), CONFIG.replace(segment=UfMStarConfig().segment)
-    )
+    model = UncertainDepth(wrap_network(Guess(), preprocess=Preprocess()))
     camera = np.array([[150.0, 0, 79.5], [0, 150, 59.5], [0, 0, 1]])
     for i, image in enumerate(images):
         pose = np.eye(4)
@@ -188,7 +196,7 @@ def test_a_covered_lens_is_named_and_measures_nothing(caplog):
     assert int(out.statistics.segments) == 0
     assert torch.equal(out.statistics.components, seen.statistics.components)  # the map is as before
     ratio = (out.std / out.depth)[out.valid]
-    torch.testing.assert_close(ratio, torch.full_like(ratio, 0.2), rtol=0.02, atol=0)
+    torch.testing.assert_close(ratio, torch.full_like(ratio, 0.2), rtol=0.1, atol=0)
 
 
 def test_a_frozen_image_of_a_moving_camera_measures_nothing(caplog):

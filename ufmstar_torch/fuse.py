@@ -36,8 +36,9 @@ def fuse(
     lambda = pi_c / (pi_k + pi_c): mean and covariance move by lambda along the optimal-transport geodesic, features are
     averaged with lambda, pi_k <- pi_k + pi_c. With the weight w_k of the comparison (``views``; 1 in the paper) and
     rho = w_k pi_c / (W_k + w_k pi_c): m_k <- (1-rho) m_k + rho W2^2(G_k, G_c), W_k <- W_k + w_k pi_c; in the paper
-    rho = lambda. Where w_k > 0, n_k <- n_k + w_k. ``pairs.distance`` replaces W2^2 if it is not None. A c that matches
-    several k is fused into each of them with its full weight.
+    rho = lambda. n_k <- n_k + w_k. Where w_k = 0, k is unchanged: it would only weigh more against its neighbours.
+    ``pairs.distance`` replaces W2^2 if it is not None. A c that matches several k is fused into each of them with its
+    full weight.
 
     Args:
         mixture: M_(i-1), [B, K], in the first camera's frame.
@@ -49,14 +50,15 @@ def fuse(
     Returns:
         The updated mixture, [B, K]; components without a match are unchanged to the last bit.
     """
-    order = pairs.match.cumsum(dim=1)  # 1-based position of c among the matches of k
+    weight = view_weights(mixture, view, config)
+    match = pairs.match & (weight > 0)[:, None]
+    order = match.cumsum(dim=1)  # 1-based position of c among the matches of k
     if rounds is None:
         rounds = int(order[:, -1:].max()) if order.numel() else 0
-    weight = view_weights(mixture, view, config)
     for position in range(1, rounds + 1):
-        turn = pairs.match & (order == position)  # [B, C, K], at most one c for every k
+        turn = match & (order == position)  # [B, C, K], at most one c for every k
         mixture = _fuse_one_each(mixture, current, turn, pairs, weight, config)
-    counts = pairs.match.any(dim=1) & (weight > 0)
+    counts = match.any(dim=1)
     changes = {"views": mixture.views.double() + weight, "reference": after_view(mixture, view, weight)}
     return mixture.replace(**{name: _where(counts, value, getattr(mixture, name)) for name, value in changes.items()})
 

@@ -129,7 +129,7 @@ class UfMStar(StatefulModule):
         """
         depth = as_tensor("depth", depth)
         a, e = (None if v is None else as_tensor(n, v) for n, v in (("aleatoric", aleatoric), ("epistemic", epistemic)))
-        frame = self._checked(depth, pose, intrinsics, a, e, valid, features, member, informative)
+        frame = self._checked(depth, pose, intrinsics, a, e, valid, features, member=member, informative=informative)
         out, maps = self._observe(frame, inputs)
         originals: dict[str, Any] = {"epistemic": e} if self.config.aleatoric_in_h else {"aleatoric": a, "epistemic": e}
 
@@ -182,7 +182,8 @@ class UfMStar(StatefulModule):
             ValueError: both ``pixels`` and ``fraction``, or one out of range; and as :meth:`forward`.
         """
         depth = as_tensor("depth", depth)
-        frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features, member, informative)
+        maps = aleatoric, epistemic, valid, features
+        frame = self._checked(depth, pose, intrinsics, *maps, member=member, informative=informative)
         index, used = sample_pixels(frame.valid, sample_size(frame.size, pixels, fraction), seed)
         out, maps = self._observe(frame, inputs, index, average=average)
         return mean_uncertainty(out, maps | {"depth": torch.gather(frame.depth.flatten(1), 1, index)}, used)
@@ -276,15 +277,13 @@ class UfMStar(StatefulModule):
             self._extensions.require_state(state)
 
     def _checked(
-        self, depth: Tensor, pose: CameraLike, intrinsics: CameraLike, aleatoric: Array | None,
-        epistemic: Array | None, valid: Array | None, features: Array | None, member: int | Tensor,
-        informative: Tensor | None,
-    ) -> FrameInput:  # fmt: skip
+        self, depth: Tensor, pose: CameraLike, intrinsics: CameraLike, *maps: Array | None, **view: Any
+    ) -> FrameInput:
         return check_frame(
-            depth, pose, intrinsics, aleatoric, epistemic, valid, features,
+            depth, pose, intrinsics, *maps, **view,
             feature_count=self.config.features, aleatoric_in_h=self.config.aleatoric_in_h,
             rotation_tolerance=self.config.rotation_tolerance, max_depth=self.config.segment.depth_limit,
-            member=member, informative=informative, kernel=self._kernels(depth.device.type)[1],
+            kernel=self._kernels(depth.device.type)[1],
         )  # fmt: skip
 
     def _observe(

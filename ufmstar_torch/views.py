@@ -6,13 +6,14 @@ change is
 
     q = 1 - exp(-(b/b_0)^2),   b = |t - t_ref| / r,
 
-and a comparison has the weight w = max(q - q_max, 0), where q_max is the largest q since the reference. Once q_max
-reaches ``COMPLETE``, the present view becomes the reference, with q_max = 0. In this way a camera that stands still, or
-trembles, adds nothing, and a slow one adds as much as a fast one on the same path. A comparison with another network,
-or another random sample of one, has w = 1.
+and a comparison has the weight w = q - q_max, where q_max is the largest q since the reference; 0 if that is below
+``LEAST``. Once q_max reaches ``COMPLETE``, the present view becomes the reference, with q_max = 0. In this way a camera
+that stands still, or trembles, adds nothing, and a slow one adds as much as a fast one on the same path. A comparison
+with another network, or another random sample of one, has w = 1.
 
-m is the mean of W2^2 with the weights w pi_c. The number of views of a component is n = sum of w, each view once. In
-the paper every comparison has w = 1, and the first view has the distance 0 in m: ``view_baseline=None``.
+A component is fused only where w > 0. m is the mean of W2^2 with the weights w pi_c. The number of views of a component
+is n = sum of w, each view once. In the paper every comparison has w = 1, and the first view has the distance 0 in m:
+``view_baseline=None``.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from ufmstar_torch.mixture import GaussianMixture
 
 # Change q of the view from which on it becomes the reference: 1.5 b_0.
 COMPLETE = 0.9
+# Least w: a tenth of b_0 from the reference. Without it, rounding would make a comparison of a first view.
+LEAST = 0.01
 
 
 def view_weights(mixture: GaussianMixture, view: Tensor, config: UfMStarConfig) -> Tensor:
@@ -43,7 +46,8 @@ def view_weights(mixture: GaussianMixture, view: Tensor, config: UfMStarConfig) 
     reach = (mixture.mean.double() - centre).square().sum(-1).clamp_min(config.near_plane**2)
     change = -torch.expm1(-squared / (reach * config.view_baseline**2))
     other = reference[..., 3] != view[:, None, 3]
-    return torch.where(other, weight, (change - reference[..., 4]).clamp_min(0))
+    increase = change - reference[..., 4]
+    return torch.where(other, weight, torch.where(increase < LEAST, torch.zeros_like(weight), increase))
 
 
 def after_view(mixture: GaussianMixture, view: Tensor, weight: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
-from ufmstar_torch.views import COMPLETE
+from ufmstar_torch.views import COMPLETE, LEAST
 
 _SWEEPS = 12  # an upper bound: the loops end when a sweep no longer rotates
 _NEGLIGIBLE = 16 * np.finfo(np.float64).eps
@@ -172,7 +172,8 @@ def view_weight(mean, reference, view, baseline, near):
         moved += (view[i] - reference[i]) ** 2
         reach += (mean[i] - view[i]) ** 2
     change = -math.expm1(-moved / (max(reach, near * near) * (baseline * baseline)))
-    return max(change - reference[4], 0.0)
+    increase = change - reference[4]
+    return increase if increase >= LEAST else 0.0
 
 
 @leaf
@@ -204,6 +205,8 @@ def fuse_pairs(
                 references[k, 4] = change
     for p in range(pair_c.size):
         c, k = pair_c[p], pair_k[p]
+        if w[k] == 0:
+            continue
         pi_k = np.float64(weight[k])
         pi_c = weight_c[c] * (overlap[p] if weighted else 1.0)
         lam = pi_c / (pi_k + pi_c)
@@ -220,12 +223,11 @@ def fuse_pairs(
             for j in range(3):
                 covariance[k, i, j] = cov_k[i, j]
         weight[k] = pi_k + pi_c
-        if w[k] > 0:
-            added = w[k] * pi_c
-            total = np.float64(compared[k]) + added
-            rho = added / total
-            disagreement[k] = (1 - rho) * np.float64(disagreement[k]) + rho * squared
-            compared[k] = total
+        added = w[k] * pi_c
+        total = np.float64(compared[k]) + added
+        rho = added / total
+        disagreement[k] = (1 - rho) * np.float64(disagreement[k]) + rho * squared
+        compared[k] = total
         for g in range(features.shape[1]):
             features[k, g] = (1 - lam) * np.float64(features[k, g]) + lam * features_c[c, g]
 

@@ -27,7 +27,7 @@ from ufmstar_torch.kernels.triton.matrices import (
     turned,
 )
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.views import COMPLETE
+from ufmstar_torch.views import COMPLETE, LEAST
 
 _LANES = 32
 
@@ -90,7 +90,7 @@ def fuse_bits(
         *(v.contiguous() for v in (current.mean, current.covariance, current.weight, current.features)),
         *motion, bits, index, position, count, overlap, distance, view.contiguous(), *out.tensors().values(),
         k, current.capacity, bits.shape[2], epsilon=8 * torch.finfo(mixture.covariance.dtype).eps,
-        baseline=config.view_baseline or 0.0, near=config.near_plane, complete=COMPLETE,
+        baseline=config.view_baseline or 0.0, near=config.near_plane, complete=COMPLETE, least=LEAST,
         weighted=weighted, has_distance=has_distance, channels=channels, padded=power_of_two(channels), word=WORD,
         lanes=_LANES, warps=1,
     )  # fmt: skip
@@ -129,8 +129,9 @@ def _fuse(
     R, t, bits, index_c, position, listed_c, overlap, distances, view,
     mean_o, covariance_o, weight_o, disagreement_o, compared_o, views_o, reference_o, features_o,
     capacity_k, capacity_c, words,
-    epsilon: tl.constexpr, baseline: tl.constexpr, near: tl.constexpr, complete: tl.constexpr, weighted: tl.constexpr,
-    has_distance: tl.constexpr, channels: tl.constexpr, padded: tl.constexpr, word: tl.constexpr, lanes: tl.constexpr,
+    epsilon: tl.constexpr, baseline: tl.constexpr, near: tl.constexpr, complete: tl.constexpr, least: tl.constexpr,
+    weighted: tl.constexpr, has_distance: tl.constexpr, channels: tl.constexpr, padded: tl.constexpr,
+    word: tl.constexpr, lanes: tl.constexpr,
 ):  # fmt: skip
     b = tl.program_id(1).to(tl.int64)
     stored = mean.dtype.element_ty
@@ -162,13 +163,14 @@ def _fuse(
         squared = (vx - rx) * (vx - rx) + (vy - ry) * (vy - ry) + (vz - rz) * (vz - rz)
         reach = (x - vx) * (x - vx) + (y - vy) * (y - vy) + (z - vz) * (z - vz)
         reach = tl.maximum(reach, exact(near * near, reach)) * exact(baseline * baseline, reach)
-        w = tl.where(r_member != v_member, 1.0, tl.maximum(1 - tl.exp(-squared / reach) - change, 0.0))
+        increase = 1 - tl.exp(-squared / reach) - change
+        w = tl.where(r_member != v_member, 1.0, tl.where(increase >= exact(least, increase), increase, 0.0))
     any_match = slot < 0
     in_f = inside[:, None] & (f < channels)[None, :]
     h = tl.zeros([lanes, padded], tl.float64)
     if channels > 0:
         h = tl.load(features + k[:, None] * channels + f[None, :], mask=in_f, other=0.0).to(tl.float64)
-    row = tl.load(position + k, mask=inside, other=-1)
+    row = tl.where(w > 0, tl.load(position + k, mask=inside, other=-1), -1)
     n = tl.load(listed_c + b)
     for w in range(tl.cdiv(n, word)):
         remaining = tl.load(bits + (b * capacity_k + row) * words + w, mask=row >= 0, other=0)
@@ -211,11 +213,10 @@ def _fuse(
             yx, zx, zy = tl.where(use, xy, yx), tl.where(use, xz, zx), tl.where(use, yz, zy)
             pi = tl.where(use, (pi + pi_c).to(stored).to(tl.float64), pi)
             added = w * pi_c
-            counts = use & (added > 0)
             total = compared_k + added
-            rho = added / tl.where(counts, total, 1.0)
-            m = tl.where(counts, ((1 - rho) * m + rho * d).to(stored).to(tl.float64), m)
-            compared_k = tl.where(counts, total.to(stored).to(tl.float64), compared_k)
+            rho = added / tl.where(use, total, 1.0)
+            m = tl.where(use, ((1 - rho) * m + rho * d).to(stored).to(tl.float64), m)
+            compared_k = tl.where(use, total.to(stored).to(tl.float64), compared_k)
             if channels > 0:
                 from_c = features_c + index[:, None] * channels + f[None, :]
                 new = tl.load(from_c, mask=in_f & use[:, None], other=0.0).to(tl.float64)
@@ -231,10 +232,9 @@ def _fuse(
     tl.store(weight_o + k, pi, mask=inside)
     tl.store(disagreement_o + k, m, mask=inside)
     tl.store(compared_o + k, compared_k, mask=inside)
-    any_match = any_match & (w > 0)
     tl.store(views_o + k, tl.where(any_match, n_k + w, n_k), mask=inside)
     change = tl.where(any_match, change + w, change)
-    new = any_match & (change >= complete)
+    new = any_match & (change >= exact(complete, change))
     tl.store(reference_o + 5 * k, tl.where(new, vx, rx), mask=inside)
     tl.store(reference_o + 5 * k + 1, tl.where(new, vy, ry), mask=inside)
     tl.store(reference_o + 5 * k + 2, tl.where(new, vz, rz), mask=inside)
