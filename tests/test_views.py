@@ -25,12 +25,13 @@ K = torch.tensor([[100.0, 0, 63.5], [0, 100, 47.5], [0, 0, 1]])
 
 
 def room(x: float, flicker: int) -> torch.Tensor:
-    """Depth of a wall at 2.5 m and a box in front of it, seen from ``x`` m to the right, with a flicker of .2 %."""
+    """Depth of a rough wall at 2.5 m and a box in front of it, seen ``x`` m to the right, with a flicker of .2 %."""
     u = torch.arange(W)[None] + 0 * torch.arange(H)[:, None]
     box = ((u - 63.5) / 100 * 1.8 + x).abs() < 0.5
     noise = 0.002 * torch.randn(6, 8, generator=torch.Generator().manual_seed(flicker))
     smooth = torch.nn.functional.interpolate(noise[None, None], (H, W), mode="bilinear")[0, 0]
-    return torch.where(box, 1.8, 2.5) * (1 + smooth)
+    relief = 1 + 0.03 * torch.sin(u / 5.0 + 20 * x)
+    return torch.where(box, 1.8, 2.5) * relief * (1 + smooth)
 
 
 def pose_at(x: float, tremble: float = 0.0, rng: np.random.Generator | None = None) -> torch.Tensor:
@@ -45,7 +46,7 @@ def at_rest(ufm: UfMStar, *, frames: int = REST, tremble: float = 0.0, members: 
     """The output after ``frames`` flickering views of one scene from one place."""
     rng = np.random.default_rng(seed)
     for i in range(frames):
-        depth = room(0, i) * (1 + 0.2 * (i % members))
+        depth = room(0, i) * (1 + 0.05 * (i % members))
         out = ufm(depth[None], pose_at(0, tremble, rng)[None], K[None], member=i % members)
     return out
 
@@ -63,20 +64,20 @@ def test_a_camera_at_rest_measures_nothing(tremble):
 
 
 def test_networks_in_turn_measure_at_rest():
-    """That is what alternating is for: two networks that differ by 20 % disagree, from one place as well."""
+    """That is what alternating is for: two networks that differ by 5 % disagree, from one place as well."""
     out = at_rest(UfMStar(CONFIG), members=2)
     assert float(out.measured.nanmean()) > 0.9
     ratio = (out.std / out.depth)[out.valid]
-    assert 0.03 < float(ratio.median()) < 0.15
+    assert 0.01 < float(ratio.median()) < 0.1
 
 
 def test_standing_still_after_a_walk_changes_little():
     ufm, rng = UfMStar(CONFIG), np.random.default_rng(1)
     end = 0.4
     for i, x in enumerate([*np.linspace(0, end, 15), *[end] * 10]):  # the moving average follows
-        walked = ufm((room(x, i) * (1 + 0.1 * math.sin(9 * x)))[None], pose_at(x)[None], K[None])
+        walked = ufm((room(x, i) * (1 + 0.02 * math.sin(9 * x)))[None], pose_at(x)[None], K[None])
     for i in range(300):
-        depth = room(end, 100 + i) * (1 + 0.1 * math.sin(9 * end))
+        depth = room(end, 100 + i) * (1 + 0.02 * math.sin(9 * end))
         out = ufm(depth[None], pose_at(end, 0.001, rng)[None], K[None])
     assert float(walked.measured.mean()) > 0.5
     assert float(out.std.mean() / walked.std.mean()) == pytest.approx(1, abs=0.1)

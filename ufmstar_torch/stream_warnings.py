@@ -69,9 +69,10 @@ class _Track:
     farthest: float = 0.0  # largest depth of the last frame
     saturated: int = 0  # successive changes of the pose with the same largest depth
     depth: Tensor | None = None  # depth map at the first of the ``still`` frames
+    member: float = 0.0  # index of the network that predicted it
 
     def follow(
-        self, T: list[list[float]], focal: tuple[float, float], depth: Tensor, total: float
+        self, T: list[list[float]], focal: tuple[float, float], depth: Tensor, total: float, member: float
     ) -> Iterator[tuple[str, str]]:
         """Update the statistics with a frame; yields kinds and texts of warnings."""
         step = math.dist(_position(T), _position(self.T))
@@ -80,7 +81,7 @@ class _Track:
             text = f"the focal length changed from frame to frame ({each}): every camera is a stream of its own, and "
             yield "camera", text + "another recording begins with reset()"
         if T == self.T:
-            yield from self._stay(depth)
+            yield from self._stay(depth, member)
         else:
             self.still, self.same = 0, self.same + 1 if total == self.total else 0
             if self.same == _FRAMES:
@@ -116,11 +117,11 @@ class _Track:
                 text = f"the depth of {share:.0%} of the pixels is {largest:g} m in every frame: if the network cannot "
                 yield "saturated", text + "predict more, as in the sky, set valid to False there"
 
-    def _stay(self, depth: Tensor) -> Iterator[tuple[str, str]]:
+    def _stay(self, depth: Tensor, member: float) -> Iterator[tuple[str, str]]:
         self.still += 1
         if self.still == 1 or self.depth is None or self.depth.shape != depth.shape:
-            self.depth = depth.clone()
-        elif self.still % _FRAMES == 0:
+            self.depth, self.member = depth.clone(), member
+        elif self.still >= _FRAMES and member == self.member:
             both = (depth > 0) & (self.depth > 0)
             change = (depth[both] / self.depth[both] - 1).abs()
             if change.numel() and (median := float(change.median())) > _CHANGE:
@@ -192,6 +193,7 @@ class StreamWarnings:
         sums, pixels = rows.sum((1, 2)).tolist(), statistics.valid_pixels.tolist()
         poses, cameras = frame.T_world_cam.tolist(), frame.intrinsics.tolist()
         used = None if statistics.anchors_used is None else statistics.anchors_used.tolist()
+        members = [0.0] * len(poses) if frame.member is None else frame.member.tolist()
         height, width = frame.size
         yield from self._one_video(poses)
         for b, fault in enumerate(statistics.fault.tolist()):
@@ -203,7 +205,7 @@ class StreamWarnings:
             if (track := self._tracks.get(b)) is None:
                 self._tracks[b] = track = _Track(T, T, focal, sums[b], _position(T))
             else:
-                yield from ((b, *warning) for warning in track.follow(T, focal, rows[b], sums[b]))
+                yield from ((b, *warning) for warning in track.follow(T, focal, rows[b], sums[b], members[b]))
             if used is not None and (text := track.anchored(used[b], _mean(rows[b], sums[b]))):
                 yield b, "anchors", text
 

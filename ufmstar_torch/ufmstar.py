@@ -51,12 +51,7 @@ class UfMStar(StatefulModule):
 
     Attribute ``observer``: receives the stages of every step, to time them (``step_parts.StepObserver``), or None.
 
-    Example::
-
-        ufm = UfMStar()
-        for image, T_world_cam in video:
-            out = ufm(network(image), T_world_cam, K)   # depth [B, H, W]
-            trust = out.std  # [m]
+    Example: ``ufm = UfMStar()``; for every image, ``out = ufm(depth, T_world_cam, K)``; ``out.std`` [m].
     """
 
     STATE = NAMES
@@ -115,10 +110,8 @@ class UfMStar(StatefulModule):
             epistemic: likewise E [m^2].
             valid: like ``depth``, bool, True = use.
             features: [B, F, H, W] with F = ``config.features``, averaged per component and regressed; of at most 1e12.
-            member: index of the network, or of the random sample, that predicted, for all streams or [B]: views of one
-                network from one place show nothing (``views``), those of two networks do.
-            informative: [B] bool, False where the image shows nothing (black, covered, frozen): the depth is a guess,
-                which is neither fused nor measured. None = all True.
+            member: index of the network, or random sample, that predicted, an integer or [B]; see ``views``.
+            informative: [B] bool, False where the image shows nothing, so that the depth is neither fused nor measured.
             **inputs: inputs of extensions, by the name of the extension's section in the config; None = no input.
 
         Raises:
@@ -182,8 +175,8 @@ class UfMStar(StatefulModule):
             ValueError: both ``pixels`` and ``fraction``, or one out of range; and as :meth:`forward`.
         """
         depth = as_tensor("depth", depth)
-        maps = aleatoric, epistemic, valid, features
-        frame = self._checked(depth, pose, intrinsics, *maps, member=member, informative=informative)
+        maps, view = (aleatoric, epistemic, valid, features), {"member": member, "informative": informative}
+        frame = self._checked(depth, pose, intrinsics, *maps, **view)
         index, used = sample_pixels(frame.valid, sample_size(frame.size, pixels, fraction), seed)
         out, maps = self._observe(frame, inputs, index, average=average)
         return mean_uncertainty(out, maps | {"depth": torch.gather(frame.depth.flatten(1), 1, index)}, used)
@@ -276,12 +269,9 @@ class UfMStar(StatefulModule):
         if state["weight"].device.type != "meta":
             self._extensions.require_state(state)
 
-    def _checked(
-        self, depth: Tensor, pose: CameraLike, intrinsics: CameraLike, *maps: Array | None, **view: Any
-    ) -> FrameInput:
+    def _checked(self, depth: Tensor, T: CameraLike, K: CameraLike, *maps: Array | None, **view: Any) -> FrameInput:
         return check_frame(
-            depth, pose, intrinsics, *maps, **view,
-            feature_count=self.config.features, aleatoric_in_h=self.config.aleatoric_in_h,
+            depth, T, K, *maps, **view, feature_count=self.config.features, aleatoric_in_h=self.config.aleatoric_in_h,
             rotation_tolerance=self.config.rotation_tolerance, max_depth=self.config.segment.depth_limit,
             kernel=self._kernels(depth.device.type)[1],
         )  # fmt: skip
