@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ufmstar_torch.anchors.sources import CORNERS, DENSE
+from ufmstar_torch.anchors.sources import DENSE
 from ufmstar_torch.eval.check.image_fit import image_fit, track_corners
-from ufmstar_torch.eval.commands.depth import NetworkOptions, UfMOptions
+from ufmstar_torch.eval.commands.depth import NetworkOptions, PosteriorOptions
 from ufmstar_torch.eval.commands.options import MachineOptions, option, positional, reader, usage_errors
 from ufmstar_torch.eval.commands.terminal import Bars
 from ufmstar_torch.eval.engine.anchors import landmarks_of
@@ -35,8 +35,7 @@ from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
 from ufmstar_torch.eval.sequences.live import LiveEvent
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.live import LiveDepth, LiveResult, LiveStatistics
-from ufmstar_torch.models.checkpoints import read_tensors
+from ufmstar_torch.live import LiveDepth, LiveResult, LiveStatistics, load_state
 from ufmstar_torch.pipeline import UncertainDepth
 from ufmstar_torch.stream_warnings import LOGGER
 
@@ -85,7 +84,7 @@ class LiveOptions(MachineOptions):
     json: bool = False
     opening: Options
     network: NetworkOptions
-    uncertainty: UfMOptions
+    uncertainty: PosteriorOptions
 
     def __post_init__(self) -> None:
         if self.network.model is None:
@@ -214,21 +213,15 @@ def _model(options: LiveOptions) -> UncertainDepth:
         mode="full" if chosen.mode == "full" else "alternate",
         posterior=options.uncertainty.posterior,
         samples=source.passes if len(source.networks) == 1 and chosen.mode == "full" else None,
-        anchors=None if anchors is False else landmarks_of(anchors, None),
+        anchors=None if anchors is None else landmarks_of(anchors, None),
         recalibration=options.uncertainty.load_recalibration(config, chosen.weights, source),
         check_poses=0 if options.recorded else 40,  # those of a recording are compared before
         multiview_device="cpu",  # for one camera faster than a GPU
     ).to(options.device)
     with Bars() as bars:
-        named = CORNERS if anchors is True else anchors or DENSE  # without --anchors, those of --posterior
-        warm_up_command(model.ufm.config, bars.show, [] if config.anchors is None else [named])
+        warm_up_command(model.ufm.config, bars.show, [] if config.anchors is None else [anchors or DENSE])
     if options.state is not None and options.state.exists():
-        try:
-            with options.state.open("rb") as file:
-                state = read_tensors(file, "it")
-            model.load_state_dict(state)
-        except (RuntimeError, TypeError, ValueError, OSError) as error:
-            raise ValueError(f"--state {options.state} cannot be continued: {error}") from error
+        load_state(model, options.state)  # before --out is replaced
     return model
 
 
