@@ -174,12 +174,8 @@ class UfMOptions:
         file = recalibration_path(weights[0]) if name is None else Path(name)
         try:
             recalibration = Recalibration.from_json(file)
-            if (
-                name is None
-                and config.anchors is not None
-                and recalibration.ufm
-                and not recalibration.ufm.get("anchors")
-            ):
+            of_plain = bool(recalibration.ufm) and not recalibration.ufm.get("anchors")
+            if name is None and of_plain and config.anchors is not None:
                 LOGGER.warning("%s is not used: it was fitted to UfM* alone, which --plain runs", file)
                 return None
             recalibration.require(config, ", ".join(one["name"] for one in source.identity.get("files", ())))

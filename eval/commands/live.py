@@ -46,10 +46,11 @@ _OF_LIVE = ("intrinsics", "trajectory", "poses", "pose_scale", "max_pose_gap")
 
 @dataclass(frozen=True, kw_only=True)
 class LiveOptions(MachineOptions):
-    """Depth with a variance for the newest image, as images and poses come.
+    """Depth with a standard deviation for the newest image, as images and poses come.
 
-    A recording is replayed at its pace. A camera, and a folder with --follow, take their poses from the file
-    --trajectory, to which another program adds lines. On standard input, a line is
+    Depths that are searched in earlier images correct the network's; --plain is UfM* alone. A recording is replayed at
+    its pace. A camera, and a folder with --follow, take their poses from the file --trajectory, to which another
+    program adds lines. On standard input, a line is
     {"stamp": s, "pose": [x, y, z, qx, qy, qz, qw], "image": "file", "intrinsics": [fx, fy, cx, cy]} or a part of it.
     Ends with its source, or with Ctrl-C.
 
@@ -62,7 +63,8 @@ class LiveOptions(MachineOptions):
         max_wait: for the poses after an image [s]
         state: file in which the state is kept, and from which it goes on
         save_every: of the state [s]
-        out: folder for realtime.json and a .npz with depth, variance, disagreement, pose and intrinsics per image
+        out: folder for realtime.json and, for each image, a .npz with depth and variance (corrected unless --plain),
+            network_depth and ufm_variance before the correction, disagreement, pose and intrinsics
         overwrite: replace the results in --out
         view: show the images, depth and plots in rerun, on this computer alone
         json: print a line of JSON per image instead of the status
@@ -227,7 +229,10 @@ def _model(options: LiveOptions) -> UncertainDepth:
 
 def _write(out: Path, result: LiveResult) -> None:
     """Write the maps of an image to OUT/STAMP.npz."""
-    maps = {"depth": result.out.depth, "variance": result.out.variance, "disagreement": result.out.disagreement}
+    of = result.out
+    maps = {"depth": of.depth, "variance": of.variance, "disagreement": of.disagreement}
+    if of.ufm.posterior_depth is not None:
+        maps |= {"network_depth": of.prediction.depth, "ufm_variance": of.ufm.variance}
     arrays = {name: value[0].cpu().numpy() for name, value in maps.items()}
     camera = {"T_world_cam": result.T_world_cam, "intrinsics": result.out.intrinsics[0].cpu().numpy()}
     write_atomic(out / f"{result.stamp:.6f}.npz", lambda file: np.savez(file, allow_pickle=False, **arrays, **camera))
@@ -248,7 +253,7 @@ def _figures(result: LiveResult, live: LiveDepth) -> dict[str, float]:
     return {
         "stamp": round(result.stamp, 6),
         "latency_ms": round(1000 * result.latency, 2),
-        "depth_m": round(float(depth.median()), 3),
+        "depth_m": round(float(depth.nanmedian()), 3),
         "sigma_m": round(float(std.nanmedian()), 3),
         "components": int(result.out.ufm.statistics.components[0]),
         "dropped": sum(counts.dropped.values()),
