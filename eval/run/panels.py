@@ -240,8 +240,8 @@ def contact_sheet(
     position = 1
     for scale, of_scale in groupby(columns, key=lambda column: column.scale):
         labels = [column.label for column in of_scale]
-        words = f"{', '.join(labels) if len(labels) < 3 else 'σ and |error|'} [m]"
-        bars.append(Bar(words, scale, position, len(labels)))
+        names = dict.fromkeys(label.partition(", ")[0] for label in labels)
+        bars.append(Bar(f"{', '.join(names)} [m]", scale, position, len(labels)))
         position += len(labels)
     height, width = panels[0].shape
     draw_grid(Path(path), rows, bars, aspect=height / width, title=title, cell=2.4, words=1.2)
