@@ -83,10 +83,8 @@ class AnchorDoubts:
                 yield b, "inverse", text
             self._far_off[b] = self._far_off[b] + 1 if max(ratio, 1 / ratio) > _UNIT else 0
             if self._far_off[b] == _AT_ONCE:
-                text = (
-                    f"the predicted depth is {1 / ratio:.2g} times what the anchors show: another unit, or a scene far "
-                )
-                yield b, "scale", text + "from the training data; the variance is increased"
+                text = f"the predicted depth is {1 / ratio:.2g} times what the anchors show: another unit, or a scene "
+                yield b, "scale", text + "far from the training data; the variance is increased"
             self._off[b] = self._off[b] + 1 if max(ratio, 1 / ratio) > _RATIO else 0
             if self._off[b] == _SUCCESSIVE:
                 text = f"in {_SUCCESSIVE} frames the anchors' median depth was {ratio:.2g} times the predicted one; "
