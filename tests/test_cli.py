@@ -118,7 +118,7 @@ MISTAKES = {
     "live: speed": (f"ufmstar live tour:3 --speed 0 {NETWORK}", "--speed must be positive"),
     "live: intrinsics": (f"ufmstar live /nowhere --intrinsics 1 2 {NETWORK}", "--intrinsics must be a file"),
     "live: scale": (f"ufmstar live tour:3 --scale-from network {NETWORK}", "--scale-from goes with ufmstar run"),
-    "live: anchors": (f"ufmstar live tour:3 --ufm.anchors.half_life 5 {NETWORK}", "needs --anchors"),
+    "live: anchors": (f"ufmstar live tour:3 --plain --ufm.anchors.half_life 5 {NETWORK}", "needs --anchors"),
     "live: layout": (f"ufmstar live {{path}}/images {NETWORK}", "has no known layout"),
     "data: no command": ("ufmstar data", "the following arguments are required"),
     "data: another command": ("ufmstar data mend x", "mend"),
@@ -131,7 +131,7 @@ MISTAKES = {
         "--intrinsics must be a file, or the four numb",
     ),
     "rank: part": ("ufmstar rank {tour} --depth self --by epistemic --out {out}", "comes with no epistemic variance"),
-    "rank: anchors": ("ufmstar rank {tour} --depth self --by anchored --out {out}", "--by anchored needs --anchors or"),
+    "rank: anchors": ("ufmstar rank {tour} --depth self --by anchored --out {out}", "--by anchored needs --anchors"),
     "rank: count": ("ufmstar rank {tour} --depth self --count 0 --out {out}", "--count must be at least 1"),
     "rank: measured": ("ufmstar rank {tour} --depth self --measured 2 --out {out}", "--measured must be a share"),
     "rank: depth": ("ufmstar rank {tour} {path} --depth a --out {out}", "--depth DIR goes with one sequence"),
@@ -150,7 +150,8 @@ MISTAKES = {
     "eval: list": (f"{EVAL} --sequence-list /nowhere.txt", "/nowhere.txt"),
     "demo: frames": ("ufmstar demo --frames 1 --out {out}", "--frames must be 2 to 150"),
     "demo: seed": ("ufmstar demo --seed -1 --out {out}", "--seed must be at least 0"),
-    "anchors": ("--depth self --ufm.anchors.half_life 10", "--ufm.anchors.* needs --anchors"),
+    "anchors": ("--depth self --plain --ufm.anchors.half_life 10", "--ufm.anchors.* needs --anchors"),
+    "posterior": ("--depth self --plain --ufm.posterior.prior_sigma 1", "--ufm.posterior.* needs the posterior"),
     "export": ("ufmstar export {path} --to depth", "no output of `ufmstar run`"),
 }
 

@@ -177,3 +177,68 @@ def test_an_image_of_another_camera_restarts_the_evidence_with_one_warning(caplo
     assert model.landmarks.restarts == 4
     assert len([text for text in caplog.messages if "another size or camera" in text]) == 1
     assert error(out.depth, walk()[-1]) < 0.2  # with what was learnt before
+
+
+class Scaled(torch.nn.Module):
+    """A function of the true depth of the walk's next frame."""
+
+    def __init__(self, change):
+        super().__init__()
+        self.change, self.calls = change, 0
+
+    def forward(self, image):
+        self.calls += 1
+        return DepthPrediction(self.change(torch.from_numpy(walk()[self.calls - 1].depth)[None]))
+
+
+WRONG = {
+    "an eighth": (lambda z: z / 9, "the predicted depth is 0.11 times what the anchors show: another unit, or a scene"),
+    "inverse depth": (lambda z: 4 / z, "far is near in the depth"),
+    "right": (lambda z: 1.2 * z, ""),
+    "a third": (lambda z: z / 3, ""),
+}
+
+
+@pytest.mark.parametrize("mistake", WRONG)
+def test_a_depth_that_contradicts_its_first_anchors_is_named_once(caplog, mistake):
+    change, words = WRONG[mistake]
+    model = UncertainDepth(Scaled(change))
+    for _ in range(2):
+        followed(model)
+        model.reset()
+        model.networks[0].calls = 0
+    found = [text for text in caplog.messages if "anchors show" in text or "far is near" in text]
+    assert len(found) == bool(words), caplog.messages
+    assert all(words in text for text in found)
+
+
+def ring(n, around):
+    """Cameras on a circle of 20 cm, with angles [deg] between their axes."""
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    for pose, angle in zip(poses, around, strict=True):
+        c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+        pose[:3, :3], pose[:3, 3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]], 0.2 * np.array([s, 0, c])
+    return poses
+
+
+BATCHES = {
+    "a clip": (lambda: np.stack([frame.T_world_cam for frame in walk()]), True),
+    "a clip in another order": (lambda: np.stack([walk()[i].T_world_cam for i in (3, 0, 6, 1, 7, 4, 2, 5)]), False),
+    "one pose": (lambda: np.tile(np.eye(4), (8, 1, 1)), False),
+    "a ring of cameras": (lambda: ring(6, np.arange(6) * 60), False),
+    "robots in a row": (lambda: np.stack([np.eye(4) + np.eye(4, k=3) * 2.0 * i for i in range(8)]), False),
+}
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_a_clip_that_is_passed_as_a_batch_is_named_once(caplog, batch):
+    poses, named = BATCHES[batch]
+    poses = poses()
+    ufm = UfMStar()
+    depth = torch.from_numpy(np.stack([frame.depth for frame in walk()[: len(poses)]]))
+    for _ in range(2):
+        ufm(depth, poses, walk()[0].intrinsics)
+        ufm.reset()
+    found = [text for text in caplog.messages if "look like successive frames of one video" in text]
+    assert len(found) == 2 * named  # reset() begins anew
+    assert all("8 streams of a batch" in text and "their poses form one path" in text for text in found)

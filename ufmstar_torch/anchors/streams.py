@@ -197,7 +197,8 @@ class StreamLandmarks:
                 parts[int(stream)][name] = value
             for source, source_state, part in zip(self._sources, before, parts, strict=True):
                 if part.keys() != source_state.keys():
-                    raise ValueError(f"anchors: the state must hold {sorted(source_state)}, got {sorted(part)}")
+                    names = ", ".join(sorted(part.keys() ^ source_state.keys())[:3])
+                    raise ValueError(f"anchors: the state must hold the values of this source, other: {names}, ...")
                 source.load_state(part)
         except BaseException:
             self._restore(before, range(len(before)))
