@@ -193,7 +193,7 @@ def test_settings_come_from_a_file_and_options(ufmstar, path, tmp_path):
 
 
 def test_the_papers_settings_by_name():
-    words = ["walk", "--depth", "self", "--out", "out", "--ufm-preset", "paper", "--ufm.eta", "0.4"]
+    words = ["walk", "--depth", "self", "--out", "out", "--plain", "--ufm-preset", "paper", "--ufm.eta", "0.4"]
     assert read(words).config == UfMStarConfig.paper().replace(eta=0.4, on_bad_frame="skip")
     assert read([*words, "--ufm.segment.min_rows", "8"]).config.segment.min_rows == 8
     mixed = read([*words, "--preset", "tum"]).config
@@ -240,8 +240,9 @@ def test_a_run_prints_its_table_and_outputs(ufmstar, path, tmp_path, brightness)
     assert code == 0
     summary = read_summary(tmp_path / "out")
     lines = out.splitlines()
-    assert lines[1].split()[:2] == ["UfM*", f"{summary['metrics']['delta1']:.3g}"]
-    assert lines[2].split()[5] == f"{summary['network_alone']['nll']:.3g}"
+    assert lines[1].split()[:2] == ["posterior", f"{summary['metrics']['delta1']:.3g}"]
+    assert lines[2].split()[:3] == ["UfM*,", "anchored", f"{summary['ufm']['metrics']['delta1']:.3g}"]
+    assert lines[3].split()[5] == f"{summary['network_alone']['nll']:.3g}"
     assert f"K = {summary['mixture']['components']} " in out
     assert lines[-1] == "ufmstar run: finished: 6 of 6 frames"
     assert [line for line in err.splitlines() if "frames" in line] == ["frames: 0 of 6", "frames: done, 6 of 6"]
@@ -317,7 +318,7 @@ def test_fastdepth_on_a_real_sequence(tmp_path):
     sequence = require_shared("data/rgbd_dataset_freiburg1_xyz")
     weights = require_shared("weights/fastdepth_nyu.onnx")
     command = [sys.executable, "-m", "ufmstar_torch.cli", "run", sequence, "--model", "fastdepth", "--weights", weights]
-    command += ["--frames", "0:3", "--distortion", "none", "--threads", "1", "--out", tmp_path / "out"]
+    command += ["--plain", "--frames", "0:3", "--distortion", "none", "--threads", "1", "--out", tmp_path / "out"]
     done = subprocess.run([str(word) for word in command], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "Warning" not in done.stderr
