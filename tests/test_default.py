@@ -133,6 +133,20 @@ def test_without_images_one_line_names_what_is_missed(caplog):
     assert not caplog.messages
 
 
+def test_predictions_from_elsewhere_are_corrected_by_the_anchors_that_come_with_them():
+    model, network = UncertainDepth(None, UfMStarConfig(anchors=AnchorConfig())), TooFar()
+    for frame in walk()[:4]:
+        v, u = (index.ravel() for index in np.mgrid[4:120:8, 4:160:8])
+        depth = torch.from_numpy(frame.depth[v, u]).double()[None]
+        anchors = Anchors(torch.from_numpy(np.stack([u, v], -1)).double()[None], depth, 1e-4 * depth**2)
+        prediction = network(torch.zeros(1, 3, 120, 160))
+        out = model.update(prediction, frame.T_world_cam, frame.intrinsics, anchors=anchors)
+    assert torch.equal(out.prediction.depth, prediction.depth)
+    assert out.member is None
+    np.testing.assert_array_equal(out.intrinsics[0].numpy(), frame.intrinsics)
+    assert error(out.depth, frame) < 0.01
+
+
 def test_normalised_images_are_not_searched(caplog):
     def normalised(frame):
         return torch.from_numpy(frame.image).permute(2, 0, 1) / 64.0 - 2

@@ -48,7 +48,7 @@ class UncertainPrediction:
     Attributes:
         prediction: the network's output (for "full": the predictive mean, mean A and E over the members).
         ufm: the output of UfM* for the network's depth: V, M, A, E and B, ``measured`` and the counts.
-        member: index of the network that was run, or None if all were.
+        member: index of the network that was run; None if all were, or none.
     """
 
     prediction: DepthPrediction
@@ -281,7 +281,7 @@ class UncertainDepth(NetworksInTurn):
         *,
         features: Array | None = None,
         anchors: Anchors | None = None,
-    ) -> UfMStarOutput:
+    ) -> UncertainPrediction:
         """Process an existing prediction, for example a cached one, as :meth:`forward` does after its networks.
 
         Args:
@@ -295,9 +295,12 @@ class UncertainDepth(NetworksInTurn):
             ValueError, TypeError: as :meth:`UfMStar.forward`; the image is then not counted.
         """
         maps = maps_of(prediction, self.ufm)
-        out = self.ufm(pose=pose, intrinsics=intrinsics, valid=valid, features=features, anchors=anchors, **maps)
+        ufm = self.ufm(pose=pose, intrinsics=intrinsics, valid=valid, features=features, anchors=anchors, **maps)
         self._count(self._next + 1)
-        return out
+        if prediction.intrinsics is None:
+            K = as_intrinsics(intrinsics)
+            prediction = replace(prediction, intrinsics=K.expand(len(prediction.depth), 3, 3))
+        return UncertainPrediction(prediction, ufm, None)
 
     def mean_uncertainty(
         self,
@@ -379,9 +382,9 @@ class UncertainDepth(NetworksInTurn):
     ) -> UncertainPrediction:
         p = predicted.prediction
         with self._anchored(predicted, anchors) as found:
-            ufm = self.update(p, predicted.pose, p.K, valid, features=predicted.features, anchors=found)
-        self._undo(ufm.statistics)
-        return UncertainPrediction(p, ufm, predicted.member)
+            out = self.update(p, predicted.pose, p.K, valid, features=predicted.features, anchors=found)
+        self._undo(out.ufm.statistics)
+        return replace(out, member=predicted.member)
 
     @contextmanager
     def _anchored(
