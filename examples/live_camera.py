@@ -1,4 +1,4 @@
-"""Show the live camera image and the standard deviation of its depth. A SLAM writes the poses to a trajectory file.
+"""Show the standard deviation of the live camera's corrected depth. A SLAM writes the poses to a trajectory file.
 
     python examples/live_camera.py --weights fastdepth_nyu.onnx --trajectory poses.txt --intrinsics 600 600 319.5 239.5
 

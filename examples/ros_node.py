@@ -1,4 +1,4 @@
-"""A ROS 2 node on ``LiveDepth``: images and poses in, depth and sigma (32FC1, metres) out.
+"""A ROS 2 node on ``LiveDepth``: images and poses in, corrected depth and sigma (32FC1, metres) out.
     python examples/ros_node.py fastdepth_nyu.onnx --ros-args -r image:=/camera/image_raw -r pose:=/slam/pose
 
 Topics: image (rgb8), camera_info, pose (PoseStamped of the camera's optical frame); depth, sigma.

@@ -1,6 +1,6 @@
 """Fuse a run's depth into a TSDF, with equal weights or with 1/sigma^2, and print the surface error [cm].
 
-    ufmstar run "tour:5?frames=60&size=120x160" --model trained --weights models/weights/demo.safetensors --posterior \\
+    ufmstar run "tour:5?frames=60&size=120x160" --model trained --weights models/weights/demo.safetensors \\
         --out out/tour
     python examples/tsdf.py out/tour
 """

@@ -24,15 +24,14 @@ def main(tour: int = 5, frames: int = 40) -> dict[str, SequenceMetrics]:
         return {"metric_depth": pretrained(image).depth}
 
     wrapped = wrap_network(network, "metric_depth", preprocess=pretrained.preprocess)
-    model = UncertainDepth(wrapped, posterior=True)
+    model = UncertainDepth(wrapped)
     rows = {"UfM*": SequenceMetrics(), "posterior": SequenceMetrics()}
     walk = tour_sequence(tour, frames=150, style="hall")
     for frame in (walk[i] for i in range(frames)):
         out = model(frame.image, frame.T_world_cam, frame.intrinsics)  # NumPy arrays, PIL images or tensors
         truth = wrapped.preprocess.apply_depth(torch.from_numpy(frame.depth))
-        rows["UfM*"].update(out.depth[0], out.variance[0], truth)
-        depth, variance = out.ufm.posterior()
-        rows["posterior"].update(depth[0], variance[0], truth)
+        rows["UfM*"].update(out.prediction.depth[0], out.ufm.variance[0], truth)
+        rows["posterior"].update(out.depth[0], out.variance[0], truth)
     for name, metrics in rows.items():
         figures = metrics.compute()
         print(f"{name:10}", *(f"{key} {figures[key]:.3f}" for key in ("delta1", "rmse", "nll", "ece_delta", "ece_q")))

@@ -16,7 +16,6 @@ from zipfile import ZIP_STORED, BadZipFile, ZipFile
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.models.checkpoints import read_tensors
 from ufmstar_torch.models.hugging_face import from_hugging_face, of_transformers
 from ufmstar_torch.models.network import DeclaredNetwork, DepthNetwork
 from ufmstar_torch.models.outputs import METRIC, OutputSpec, PlainSpec, ProgramSpec, Spread
@@ -24,6 +23,7 @@ from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction, infer
 from ufmstar_torch.prediction import takes_intrinsics as declares_intrinsics
 from ufmstar_torch.stream_warnings import LOGGER
+from ufmstar_torch.tensor_files import read_tensors
 
 # Files of a torch.export archive: short texts, and tensors as raw bytes.
 _TEXTS = ("archive_format", "archive_version", "byteorder", "version", "serialization_id")

@@ -7,32 +7,25 @@ older repositories, raises with an explanation.
 from __future__ import annotations
 
 import json
-import pickle
-import struct
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from ufmstar_torch.atomic import write_atomic
 from ufmstar_torch.optional import optional
+from ufmstar_torch.tensor_files import DAMAGE as DAMAGE
+from ufmstar_torch.tensor_files import CheckpointError as CheckpointError
+from ufmstar_torch.tensor_files import read_tensors
 
 # Keys under which training programs store the weights in a checkpoint, and prefixes that wrappers add to every key.
 _CONTAINERS = ("state_dict", "model_state_dict", "model")
 _PREFIXES = ("module.", "_orig_mod.", "state_dict.", "model.", "network.")
 _TORCH_SUFFIXES = (".pth", ".pt", ".ckpt", ".bin", ".tar")
 _UNKNOWN_SUFFIX = f"{{}} must end in .safetensors or one of {', '.join(_TORCH_SUFFIXES)}"
-# Files of torch.save begin with these bytes: a zip archive, or (before torch 1.6) a pickled magic number.
-_BEGINNINGS = (b"PK\x03\x04", b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.")
-# Exceptions, not documented, of the restricted unpickler on damaged bytes.
-DAMAGE = (EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, AttributeError, AssertionError)
 _SHOWN = 8  # most keys in an error message
-
-
-class CheckpointError(ValueError):
-    """A file of weights is damaged, has other content, or does not fit the network; the message names the file."""
 
 
 def load_state_dict_file(path: str | Path, ignore: Collection[str] = ()) -> dict[str, Tensor]:
@@ -151,24 +144,6 @@ def _read(path: Path, ignore: Collection[str] = ()) -> dict[str, Tensor]:
         raise CheckpointError(_UNKNOWN_SUFFIX.format(path))
     with path.open("rb") as file:
         return _weights_in(read_tensors(file, path), path, ignore)
-
-
-def read_tensors(file: BinaryIO, name: str | Path) -> Any:
-    """The content of an open file of ``torch.save``, without running code from it. Raises CheckpointError: it is
-    damaged, or holds more than tensors and plain values; the message contains ``name``."""
-    beginning = file.read(max(map(len, _BEGINNINGS)))
-    if not beginning.startswith(_BEGINNINGS):
-        raise CheckpointError(f"{name} is damaged or not a file of torch.save: it begins with {beginning[:8]!r}")
-    file.seek(0)
-    try:
-        return torch.load(file, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
-        raise CheckpointError(
-            f"{name} is damaged or holds pickled Python objects (a whole module?), which are never loaded because "
-            "they can run code; save the module's state_dict() with the program that made it, and load that"
-        ) from error
-    except (*DAMAGE, struct.error) as error:
-        raise CheckpointError(f"{name} is damaged or not a file of torch.save: {error}") from error
 
 
 def _weights_in(content: Any, path: Path, ignore: Collection[str]) -> dict[str, Tensor]:

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from ufmstar_torch.checked import Checked, number
 from ufmstar_torch.models.alignment import AlignedNetwork, Alignment
-from ufmstar_torch.models.checkpoints import channels_of, fill, load_state_dict_file, read_tensors
+from ufmstar_torch.models.checkpoints import channels_of, fill, load_state_dict_file
 from ufmstar_torch.models.monodepth2 import (
     IMAGENET_MEAN,
     IMAGENET_STD,
@@ -30,6 +30,7 @@ from ufmstar_torch.models.monodepth2 import (
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import PlainSpec
 from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.tensor_files import read_tensors
 
 # Keys of encoder.pth other than weights.
 _NO_WEIGHTS = ("height", "width", "use_stereo")

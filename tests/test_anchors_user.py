@@ -135,7 +135,7 @@ def two_streams(frames=4):
 
 @pytest.mark.parametrize("preprocess", [None, half])
 def test_the_pipeline_takes_anchors_in_the_images_pixels(preprocess):
-    model, ufm = UncertainDepth(Biased(), ON, preprocess=preprocess), UfMStar(ON)
+    model, ufm = UncertainDepth(Biased(), ON, posterior=False, preprocess=preprocess), UfMStar(ON)
     for truth, pose, intrinsics, anchors in two_streams():
         image = truth[:, None].expand(2, 3, H, W)
         out = model(image, pose, intrinsics, anchors=anchors)
@@ -152,7 +152,7 @@ def test_the_pipeline_takes_anchors_in_the_images_pixels(preprocess):
         assert 23 <= of_twenty_five <= 25
     assert float(out.ufm.anchored[out.ufm.valid].mean()) > 0.05
     with pytest.raises(ValueError, match="anchors"):
-        UncertainDepth(Biased())(image, pose, intrinsics, anchors=anchors)
+        UncertainDepth(Biased(), posterior=False)(image, pose, intrinsics, anchors=anchors)
 
 
 # ---- a standing camera, and starting again ----
@@ -211,7 +211,7 @@ def test_kept_evidence_survives_saving_and_needs_anchors():
     torch.testing.assert_close(ufm(*frame).variance, later(*frame).variance, rtol=0, atol=0, equal_nan=True)
     with pytest.raises(ValueError, match="keep_evidence needs UfMStarConfig"):
         UfMStar().reset(keep_evidence=True)
-    model = UncertainDepth(Biased(), ON)
+    model = UncertainDepth(Biased(), ON, posterior=False)
     model.ufm.load_state_dict(ufm.state_dict())
     model.reset(keep_evidence=True)
     assert torch.equal(model.ufm.overall_evidence, ufm.overall_evidence)

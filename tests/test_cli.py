@@ -118,7 +118,7 @@ MISTAKES = {
     "live: speed": (f"ufmstar live tour:3 --speed 0 {NETWORK}", "--speed must be positive"),
     "live: intrinsics": (f"ufmstar live /nowhere --intrinsics 1 2 {NETWORK}", "--intrinsics must be a file"),
     "live: scale": (f"ufmstar live tour:3 --scale-from network {NETWORK}", "--scale-from goes with ufmstar run"),
-    "live: anchors": (f"ufmstar live tour:3 --ufm.anchors.half_life 5 {NETWORK}", "needs --anchors"),
+    "live: anchors": (f"ufmstar live tour:3 --plain --ufm.anchors.half_life 5 {NETWORK}", "needs --anchors"),
     "live: layout": (f"ufmstar live {{path}}/images {NETWORK}", "has no known layout"),
     "data: no command": ("ufmstar data", "the following arguments are required"),
     "data: another command": ("ufmstar data mend x", "mend"),
@@ -131,7 +131,7 @@ MISTAKES = {
         "--intrinsics must be a file, or the four numb",
     ),
     "rank: part": ("ufmstar rank {tour} --depth self --by epistemic --out {out}", "comes with no epistemic variance"),
-    "rank: anchors": ("ufmstar rank {tour} --depth self --by anchored --out {out}", "--by anchored needs --anchors or"),
+    "rank: anchors": ("ufmstar rank {tour} --depth self --by anchored --out {out}", "--by anchored needs --anchors"),
     "rank: count": ("ufmstar rank {tour} --depth self --count 0 --out {out}", "--count must be at least 1"),
     "rank: measured": ("ufmstar rank {tour} --depth self --measured 2 --out {out}", "--measured must be a share"),
     "rank: depth": ("ufmstar rank {tour} {path} --depth a --out {out}", "--depth DIR goes with one sequence"),
@@ -150,7 +150,8 @@ MISTAKES = {
     "eval: list": (f"{EVAL} --sequence-list /nowhere.txt", "/nowhere.txt"),
     "demo: frames": ("ufmstar demo --frames 1 --out {out}", "--frames must be 2 to 150"),
     "demo: seed": ("ufmstar demo --seed -1 --out {out}", "--seed must be at least 0"),
-    "anchors": ("--depth self --ufm.anchors.half_life 10", "--ufm.anchors.* needs --anchors"),
+    "anchors": ("--depth self --plain --ufm.anchors.half_life 10", "--ufm.anchors.* needs --anchors"),
+    "posterior": ("--depth self --plain --ufm.posterior.prior_sigma 1", "--ufm.posterior.* needs the posterior"),
     "export": ("ufmstar export {path} --to depth", "no output of `ufmstar run`"),
 }
 
@@ -192,7 +193,7 @@ def test_settings_come_from_a_file_and_options(ufmstar, path, tmp_path):
 
 
 def test_the_papers_settings_by_name():
-    words = ["walk", "--depth", "self", "--out", "out", "--ufm-preset", "paper", "--ufm.eta", "0.4"]
+    words = ["walk", "--depth", "self", "--out", "out", "--plain", "--ufm-preset", "paper", "--ufm.eta", "0.4"]
     assert read(words).config == UfMStarConfig.paper().replace(eta=0.4, on_bad_frame="skip")
     assert read([*words, "--ufm.segment.min_rows", "8"]).config.segment.min_rows == 8
     mixed = read([*words, "--preset", "tum"]).config
@@ -239,8 +240,9 @@ def test_a_run_prints_its_table_and_outputs(ufmstar, path, tmp_path, brightness)
     assert code == 0
     summary = read_summary(tmp_path / "out")
     lines = out.splitlines()
-    assert lines[1].split()[:2] == ["UfM*", f"{summary['metrics']['delta1']:.3g}"]
-    assert lines[2].split()[5] == f"{summary['network_alone']['nll']:.3g}"
+    assert lines[1].split()[:2] == ["posterior", f"{summary['metrics']['delta1']:.3g}"]
+    assert lines[2].split()[:3] == ["UfM*,", "anchored", f"{summary['ufm']['metrics']['delta1']:.3g}"]
+    assert lines[3].split()[5] == f"{summary['network_alone']['nll']:.3g}"
     assert f"K = {summary['mixture']['components']} " in out
     assert lines[-1] == "ufmstar run: finished: 6 of 6 frames"
     assert [line for line in err.splitlines() if "frames" in line] == ["frames: 0 of 6", "frames: done, 6 of 6"]
@@ -316,7 +318,7 @@ def test_fastdepth_on_a_real_sequence(tmp_path):
     sequence = require_shared("data/rgbd_dataset_freiburg1_xyz")
     weights = require_shared("weights/fastdepth_nyu.onnx")
     command = [sys.executable, "-m", "ufmstar_torch.cli", "run", sequence, "--model", "fastdepth", "--weights", weights]
-    command += ["--frames", "0:3", "--distortion", "none", "--threads", "1", "--out", tmp_path / "out"]
+    command += ["--plain", "--frames", "0:3", "--distortion", "none", "--threads", "1", "--out", tmp_path / "out"]
     done = subprocess.run([str(word) for word in command], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "Warning" not in done.stderr

@@ -201,7 +201,7 @@ def test_a_network_states_it():
     image = torch.rand(1, 3, *SIZE, generator=torch.Generator().manual_seed(0))
     assert torch.equal(network(image).confidence, image[:, 0])
     torch.testing.assert_close(Ensemble([network, network])(image).confidence, image[:, 0])
-    assert UncertainDepth(network).ufm.config.confidence is None
+    assert UncertainDepth(network, posterior=False).ufm.config.confidence is None
     model = UncertainDepth(
         [network, copy.deepcopy(network)], UfMStarConfig(anchors=AnchorConfig()), preprocess=network.preprocess
     )

@@ -60,7 +60,7 @@ def image(batch=2):
 @pytest.mark.parametrize("options", [{}, {"offload": True}])
 def test_images_follow_members_that_are_not_loaded_to_their_device(options):
     config = UfMStarConfig(max_components=64, initial_capacity=64, on_bad_frame="skip")
-    model = UncertainDepth(lazy(1.0, 1.1, **options)[0], config).to("meta")
+    model = UncertainDepth(lazy(1.0, 1.1, **options)[0], config, posterior=False).to("meta")
     picture = np.zeros((8, 10, 3), np.uint8)  # not a tensor, whose device is the caller's choice
     for _ in range(3):
         assert model(picture, POSE, K).depth.is_meta

@@ -212,7 +212,8 @@ def test_anchors_have_a_line_to_the_depth_of_their_pixel(stand_in, tmp_path):
     """The run stores the anchors of every frame. In the recording, each line's length is the difference of depth and
     anchor."""
     path, out = "tour:1?frames=8&size=96x128", tmp_path / "out"
-    assert cli.main(["run", path, "--depth", "self", "--anchors", "--no-video", "--no-sheet", "--out", str(out)]) == 0
+    words = ["run", path, "--depth", "self", "--anchors", "corners", "--no-video", "--no-sheet"]
+    assert cli.main([*words, "--out", str(out)]) == 0
     assert cli.main(["export", str(out), "--to", "rrd"]) == 0
     found = [read_frame(file) for file in sorted((out / "frames").iterdir())]
     points, lines = stand_in.logged("world/camera/anchors"), stand_in.logged("world/camera/residuals")

@@ -121,10 +121,10 @@ def test_networks_on_the_gpu_and_ufmstar_on_the_cpu():
     from test_pipeline import CONFIG, POSES, K, Scaled, image
 
     members = [Scaled(1.0), Scaled(1.1)]
-    split = UncertainDepth(members, CONFIG, multiview_device="cpu").cuda()
+    split = UncertainDepth(members, CONFIG, posterior=False, multiview_device="cpu").cuda()
     inputs = [(image(i).cuda(), POSES[i], K) for i in range(5)]
     outputs = list(split.stream(inputs))
-    plain = UncertainDepth(members, CONFIG).cpu()
+    plain = UncertainDepth(members, CONFIG, posterior=False).cpu()
     for out, frame in zip(outputs, inputs, strict=True):
         expected = plain(*(v.cpu() for v in frame))
         assert out.variance.device.type == "cpu"

@@ -287,8 +287,8 @@ def test_a_state_that_is_not_finite_is_refused(tour, name):
     assert all(torch.equal(value, before[key]) for key, value in evidence.state().items())
 
 
-def test_images_of_another_size_are_refused_however_small():
-    """UfM* rolls back a refused frame together with its image size, so a frame of another size can follow."""
+def test_images_of_another_size_are_refused_by_a_source_and_restart_that_of_a_stream_however_small():
+    """An undone frame is undone together with its image size, so a frame of another size can follow."""
     K, sizes = np.eye(3), [(1, 1), (2, 1), (1, 2), (8, 8)]
     for first, other in itertools.permutations(sizes, 2):
         streams = StreamLandmarks("dense")
@@ -296,8 +296,16 @@ def test_images_of_another_size_are_refused_however_small():
         pose, camera = torch.eye(4, dtype=torch.float64), torch.from_numpy(K)
         for _ in range(3):
             streams.update(image[first], pose, camera)
+        arrays = [image[size][0].permute(1, 2, 0).numpy() for size in (first, other)]
+        evidence = DenseEvidence()
+        evidence.update(arrays[0], np.eye(4), K)
         with pytest.raises(ValueError, match="of the size and camera of the images before"):
-            streams.update(image[other], pose, camera)
+            evidence.update(arrays[1], np.eye(4), K)
+        streams.update(image[other], pose, camera)
+        assert streams.restarts == 1
+        streams.undo()
+        streams.update(image[first], pose, camera)
+        assert streams.restarts == 1
         streams.reset()
         streams.update(image[first], pose, camera)
         streams.undo()

@@ -332,7 +332,9 @@ def test_the_state_goes_on_where_it_ended(model, tmp_path):
             show(live, n, x=n / 100)
     assert live.statistics.saved == 3
     again = UncertainDepth(Network())
-    again.load_state_dict(torch.load(tmp_path / "state.pt"))
+    with LiveDepth(again, print, K, state=tmp_path / "state.pt"):
+        assert int(again.image_index) == 3
+    assert live.statistics.saved == 3  # no change, so nothing is written
     torch.testing.assert_close(
         again(PICTURE, at(0.03), K).variance, model(PICTURE, at(0.03), K).variance, rtol=0, atol=0
     )
@@ -340,6 +342,22 @@ def test_the_state_goes_on_where_it_ended(model, tmp_path):
     with LiveDepth(model, print, K, state=tmp_path / "other.pt"):
         pass  # no change, so no file is overwritten
     assert not (tmp_path / "other.pt").exists()
+
+
+def test_a_state_that_does_not_fit_is_refused_and_stays(model, tmp_path):
+    file, before = tmp_path / "state.pt", {name: value.clone() for name, value in model.state_dict().items()}
+    plain = UncertainDepth(Network(), posterior=False)
+    torch.save(plain.state_dict(), file)
+    (tmp_path / "damaged.pt").write_bytes(file.read_bytes()[:500])
+    for path, words in ((file, "the state must hold"), (tmp_path / "damaged.pt", "damaged")):
+        content = path.read_bytes()
+        with pytest.raises(
+            ValueError, match=rf"state .*{path.name} cannot be continued: (.|\n)*{words}(.|\n)*Delete the"
+        ):
+            LiveDepth(model, print, K, state=path)
+        assert path.read_bytes() == content
+    after = model.state_dict()
+    assert all(torch.equal(after[name], value) for name, value in before.items())
 
 
 def test_a_state_that_cannot_be_written_is_an_error(model, tmp_path):

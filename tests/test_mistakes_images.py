@@ -17,7 +17,7 @@ from shared_data import require_shared
 from ufmstar_torch import DepthPrediction, SPGFConfig, UfMStarConfig, UncertainDepth
 from ufmstar_torch.anchors import landmarks
 from ufmstar_torch.anchors.pose_check import PoseCheck
-from ufmstar_torch.anchors.pose_fit import CornerTrack
+from ufmstar_torch.anchors.pose_fit import UNCHANGED, CornerTrack
 from ufmstar_torch.eval.check.depth_image_fit import depth_image_fit, image_at_map, part_of_image
 from ufmstar_torch.eval.check.image_fit import depth_fit, image_fit, track_corners
 from ufmstar_torch.eval.sequences import open_sequence
@@ -205,6 +205,17 @@ def test_a_network_on_right_input_is_not_warned_of(caplog, name):
     for frame in islice(open_sequence(path), 20):
         model(frame.image, frame.T_world_cam, frame.intrinsics)
     assert not caplog.messages
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_four_frames_do_not_show_another_camera_or_delay(name):
+    sequence = open_sequence(require_shared(f"data/{name}"))
+    for start in range(0, len(sequence) - 4, 4):
+        fit = image_fit(sequence, track_corners(sequence, range(start, start + 4)))
+        assert fit is None or fit.reading == UNCHANGED
+    wrong = posed(sequence, np.linalg.inv)  # another convention is found all the same, where the camera moves enough
+    fits = [image_fit(wrong, track_corners(wrong, range(start, start + 4))) for start in range(0, len(wrong) - 4, 4)]
+    assert any(fit is not None and fit.reading.poses == "world-to-camera" for fit in fits)
 
 
 @pytest.mark.parametrize("name", RECORDINGS)

@@ -48,14 +48,14 @@ def image(i: int) -> torch.Tensor:
 
 def test_members_take_turns():
     members = [Scaled(1.0), Scaled(1.1), Scaled(0.9)]
-    model = UncertainDepth(members, CONFIG)
+    model = UncertainDepth(members, CONFIG, posterior=False)
     used = [model(image(i), POSES[i], K).member for i in range(7)]
     assert used == [0, 1, 2, 0, 1, 2, 0]
     assert [m.calls for m in members] == [3, 2, 2]
 
 
 def test_one_inference_then_ufmstar():
-    model, ufm = UncertainDepth(Scaled(1.2, aleatoric=0.04), CONFIG), UfMStar(CONFIG)
+    model, ufm = UncertainDepth(Scaled(1.2, aleatoric=0.04), CONFIG, posterior=False), UfMStar(CONFIG)
     for i in range(4):
         out = model(image(i), POSES[i], K)
         expected = ufm(image(i)[:, 0] * 1.2, POSES[i], K, aleatoric=torch.full((1, H, W), 0.04))
@@ -67,7 +67,7 @@ def test_one_inference_then_ufmstar():
 
 def test_full_ensemble_is_the_predictive_mixture():
     members = [Scaled(1.0, 0.01), Scaled(1.2, 0.03)]
-    model = UncertainDepth(members, CONFIG, mode="full")
+    model = UncertainDepth(members, CONFIG, posterior=False, mode="full")
     out = model(image(0), POSES[0], K)
     d = image(0)[:, 0]
     assert out.member is None
@@ -79,7 +79,7 @@ def test_full_ensemble_is_the_predictive_mixture():
 
 def test_full_stochastic_network_samples():
     torch.manual_seed(0)
-    out = UncertainDepth(Noisy(), CONFIG, mode="full", samples=200)(image(0), POSES[0], K)
+    out = UncertainDepth(Noisy(), CONFIG, posterior=False, mode="full", samples=200)(image(0), POSES[0], K)
     relative = (out.prediction.epistemic_variance / image(0)[:, 0] ** 2).mean().sqrt().item()
     assert relative == pytest.approx(0.1, rel=0.2)
 
@@ -109,7 +109,7 @@ def test_the_preprocessed_intrinsics_reach_the_networks_that_take_them(mode):
     """Half the size, half the focal length. A member without ``takes_intrinsics`` gets the image only."""
     half = Preprocess(size=(H // 2, W // 2))
     x = torch.rand(2, 3, H, W, generator=torch.Generator().manual_seed(0))
-    model = UncertainDepth([ByFocal(), Scaled(1.0)], CONFIG, mode=mode, preprocess=half)
+    model = UncertainDepth([ByFocal(), Scaled(1.0)], CONFIG, posterior=False, mode=mode, preprocess=half)
     expected = half.apply_image(x)[:, 0] * K[0, 0].float() / 2 / 16
     if mode == "full":
         expected = (expected + half.apply_image(x)[:, 0]) / 2
@@ -123,7 +123,7 @@ def test_the_preprocessed_intrinsics_reach_the_networks_that_take_them(mode):
 
 def test_the_mean_uncertainty_of_images():
     """Equal to UfM*'s, with alternating members. A failed call does not advance the member index."""
-    model, ufm = UncertainDepth([Scaled(1.0, 0.01), Scaled(1.2, 0.03)], CONFIG), UfMStar(CONFIG)
+    model, ufm = UncertainDepth([Scaled(1.0, 0.01), Scaled(1.2, 0.03)], CONFIG, posterior=False), UfMStar(CONFIG)
     for i in range(4):
         factor, a = ((1.0, 0.01), (1.2, 0.03))[i % 2]
         with pytest.raises(ValueError, match="pixels or fraction"):
@@ -136,7 +136,7 @@ def test_the_mean_uncertainty_of_images():
 
 
 def test_networks_stay_in_eval_mode():
-    model = UncertainDepth(nn.Sequential(Scaled(1.0)), CONFIG)
+    model = UncertainDepth(nn.Sequential(Scaled(1.0)), CONFIG, posterior=False)
     model.train()
     assert not model.networks.training
     assert not any(m.training for m in model.networks.modules())
@@ -144,7 +144,7 @@ def test_networks_stay_in_eval_mode():
 
 def test_state_continues_and_resets():
     def fresh():
-        return UncertainDepth([Scaled(1.0), Scaled(1.1)], CONFIG)
+        return UncertainDepth([Scaled(1.0), Scaled(1.1)], CONFIG, posterior=False)
 
     whole, first, second = fresh(), fresh(), fresh()
     expected = [whole(image(i), POSES[i], K).variance for i in range(5)]
@@ -157,15 +157,15 @@ def test_state_continues_and_resets():
 
 
 def test_a_state_holds_no_weights_and_names_other_networks(caplog):
-    first = UncertainDepth([Scaled(1.0), Scaled(1.1)], CONFIG)
+    first = UncertainDepth([Scaled(1.0), Scaled(1.1)], CONFIG, posterior=False)
     for i in range(3):
         first(image(i), POSES[i], K)
     state = first.state_dict()
     assert not [name for name in state if name.startswith("networks.")]
-    same_networks = UncertainDepth([Scaled(1.0), Scaled(1.1)], CONFIG)
+    same_networks = UncertainDepth([Scaled(1.0), Scaled(1.1)], CONFIG, posterior=False)
     same_networks.load_state_dict(state)
     assert not caplog.messages
-    others = UncertainDepth([Scaled(1.0), Scaled(1.2)], CONFIG)
+    others = UncertainDepth([Scaled(1.0), Scaled(1.2)], CONFIG, posterior=False)
     others.load_state_dict({**state, "networks.1.factor": torch.tensor(9.0)})  # as states were saved before
     assert [network.factor.item() for network in others.networks] == [1.0, pytest.approx(1.2)]
     assert int(others.ufm.frames) == 3
@@ -215,12 +215,12 @@ class Foreign(nn.Module):
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
 def test_networks_with_states_of_any_kind_are_saved(caplog):
-    model = UncertainDepth(Foreign(1.0), CONFIG)
+    model = UncertainDepth(Foreign(1.0), CONFIG, posterior=False)
     model(image(0), POSES[0], K)
     state = model.state_dict()
-    UncertainDepth(Foreign(1.0), CONFIG).load_state_dict(state)
+    UncertainDepth(Foreign(1.0), CONFIG, posterior=False).load_state_dict(state)
     assert not caplog.messages
-    UncertainDepth(Foreign(2.0), CONFIG).load_state_dict(state)
+    UncertainDepth(Foreign(2.0), CONFIG, posterior=False).load_state_dict(state)
     assert caplog.messages
 
 
@@ -237,8 +237,8 @@ def test_weights_of_a_large_layer_are_marked_by_its_first_and_last_entries():
 
 def test_stream_and_a_device_for_the_multiview_part_change_no_bit():
     members = [Scaled(1.0), Scaled(1.1), Scaled(0.9)]
-    plain = UncertainDepth(members, CONFIG)
-    ahead = UncertainDepth(members, CONFIG, multiview_device="cpu").to(torch.device("cpu"))
+    plain = UncertainDepth(members, CONFIG, posterior=False)
+    ahead = UncertainDepth(members, CONFIG, posterior=False, multiview_device="cpu").to(torch.device("cpu"))
     frames = [(image(i), POSES[i], K) for i in range(5)]
     requested = []
 

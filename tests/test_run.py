@@ -54,7 +54,7 @@ def test_a_run_equals_a_loop_by_hand(scene, tmp_path):
     path, truth = scene
     summary = run(network_job(path, Brightness(spread=0.02)), tmp_path / "out")
     sequence, preprocess = open_sequence(path), Preprocess(size=(24, 32))
-    pipeline = UncertainDepth(Brightness(spread=0.02), CONFIG, preprocess=preprocess)
+    pipeline = UncertainDepth(Brightness(spread=0.02), CONFIG, posterior=False, preprocess=preprocess)
     ours, alone = SequenceMetrics(), SequenceMetrics()
     disagreements, unmeasured = [], []
     for frame, depth in zip(sequence, truth.depths, strict=True):

@@ -1,4 +1,4 @@
-"""``ufmstar run --anchors``: equal to a loop written by hand, after any interruption; reports frames without
+"""``ufmstar run`` with anchors: equal to a loop written by hand, after any interruption; reports frames without
 anchors."""
 
 from __future__ import annotations
@@ -12,9 +12,11 @@ from runs import job_of, outputs, read_summary, records
 
 from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig, cli
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
+from ufmstar_torch.eval.commands import rank
 from ufmstar_torch.eval.commands.run import job_from, read
-from ufmstar_torch.eval.engine.maps import MapSource
+from ufmstar_torch.eval.engine.maps import MapSource, folder_source
 from ufmstar_torch.eval.report.text import run_table
+from ufmstar_torch.eval.run.export import gated_frames
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.panels import map_columns
 from ufmstar_torch.eval.run.pictures import FinishedRun
@@ -180,11 +182,13 @@ def test_only_a_run_with_anchors_goes_on_with_anchors(tour, finished, tmp_path, 
 
 
 def test_the_flag(tmp_path, capfd):
-    words = ["run", TOUR, "--depth", "self", "--anchors", "--ufm.disagreement", "overlap", "--no-video", "--no-sheet"]
+    words = ["run", TOUR, "--depth", "self", "--plain", "--anchors", "corners", "--ufm.disagreement", "overlap"]
+    words += ["--no-video", "--no-sheet"]
     assert cli.main([*words, "--frames", ":5", "--out", str(tmp_path / "a")]) == 0
     printed = capfd.readouterr().out
     summary = read_summary(tmp_path / "a")
-    assert summary["settings"]["anchors"] is True
+    assert (summary["settings"]["anchors"], summary["settings"]["plain"], summary["result"]) == ("corners", True, "ufm")
+    assert "posterior" not in summary
     assert summary["settings"]["ufm"]["anchors"] == AnchorConfig().to_dict()
     assert summary["settings"]["ufm"]["disagreement"] == "overlap"
     assert "UfM*, anchored  " in printed
@@ -202,28 +206,42 @@ def test_a_run_with_a_posterior_corrects_the_depth_and_goes_on_after_a_stop(tour
     summary = run(map_job(tour, config), whole)
     run(map_job(tour, config, lambda frame: too_far(frame, stop_at=5)), parts)
     assert run(map_job(tour, config), parts, resume=True)["posterior"] == summary["posterior"]
-    posterior, plain = summary["posterior"], summary["metrics"]
-    assert posterior["metrics"]["rmse"] < 0.8 * plain["rmse"]
-    assert posterior["metrics"]["ece_delta"] < plain["ece_delta"]
-    assert posterior["unseen"] > 0
-    assert "posterior  " in run_table(summary)
+    corrected, before = summary["metrics"], summary["ufm"]["metrics"]
+    assert summary["result"] == "posterior"
+    assert corrected["rmse"] < 0.8 * before["rmse"]
+    assert corrected["ece_delta"] < before["ece_delta"]
+    assert summary["uncertainty"]["mean_sigma"] < summary["ufm"]["mean_sigma"]
+    assert summary["posterior"]["unseen"] > 0
+    _, first, second, *_ = run_table(summary).splitlines()
+    assert first.startswith("posterior  ")
+    assert first.endswith(f" {summary['uncertainty']['mean_sigma']:.3g}")
+    assert second.startswith("UfM*, anchored  ")
+    assert second.endswith(f" {summary['ufm']['mean_sigma']:.3g}")
+    assert "times that of tracked corners" in run_table(summary)
+    assert "the posterior corrects it" in run_table(summary)
     for name in tour.names:
         one, other = (read_frame(out / "frames" / f"{name}.npz") for out in (whole, parts))
-        for key in ("posterior_depth", "posterior_variance", "posterior_inlier_variance", "posterior_outlier"):
+        for key in ("depth", "variance", "posterior_inlier_variance", "posterior_outlier"):
             np.testing.assert_array_equal(one[key], other[key])
     for kind, values, unit in (
-        ("depth", one["posterior_depth"], 1e-3),
-        ("sigma", np.sqrt(one["posterior_variance"]), 1e-4),
-        ("network_depth", one["depth"], 1e-3),
-        ("network_sigma", np.sqrt(one["variance"]), 1e-4),
+        ("depth", one["depth"], 1e-3),
+        ("sigma", np.sqrt(one["variance"]), 1e-4),
+        ("network_depth", one["network_depth"], 1e-3),
+        ("ufm_sigma", np.sqrt(one["ufm_variance"]), 1e-4),
     ):
         image = read_depth(whole / kind / f"{name}.png")
         expected = np.minimum(values, 65535 * unit)[one["valid"]]
         np.testing.assert_allclose(image[one["valid"]], expected, atol=unit)
     panel = FinishedRun(whole, tour, records(whole), with_error=True).panel(7)
     labels = [column.label for column in map_columns([panel])]
-    assert labels == ["depth", "posterior", "σ", "|error|", "σ, posterior", "|error|, posterior"]
-    assert np.nanmean(panel.maps["posterior_error"]) < 0.7 * np.nanmean(panel.maps["error"])
+    assert labels == ["depth, network", "depth", "σ", "|error|", "σ, UfM*", "|error|, network"]
+    assert np.nanmean(panel.maps["error"]) < 0.7 * np.nanmean(panel.maps["network_error"])
+    valid = one["valid"]
+    np.testing.assert_allclose(one["network_depth"][valid], 1.3 * tour[7].depth[::2, ::2][valid], rtol=1e-5)
+    (exported,) = [frame for frame in gated_frames(whole, np.inf, np.inf) if frame.name == name]
+    np.testing.assert_array_equal(exported.depth[valid], one["depth"][valid])
+    again = folder_source(tour, whole).one(tour[7], 0)  # UfM* again, on the depth that the network predicted
+    np.testing.assert_array_equal(again.depth[0].numpy(), one["network_depth"])
 
 
 def test_pictures_have_a_column_for_what_anchors_add(tour, finished):
@@ -234,10 +252,30 @@ def test_pictures_have_a_column_for_what_anchors_add(tour, finished):
     assert [column.label for column in map_columns([panel])] == ["depth", "σ", "√B", "|error|"]
 
 
-def test_images_are_needed(tour, monkeypatch, tmp_path):
-    words = [TOUR, "--depth", "self", "--anchors", "--out", str(tmp_path / "out")]
-    options = read(words)
+def test_images_are_needed(tour, monkeypatch, tmp_path, caplog):
+    words = [TOUR, "--depth", "self", "--out", str(tmp_path / "out")]
     blind = with_entries(tour, lambda _, e: dataclasses.replace(e, load_image=None))
     monkeypatch.setattr("ufmstar_torch.eval.commands.run.open_sequence", lambda *_, **__: blind)
-    with pytest.raises(ValueError, match=r"--anchors tracks corners of images, of which the sequence .* has none"):
-        job_from(options, TOUR)
+    with pytest.raises(ValueError, match=r"--anchors corners searches images, of which the sequence .* has none"):
+        job_from(read([*words, "--anchors", "corners"]), TOUR)
+    assert not caplog.messages
+    job = job_from(read(words), TOUR)
+    assert job.config.posterior is job.config.anchors is None
+    assert job.settings["plain"] is True
+    assert [text for text in caplog.messages if "UfM* alone" in text and "has no images" in text]
+    caplog.clear()
+    assert job_from(read([*words, "--plain"]), TOUR).config == job.config
+    assert not caplog.messages
+
+
+def test_the_default_is_the_posterior_with_dense_evidence_and_plain_is_ufm_star_alone(tour):
+    words = [TOUR, "--depth", "self", "--out", "out"]
+    jobs = {option: job_from(read([*words, *option.split()]), TOUR) for option in ("", "--plain", "--anchors corners")}
+    assert {option: job.landmarks for option, job in jobs.items() if job.config.posterior} == {
+        "": "dense",
+        "--anchors corners": "corners",
+    }
+    assert jobs["--plain"].config == UfMStarConfig(on_bad_frame="skip")
+    ranked = rank.read([TOUR, "--depth", "self", "--out", "out"])
+    assert ranked.config.anchors is ranked.config.posterior is None
+    assert rank.read([TOUR, "--depth", "self", "--out", "out", "--anchors", "dense"]).config.anchors is not None

@@ -99,8 +99,8 @@ def test_full_and_alone_put_the_members_together(network_files, networks, sequen
     members = members_of(network_files["ensemble"])
     rows = [row("Ensemble"), row("UfM*-FullEnsemble"), row("UfM*-Ensemble")]
     result = evaluate(sequence, rows, networks)
-    full = UncertainDepth(members, SKIP, mode="full", preprocess=members[0].preprocess)
-    alternating = UncertainDepth(members, SKIP, preprocess=members[0].preprocess)
+    how = {"posterior": False, "preprocess": members[0].preprocess}
+    full, alternating = UncertainDepth(members, SKIP, mode="full", **how), UncertainDepth(members, SKIP, **how)
 
     def piped(pipeline):
         for _, image, pose, K in frames_of(sequence):

@@ -13,14 +13,14 @@ from modules import DEPTHS, POSES, H, K, W, same
 from torch import nn
 from walks import SPGF
 
-from ufmstar_torch import AnchorConfig, DepthPrediction, UfMStarConfig, UncertainDepth
+from ufmstar_torch import DepthPrediction, UfMStarConfig, UncertainDepth
 from ufmstar_torch.recalibrate import Recalibration
 
 KINDS = {
-    "plain": {},
-    "anchored": {"config": UfMStarConfig(segment=SPGF, anchors=AnchorConfig()), "anchors": "corners"},
-    "dense": {"config": UfMStarConfig(segment=SPGF, anchors=AnchorConfig()), "anchors": "dense"},
-    "posterior": {"posterior": True},
+    "plain": {"posterior": False},
+    "anchored": {"posterior": False, "anchors": "corners"},
+    "dense": {"posterior": False, "anchors": "dense"},
+    "posterior": {},
 }
 # A texture that moves with the camera, for the landmark tracker.
 _TEXTURE = np.random.default_rng(0).integers(0, 255, (H + 8, W + 8, 3), dtype=np.uint8)
@@ -56,9 +56,7 @@ def frame(i):
 
 
 def model_of(kind, frames=0):
-    model = UncertainDepth(
-        Network(), recalibration=Warner((1.0,), (1.0,)), **({"config": UfMStarConfig(segment=SPGF)} | KINDS[kind])
-    )
+    model = UncertainDepth(Network(), UfMStarConfig(segment=SPGF), recalibration=Warner((1.0,), (1.0,)), **KINDS[kind])
     for i in range(frames):
         model(*frame(i))
     return model
@@ -142,7 +140,8 @@ def test_a_damaged_state_is_refused_as_a_whole(kind, name, damage, message):
 
 
 def test_a_warning_about_the_config_that_is_an_error_changes_nothing():
-    model, other = model_of("plain", 1), UncertainDepth(Network(), UfMStarConfig(segment=SPGF, eta=0.4))
+    model = model_of("plain", 1)
+    other = UncertainDepth(Network(), UfMStarConfig(segment=SPGF, eta=0.4), posterior=False)
     other(*frame(0)), other(*frame(1))
     before = snapshot(model)
     with warnings.catch_warnings():

@@ -22,7 +22,7 @@ import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from ufmstar_torch.atomic import write_atomic
-from ufmstar_torch.models.checkpoints import read_tensors
+from ufmstar_torch.tensor_files import read_tensors
 from ufmstar_torch.train.module import FIGURES_KEY
 
 NAME = "last.ckpt"

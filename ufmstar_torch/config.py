@@ -297,7 +297,8 @@ class UfMStarConfig(Checked):
                 raise ValueError(f"UfMStarConfig.{name} needs anchors: set anchors=AnchorConfig() as well")
         if self.aleatoric_in_h and (self.anchors is not None or not self.add_aleatoric):
             raise ValueError(
-                "UfMStarConfig.aleatoric_in_h goes with add_aleatoric=True and without anchors, got another setting"
+                "UfMStarConfig.aleatoric_in_h goes with add_aleatoric=True and without anchors (posterior=False; "
+                "--plain), got another setting"
             )
         if self.far_radius < self.near_radius:
             raise ValueError(

@@ -18,13 +18,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.landmarks import OtherCameraError
 from ufmstar_torch.arguments import CameraLike, ImageLike, as_image, as_intrinsics, as_pose
 from ufmstar_torch.atomic import write_atomic
 from ufmstar_torch.camera import rotation_deviation
 from ufmstar_torch.frame import FRAME_FAULTS, pose_fault
 from ufmstar_torch.pipeline import UncertainDepth, UncertainPrediction
 from ufmstar_torch.stream_warnings import LOGGER
+from ufmstar_torch.tensor_files import read_tensors
 from ufmstar_torch.trajectory import SAME_TIME, Trajectory, interpolate_pose
 
 # Reasons for which an image is dropped (NEWER, CLOSED) or skipped (the others).
@@ -63,7 +63,7 @@ class LiveStatistics:
     dropped: Mapping[str, int]  # by reason: usable images
     skipped: Mapping[str, int]  # by reason: unusable images
     saved: int  # how often the state was saved
-    restarts: int  # how often an image of another size or camera reset the anchors' evidence
+    restarts: int  # how often an image of another size or camera restarted the anchors' evidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,12 +91,14 @@ class LiveDepth:
         intrinsics: of the images [px], [3, 3] or fx, fy, cx, cy; None = pass them to every ``push_image``.
         max_wait: longest wait for a pose after an image [s].
         max_gap: longest interval between the poses around an image, beyond which it is skipped [s].
-        state: file to which ``model.state_dict()`` is written atomically, every ``save_every`` seconds [s] and at the
-            end; None = never. ``model.load_state_dict(torch.load(FILE))`` resumes from it.
+        state: file of ``model.state_dict()``, from which the model continues if the file exists, and to which the state
+            is written atomically, every ``save_every`` seconds [s] and at the end. Delete the file for a new place.
+            None = no file.
         save_every: see ``state``.
 
     Raises:
-        TypeError, ValueError: an argument is invalid.
+        TypeError, ValueError: an argument is invalid, or the model cannot continue from the state in the file; the file
+            stays as it is.
         FileNotFoundError: the folder of ``state`` does not exist.
 
     An image of another size or camera resets the evidence of the model's anchors. An error in the model, in
@@ -127,6 +129,8 @@ class LiveDepth:
             raise FileNotFoundError(f"state: no such folder: {self._state.parent}")
         if self._state is not None and self._state.is_dir():
             raise IsADirectoryError(f"state must be a file, got the folder {self._state}")
+        if self._state is not None and self._state.exists():
+            load_state(model, self._state)
         self.model, self._on_result = model, on_result
         self._intrinsics = None if intrinsics is None else as_intrinsics(intrinsics)
         self._max_wait, self._max_gap, self._save_every = max_wait, max_gap, save_every
@@ -204,8 +208,9 @@ class LiveDepth:
     def statistics(self) -> LiveStatistics:
         """Counts so far."""
         with self._changed:
-            counts = {name: self._counts[name] for name in ("images", "poses", "results", "saved", "restarts")}
-            return LiveStatistics(**counts, dropped=dict(self._dropped), skipped=dict(self._skipped))
+            counts = {name: self._counts[name] for name in ("images", "poses", "results", "saved")}
+            restarts = 0 if self.model.landmarks is None else self.model.landmarks.restarts
+            return LiveStatistics(**counts, restarts=restarts, dropped=dict(self._dropped), skipped=dict(self._skipped))
 
     def reset(self) -> None:
         """Drop poses and waiting images, and reset the model before its next image. Call this after a loop closure that
@@ -316,14 +321,7 @@ class LiveDepth:
         if resetting:
             self.model.reset()
         started = perf_counter()
-        try:
-            out = self.model(frame.image, T, frame.intrinsics)
-        except OtherCameraError:
-            assert self.model.landmarks is not None
-            self.model.landmarks.reset()
-            with self._changed:
-                self._counts["restarts"] += 1
-            out = self.model(frame.image, T, frame.intrinsics)
+        out = self.model(frame.image, T, frame.intrinsics)
         finished = perf_counter()
         if fault := int(out.ufm.statistics.fault[0]):
             with self._changed:
@@ -353,6 +351,17 @@ class LiveDepth:
         del self._waiting[:count]
         if count:
             self._dropped[reason] += count
+
+
+def load_state(model: UncertainDepth, file: Path) -> None:
+    """Load the state in a file. Raises ValueError: the model cannot continue from it, and is unchanged."""
+    try:
+        with file.open("rb") as opened:
+            state = read_tensors(opened, "it")
+        model.load_state_dict(state)
+    except (RuntimeError, TypeError, ValueError, OSError) as error:
+        text = f"state {file} cannot be continued: {error}. Delete the file, or name another one, to begin anew"
+        raise ValueError(text) from error
 
 
 def _seconds(stamp: float) -> float:

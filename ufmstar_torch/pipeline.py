@@ -1,4 +1,4 @@
-"""The whole pipeline: networks and their alternation (step 1), anchors, and UfM*."""
+"""The whole pipeline: networks and their alternation (step 1), anchors, UfM* and the posterior."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import torch
 from torch import Tensor, nn
 
+from ufmstar_torch.anchors import landmarks
 from ufmstar_torch.anchors.anchors import Anchors, require_anchors
 from ufmstar_torch.anchors.pose_check import PoseCheck
-from ufmstar_torch.anchors.streams import SourceLike, StreamLandmarks
+from ufmstar_torch.anchors.streams import SourceLike, StreamLandmarks, as_bytes
 from ufmstar_torch.arguments import Array, CameraLike, ImageLike, as_image, as_intrinsics, as_pose, as_tensor
 from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
 from ufmstar_torch.image_check import ImageCheck
@@ -38,16 +39,18 @@ from ufmstar_torch.warm_up import along_wall, camera_of, require_size, warm_up
 _BLACK = {torch.uint8: 1, torch.float32: 1 / 255, torch.float64: 1 / 255}  # largest value of a black image
 _MARK = "weights_mark"  # key of the checksum of the networks' weights in a state
 _BRIGHT = 8.0  # largest value of a normalised image, by a wide margin
+_MISSED = "UfM* alone, without anchors and the depth that the posterior corrects with them: %s"
 
 
 @dataclass(frozen=True)
 class UncertainPrediction:
-    """A depth prediction with its total variance.
+    """The depth of an image and its variance: the posterior's, or, without a posterior, the network's depth with the
+    variance of UfM*. Before a stream's first anchor, the posterior's are the network's and UfM*'s.
 
     Attributes:
         prediction: the network's output (for "full": the predictive mean, mean A and E over the members).
-        ufm: the output of UfM*; ``ufm.variance`` [m^2] is the result.
-        member: index of the network that was run, or None if all were.
+        ufm: the output of UfM* for the network's depth: V, M, A, E and B, ``measured`` and the counts.
+        member: index of the network that was run; None if all were, or none.
     """
 
     prediction: DepthPrediction
@@ -56,8 +59,9 @@ class UncertainPrediction:
 
     @property
     def depth(self) -> Tensor:
-        """[B, H, W] [m]."""
-        return self.prediction.depth
+        """[B, H, W] [m]; the posterior's is NaN where not valid."""
+        corrected = self.ufm.posterior_depth
+        return self.prediction.depth if corrected is None else corrected
 
     @property
     def intrinsics(self) -> Tensor:
@@ -66,13 +70,14 @@ class UncertainPrediction:
 
     @property
     def variance(self) -> Tensor:
-        """[B, H, W] V [m^2]."""
-        return self.ufm.variance
+        """[B, H, W] of ``depth`` [m^2], NaN where not valid."""
+        corrected = self.ufm.posterior_variance
+        return self.ufm.variance if corrected is None else corrected
 
     @property
     def std(self) -> Tensor:
-        """[B, H, W] sqrt(V) [m]."""
-        return self.ufm.std
+        """[B, H, W] square root of ``variance`` [m]."""
+        return self.variance.sqrt()
 
     @property
     def disagreement(self) -> Tensor:
@@ -115,17 +120,19 @@ class UncertainDepth(NetworksInTurn):
             single-model mode, and with a stochastic network the sampling-based mode. "full" runs every member (or
             ``samples`` passes of a stochastic network) per image and takes the predictive mean, the mean aleatoric
             variance, and the variance between the members as epistemic variance.
-        posterior: also compute a corrected depth and its variance, ``out.ufm.posterior()``. Sets the sections
-            ``anchors`` and ``posterior`` of ``config``, and ``anchors="dense"`` unless another source is passed. To
-            pass anchors with every image, set the two sections instead.
+        posterior: correct the depth and its variance with anchors. Sets the sections ``anchors`` and ``posterior`` of
+            ``config`` and, unless a source is passed, ``anchors="dense"``. Without OpenCV, and without networks, whose
+            images are searched, a warning states what is missed, and UfM* runs alone. False: UfM* alone; with
+            ``anchors``, B is added to its variance.
         samples: number of stochastic passes per image in mode "full" with one network (MC-Dropout; the network must
             sample in eval mode). None: the network is deterministic.
         preprocess: maps image and intrinsics to the networks' input. "own": the networks' attribute ``preprocess``;
             for networks without one, bytes become floats in [0, 1]. None = no preprocessing.
-        anchors: source of the anchors of every image, with ``config.anchors``: "corners" (tracked in the image),
-            "dense" (searched in earlier images), a file of landmarks, or a
-            :class:`~ufmstar_torch.anchors.landmarks.LandmarkSource`; for several streams, a list with one source for
-            each. Saved and reset with the state. None: anchors may be passed with each image.
+        anchors: source of the anchors of every image: "corners" (tracked in the image), "dense" (searched in earlier
+            images), a file of landmarks, each for every stream; or a
+            :class:`~ufmstar_torch.anchors.landmarks.LandmarkSource`; or a list with one source for each stream. Saved
+            and reset with the state. An image of another size or camera restarts it. None: "dense" for the posterior,
+            on images of bytes, or floats in [0, 1]; anchors that are passed with an image replace its search.
         recalibration: a map of V, applied last (``Recalibration.from_json(FILE)``); None = no map.
         check_poses: number of first images, of the first stream, that are compared with their poses and intrinsics by
             tracked corners, 2 ms each. A warning states if another convention or delay of the poses, or K of another
@@ -138,15 +145,15 @@ class UncertainDepth(NetworksInTurn):
 
     Raises:
         TypeError: an argument is no network.
-        ValueError: no network, networks with different ``preprocess`` attributes, an unknown mode, ``samples`` that fit
-            neither mode nor networks, or anchors without ``config.anchors``.
+        ValueError: no network, networks with different ``preprocess`` attributes, an unknown mode, or ``samples`` that
+            fit neither mode nor networks.
 
     Example::
 
-        model = UncertainDepth(network, UfMStarConfig(anchors=AnchorConfig()), anchors="corners")
+        model = UncertainDepth(network)
         for image, pose, intrinsics in video:  # [H, W, 3] uint8, [4, 4], [3, 3]
             out = model(image, pose, intrinsics)
-            out.variance  # M + A + E + B
+            out.depth, out.std  # corrected [m]; the network's are in out.prediction, M, A, E and B in out.ufm
     """
 
     image_index: Tensor
@@ -157,7 +164,7 @@ class UncertainDepth(NetworksInTurn):
         config: UfMStarConfig | None = None,
         *,
         mode: Literal["alternate", "full"] = "alternate",
-        posterior: bool = False,
+        posterior: bool = True,
         samples: int | None = None,
         preprocess: Preprocess | Literal["own"] | None = "own",
         anchors: SourceLike | list[SourceLike] | tuple[SourceLike, ...] | None = None,
@@ -180,16 +187,23 @@ class UncertainDepth(NetworksInTurn):
         for name, value, kind in (("config", config, UfMStarConfig), ("recalibration", recalibration, Recalibration)):
             if value is not None and not isinstance(value, kind):
                 raise TypeError(f"{name} must be a {kind.__name__} or None, got {type(value).__name__}")
+        self._by_default = posterior and anchors is None
+        if self._by_default and (missed := _missed(networks)):
+            self._by_default, posterior = False, config.anchors is not None
+            if not posterior:
+                LOGGER.warning(_MISSED, missed)
+        anchors = "dense" if self._by_default else anchors
+        if posterior or anchors is not None:
+            config = config.replace(anchors=config.anchors or AnchorConfig())
         if posterior:
-            sections = config.anchors or AnchorConfig(), config.posterior or PosteriorConfig()
-            config = config.replace(anchors=sections[0], posterior=sections[1])
-            anchors = "dense" if anchors is None and networks is not None else anchors
+            config = config.replace(posterior=config.posterior or PosteriorConfig())
         mapped = () if recalibration is None else (recalibration,)
         self.ufm = UfMStar(config.within(self.max_depth, self.states_confidence), extensions=mapped)
-        if anchors is not None and self.ufm.config.anchors is None:
-            raise ValueError("anchors go with UfMStarConfig(anchors=AnchorConfig())")
         self.landmarks = None if anchors is None else StreamLandmarks(anchors)
-        searching = self.landmarks is not None and self.landmarks.searching  # these sources compare poses themselves
+        self._unsearchable = False  # whether an image could not be searched for anchors
+        self._searched = False  # whether the source of anchors has processed the current image
+        # A source that searches the images compares their poses itself, but does not name the mistake.
+        searching = self.landmarks is not None and self.landmarks.searching and not self._by_default
         if not isinstance(check_poses, int) or check_poses < 0:
             raise ValueError(f"check_poses must be a number of images of at least 0, got {check_poses!r}")
         self._pose_check = PoseCheck(0 if searching else check_poses, self.ufm.config.rotation_tolerance)
@@ -230,8 +244,8 @@ class UncertainDepth(NetworksInTurn):
             intrinsics: [B, 3, 3] or [3, 3] of ``image`` [px], or fx, fy, cx, cy; likewise.
             valid: [B, h, w] bool at the depth map's size, True = use.
             features: [B, F, h, w] likewise, F = ``config.features``.
-            anchors: sparse depths of this frame, [B, N] padded and masked, with ``config.anchors``, at pixels of
-                ``image`` before the preprocessing. None = the constructor's source, or no anchors.
+            anchors: sparse depths of this frame, [B, N] padded and masked, at pixels of ``image`` before the
+                preprocessing. None = of the constructor's source.
 
         Raises:
             ValueError, TypeError: as :meth:`UfMStar.forward`; alternation and landmarks then do not advance.
@@ -271,7 +285,7 @@ class UncertainDepth(NetworksInTurn):
         *,
         features: Array | None = None,
         anchors: Anchors | None = None,
-    ) -> UfMStarOutput:
+    ) -> UncertainPrediction:
         """Process an existing prediction, for example a cached one, as :meth:`forward` does after its networks.
 
         Args:
@@ -279,15 +293,18 @@ class UncertainDepth(NetworksInTurn):
             pose: as in :meth:`forward`.
             intrinsics: as in :meth:`forward`, of the depth map [px].
             valid, features: as in :meth:`forward`.
-            anchors: [B, N] at pixels of the depth map; None = no anchors, even with a source of anchors.
+            anchors: [B, N] at pixels of the depth map, with ``config.anchors``; None = no anchors, even with a source.
 
         Raises:
             ValueError, TypeError: as :meth:`UfMStar.forward`; the image is then not counted.
         """
         maps = maps_of(prediction, self.ufm)
-        out = self.ufm(pose=pose, intrinsics=intrinsics, valid=valid, features=features, anchors=anchors, **maps)
+        ufm = self.ufm(pose=pose, intrinsics=intrinsics, valid=valid, features=features, anchors=anchors, **maps)
         self._count(self._next + 1)
-        return out
+        if prediction.intrinsics is None:
+            K = as_intrinsics(intrinsics)
+            prediction = replace(prediction, intrinsics=K.expand(len(prediction.depth), 3, 3))
+        return UncertainPrediction(prediction, ufm, None)
 
     def mean_uncertainty(
         self,
@@ -303,7 +320,9 @@ class UncertainDepth(NetworksInTurn):
         seed: int = 0,
         average: bool = False,
     ) -> MeanUncertainty:
-        """Like :meth:`forward`, but computes an average variance per image, for active learning.
+        """Like :meth:`forward`, but computes the average of V per image, for active learning. The default source of
+        anchors is not asked: V has B only from a source that the constructor was passed, or from earlier calls of
+        :meth:`forward`.
 
         Args:
             image, pose, intrinsics, valid, features, anchors: as in :meth:`forward`.
@@ -314,7 +333,7 @@ class UncertainDepth(NetworksInTurn):
         """
         predicted = self._predicted(image, pose, intrinsics, features)
         sample: dict[str, Any] = {"pixels": pixels, "fraction": fraction, "seed": seed, "average": average}
-        with self._anchored(predicted, anchors) as found:
+        with self._anchored(predicted, anchors, search=not self._by_default) as found:
             mean = self.ufm.mean_uncertainty(
                 pose=predicted.pose, intrinsics=predicted.prediction.K, valid=valid, features=predicted.features,
                 anchors=found, **maps_of(predicted.prediction, self.ufm), **sample,
@@ -367,12 +386,14 @@ class UncertainDepth(NetworksInTurn):
     ) -> UncertainPrediction:
         p = predicted.prediction
         with self._anchored(predicted, anchors) as found:
-            ufm = self.update(p, predicted.pose, p.K, valid, features=predicted.features, anchors=found)
-        self._undo(ufm.statistics)
-        return UncertainPrediction(p, ufm, predicted.member)
+            out = self.update(p, predicted.pose, p.K, valid, features=predicted.features, anchors=found)
+        self._undo(out.ufm.statistics)
+        return replace(out, member=predicted.member)
 
     @contextmanager
-    def _anchored(self, predicted: _Predicted, anchors: Anchors | None) -> Iterator[Anchors | None]:
+    def _anchored(
+        self, predicted: _Predicted, anchors: Anchors | None, *, search: bool = True
+    ) -> Iterator[Anchors | None]:
         """The image's anchors, from the caller or the source, at pixels of the depth map. Waits for the prediction's
         copies. An error in the context undoes the source's update.
 
@@ -383,9 +404,10 @@ class UncertainDepth(NetworksInTurn):
             predicted.ready.synchronize()
         K = predicted.intrinsics
         self._pose_check.compare(predicted.image, predicted.pose, K)
-        if self.landmarks is not None:
-            if anchors is not None:
-                raise ValueError("anchors come from the source that UncertainDepth was made with: pass none")
+        if anchors is not None and self.landmarks is not None and not self._by_default:
+            raise ValueError("anchors come from the source that UncertainDepth was made with: pass none")
+        self._searched = search and anchors is None and self._searchable(predicted.image)
+        if self._searched and self.landmarks is not None:
             config = self.ufm.config
             skip = config.on_bad_frame == "skip"
             anchors = self.landmarks.update(predicted.image, predicted.pose, K, config.rotation_tolerance, skip=skip)
@@ -394,13 +416,26 @@ class UncertainDepth(NetworksInTurn):
             moved = anchors is not None and self.preprocess not in (None, in_unit_range)
             yield require_anchors(anchors).moved(K, predicted.prediction.K) if moved else anchors
         except BaseException:
-            if self.landmarks is not None:
+            if self.landmarks is not None and self._searched:
                 self.landmarks.undo()
             raise
 
+    def _searchable(self, image: Tensor) -> bool:
+        """False where the default source cannot search the image: it is neither of bytes nor of floats in [0, 1]."""
+        if not self._by_default or image.is_meta:
+            return not image.is_meta
+        try:
+            as_bytes(image)
+        except ValueError:
+            if not self._unsearchable:
+                LOGGER.warning(_MISSED, "the images must be bytes, or floats in [0, 1] (logged once)")
+            self._unsearchable = True
+            return False
+        return True
+
     def _undo(self, statistics: FrameStatistics) -> None:
         """Undo the landmark update of streams that skipped the image."""
-        if self.landmarks is not None:
+        if self.landmarks is not None and self._searched:
             self.landmarks.undo(statistics.fault.nonzero().flatten().tolist())
 
     def _predicted(
@@ -542,6 +577,17 @@ def maps_of(prediction: DepthPrediction, ufm: UfMStar) -> dict[str, Any]:
         "informative": prediction.informative,
     }
     return maps | ({"confidence": prediction.confidence} if ufm.takes("confidence") else {})
+
+
+def _missed(networks: object) -> str:
+    """Why no image can be searched for anchors; "" if images can be."""
+    if networks is None:
+        return "UncertainDepth(None) sees no images"
+    try:
+        landmarks.opencv()
+    except ImportError as error:
+        return str(error)
+    return ""
 
 
 def _require_count(value: object, name: str) -> None:

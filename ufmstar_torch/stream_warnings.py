@@ -33,6 +33,9 @@ _ALTERNATING, _NEARER = 6, 5.0
 # A batch that holds successive frames of one video: least streams, successive calls, and the largest distance between
 # successive frames over the step of the first stream (1/B for a uniform motion).
 _BATCH, _CONTINUED, _SUCCESSIVE = 3, 3, 0.5
+# A first batch whose poses form one path, as a clip's: least streams; least share of steps to the nearest of all later,
+# or earlier, poses; longest step over the mean depth, and largest rotation [rad] of a step.
+_CLIP, _IN_ORDER, _STEP, _TURN = 5, 0.8, 0.25, 0.35
 # Shares of pixels: of valid ones, below which ``valid`` may be inverted; of those with the largest depth, if it is the
 # same in every frame.
 _SPARSE, _SATURATED = 0.1, 0.2
@@ -41,6 +44,10 @@ _ROWS = 8
 # On an accelerator, reading the counts synchronises: only every so many frames, and not while a graph is recorded.
 EVERY = 64
 LOGGER = logging.getLogger("ufmstar_torch")
+_ONE_VIDEO = (
+    "the {} streams of a batch look like successive frames of one video{}. Views are compared within a stream only: "
+    "pass one frame at a time"
+)
 _CAUSES = (
     "Likely causes: poses or depth in another unit (millimetres, a scale of their own), world-to-camera poses, axes of "
     "another convention, a trajectory of other times, depth that is inverse or relative, or intrinsics of an image of "
@@ -151,6 +158,21 @@ def _position(T: list[list[float]]) -> list[float]:
     return [row[3] for row in T[:3]]
 
 
+def one_path(pose: Tensor, depth: float) -> bool:
+    """True if poses [B, 4, 4] camera-to-world [m] follow each other along one path in a scene of a mean depth [m]."""
+    position, R = pose[:, :3, 3].double(), pose[:, :3, :3].double()
+    step = (position[1:] - position[:-1]).norm(dim=1)
+    cosine = ((R[:-1].mT @ R[1:]).diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
+    if not (bool((step > 0).all()) and float(step.max()) < _STEP * depth and float(cosine.min()) > math.cos(_TURN)):
+        return False
+    distance = torch.cdist(position, position)
+    n = len(pose)
+    following = [float(distance[i, i + 1 :].min()) for i in range(n - 1)]
+    preceding = [float(distance[i, :i].min()) for i in range(1, n)]
+    nearest = torch.tensor([*following, *preceding], dtype=torch.float64)
+    return float((step.cpu().repeat(2) <= nearest).double().mean()) >= _IN_ORDER
+
+
 class StreamWarnings:
     """Checks every frame and its counts, and warns of implausible input."""
 
@@ -196,6 +218,9 @@ class StreamWarnings:
         members = [0.0] * len(poses) if frame.member is None else frame.member.tolist()
         height, width = frame.size
         yield from self._one_video(poses)
+        first = not self._tracks and len(poses) >= _CLIP and not any(statistics.fault.tolist())
+        if first and one_path(frame.T_world_cam, _mean(rows, float(sum(sums)))):
+            yield 0, "batch", _ONE_VIDEO.format(len(poses), ": their poses form one path")
         for b, fault in enumerate(statistics.fault.tolist()):
             if fault or not pixels[b]:
                 continue
@@ -227,8 +252,7 @@ class StreamWarnings:
         continues = longest < _SUCCESSIVE * math.dist(path[1], before[0])
         self._continued = self._continued + 1 if continues else max(self._continued - 1, 0)
         if self._continued == _CONTINUED:
-            text = f"the {len(poses)} streams of a batch look like successive frames of one video. Views are compared "
-            yield 0, "batch", text + "within a stream only: pass one frame at a time"
+            yield 0, "batch", _ONE_VIDEO.format(len(poses), "")
 
 
 def _left_out(

@@ -87,13 +87,13 @@ def run_onboard(out: Path, weights: Path, seconds: float, seed: int, progress: R
     sequence = in_memory(part, lambda done: progress(Progress("rooms", done, _WALKED)))
     config = UfMStarConfig(on_bad_frame="skip")
     warm_up_command(config, progress)
-    model = UncertainDepth(network, config, check_poses=0)
+    model = UncertainDepth(network, config, posterior=False, check_poses=0)
     summary = {
         "network": description,
         "realtime": _live(model, sequence, seconds, progress),
         "load_average": load_average(),
     }
-    contrasts = _contrasts(UncertainDepth(network, config, check_poses=0), sequence)
+    contrasts = _contrasts(UncertainDepth(network, config, posterior=False, check_poses=0), sequence)
     if contrasts:
         summary["contrast"] = contrast_figures(contrasts)
         draw_contrasts(out / PICTURE, contrasts)

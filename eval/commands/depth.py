@@ -19,6 +19,7 @@ from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.recalibrate import Recalibration, recalibration_path
 from ufmstar_torch.stateful import flat
+from ufmstar_torch.stream_warnings import LOGGER
 
 PRESETS = ("tum", "tartanair_indoor", "tartanair_outdoor")
 OWN_DEPTH = ("self", "ground-truth")
@@ -122,21 +123,18 @@ class UfMOptions:
     Attributes:
         preset: segmentation thresholds of the authors' code for a kind of recording; single --ufm.segment.* take
             precedence
-        ufm_preset: paper: the paper's own settings (UfMStarConfig.paper), default: ours; --preset and single --ufm.*
-            take precedence
-        anchors: depths that show the error on which all views agree (docs/anchors.md). Without a word, or with corners:
-            corners tracked in the images; dense: a depth in every cell of the image, searched in earlier images; FILE:
-            landmarks, a line x y z sigma [m] each, in the world of the poses
-        posterior: also a depth that anchors correct, with its variance (docs/results/posterior.md); --anchors chooses
-            the anchors, default: dense
+        ufm_preset: paper: the paper's own settings (UfMStarConfig.paper; with --plain, its method), default: ours;
+            --preset and single --ufm.* take precedence
+        anchors: depths that show the error on which all views agree (docs/anchors.md): dense, a depth in every cell of
+            the image, searched in earlier images; corners, tracked in the images; or FILE, landmarks, a line x y z
+            sigma [m] each, in the world of the poses
         scale_from: network: its scale for COLMAP poses without one; anchors then show shape only
         recalibration: file of `ufmstar recalibrate`, or none; default: WEIGHTS.recalibration.json beside the weights
     """
 
     preset: str | None = option(None, choices=PRESETS)
     ufm_preset: str | None = option(None, choices=(PAPER, DEFAULTS))
-    anchors: bool | str = option(False, const=True)
-    posterior: bool = False
+    anchors: str | None = None
     scale_from: str | None = option(None, choices=("network",))
     recalibration: str | None = None
     ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", unset=True, shown=True)
@@ -144,13 +142,18 @@ class UfMOptions:
     def __post_init__(self) -> None:
         self.config()  # checks the settings
 
+    @property
+    def posterior(self) -> bool:
+        """True if anchors correct the depth."""
+        return False
+
     def config(self, **first: Any) -> UfMStarConfig:
         """The configuration; ``first`` replaces values of the presets. Raises ValueError: an impossible value, or
         settings of anchors or posterior while these are off."""
-        used = {"anchors": bool(self.anchors or self.posterior), "posterior": self.posterior}
-        for name in used:
+        used = {"anchors": self.anchors is not None or self.posterior, "posterior": self.posterior}
+        for name, needed in (("anchors", "--anchors"), ("posterior", "the posterior, as run and live without --plain")):
             if name in self.ufm and not used[name]:
-                raise ValueError(f"--ufm.{name}.* needs --{name}")
+                raise ValueError(f"--ufm.{name}.* needs {needed}")
         start = started(self.ufm_preset or DEFAULTS, **used).replace(on_bad_frame="skip")
         start = start if self.preset is None else start.replace(segment=SPGFConfig.preset(self.preset))
         return start.with_values(first | flat(self.ufm))
@@ -158,7 +161,8 @@ class UfMOptions:
     def load_recalibration(
         self, config: UfMStarConfig, weights: tuple[str, ...], source: DepthSource
     ) -> Recalibration | None:
-        """Read the recalibration of the option; by default that next to the weights, if it exists.
+        """Read the recalibration of the option; by default that next to the weights, if it exists. A warning states if
+        that one was fitted to UfM* alone, and is left out because ``config`` has anchors.
 
         Raises:
             FileNotFoundError: the named file does not exist.
@@ -170,7 +174,30 @@ class UfMOptions:
         file = recalibration_path(weights[0]) if name is None else Path(name)
         try:
             recalibration = Recalibration.from_json(file)
+            of_plain = bool(recalibration.ufm) and not recalibration.ufm.get("anchors")
+            if name is None and of_plain and config.anchors is not None:
+                LOGGER.warning("%s is not used: it was fitted to UfM* alone, which --plain runs", file)
+                return None
             recalibration.require(config, ", ".join(one["name"] for one in source.identity.get("files", ())))
         except ValueError as error:
             raise ValueError(f"{file}: {error}; --recalibration none runs without it") from error
         return recalibration
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosteriorOptions(UfMOptions):
+    """UfM*, and the posterior that corrects its depth and variance with anchors.
+
+    Attributes:
+        anchors: from which the depth is corrected (docs/anchors.md): dense (default), a depth in every cell of the
+            image, searched in earlier images; corners, tracked in the images; or FILE, landmarks, a line x y z sigma
+            [m] each, in the world of the poses
+        plain: UfM* alone: the network's depth with the variance of UfM*; with --anchors, the variance has B
+    """
+
+    plain: bool = False
+
+    @property
+    def posterior(self) -> bool:
+        """True if anchors correct the depth."""
+        return not self.plain

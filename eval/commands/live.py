@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ufmstar_torch.anchors.sources import CORNERS, DENSE
+from ufmstar_torch.anchors.sources import DENSE
 from ufmstar_torch.eval.check.image_fit import image_fit, track_corners
-from ufmstar_torch.eval.commands.depth import NetworkOptions, UfMOptions
+from ufmstar_torch.eval.commands.depth import NetworkOptions, PosteriorOptions
 from ufmstar_torch.eval.commands.options import MachineOptions, option, positional, reader, usage_errors
 from ufmstar_torch.eval.commands.terminal import Bars
 from ufmstar_torch.eval.engine.anchors import landmarks_of
@@ -35,8 +35,7 @@ from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
 from ufmstar_torch.eval.sequences.live import LiveEvent
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.live import LiveDepth, LiveResult, LiveStatistics
-from ufmstar_torch.models.checkpoints import read_tensors
+from ufmstar_torch.live import LiveDepth, LiveResult, LiveStatistics, load_state
 from ufmstar_torch.pipeline import UncertainDepth
 from ufmstar_torch.stream_warnings import LOGGER
 
@@ -47,10 +46,11 @@ _OF_LIVE = ("intrinsics", "trajectory", "poses", "pose_scale", "max_pose_gap")
 
 @dataclass(frozen=True, kw_only=True)
 class LiveOptions(MachineOptions):
-    """Depth with a variance for the newest image, as images and poses come.
+    """Depth with a standard deviation for the newest image, as images and poses come.
 
-    A recording is replayed at its pace. A camera, and a folder with --follow, take their poses from the file
-    --trajectory, to which another program adds lines. On standard input, a line is
+    Depths that are searched in earlier images correct the network's; --plain is UfM* alone. A recording is replayed at
+    its pace. A camera, and a folder with --follow, take their poses from the file --trajectory, to which another
+    program adds lines. On standard input, a line is
     {"stamp": s, "pose": [x, y, z, qx, qy, qz, qw], "image": "file", "intrinsics": [fx, fy, cx, cy]} or a part of it.
     Ends with its source, or with Ctrl-C.
 
@@ -63,7 +63,8 @@ class LiveOptions(MachineOptions):
         max_wait: for the poses after an image [s]
         state: file in which the state is kept, and from which it goes on
         save_every: of the state [s]
-        out: folder for realtime.json and a .npz with depth, variance, disagreement, pose and intrinsics per image
+        out: folder for realtime.json and, for each image, a .npz with depth and variance (corrected unless --plain),
+            network_depth and ufm_variance before the correction, disagreement, pose and intrinsics
         overwrite: replace the results in --out
         view: show the images, depth and plots in rerun, on this computer alone
         json: print a line of JSON per image instead of the status
@@ -85,7 +86,7 @@ class LiveOptions(MachineOptions):
     json: bool = False
     opening: Options
     network: NetworkOptions
-    uncertainty: UfMOptions
+    uncertainty: PosteriorOptions
 
     def __post_init__(self) -> None:
         if self.network.model is None:
@@ -214,27 +215,24 @@ def _model(options: LiveOptions) -> UncertainDepth:
         mode="full" if chosen.mode == "full" else "alternate",
         posterior=options.uncertainty.posterior,
         samples=source.passes if len(source.networks) == 1 and chosen.mode == "full" else None,
-        anchors=None if anchors is False else landmarks_of(anchors, None),
+        anchors=None if anchors is None else landmarks_of(anchors, None),
         recalibration=options.uncertainty.load_recalibration(config, chosen.weights, source),
         check_poses=0 if options.recorded else 40,  # those of a recording are compared before
         multiview_device="cpu",  # for one camera faster than a GPU
     ).to(options.device)
     with Bars() as bars:
-        named = CORNERS if anchors is True else anchors or DENSE  # without --anchors, those of --posterior
-        warm_up_command(model.ufm.config, bars.show, [] if config.anchors is None else [named])
+        warm_up_command(model.ufm.config, bars.show, [] if config.anchors is None else [anchors or DENSE])
     if options.state is not None and options.state.exists():
-        try:
-            with options.state.open("rb") as file:
-                state = read_tensors(file, "it")
-            model.load_state_dict(state)
-        except (RuntimeError, TypeError, ValueError, OSError) as error:
-            raise ValueError(f"--state {options.state} cannot be continued: {error}") from error
+        load_state(model, options.state)  # before --out is replaced
     return model
 
 
 def _write(out: Path, result: LiveResult) -> None:
     """Write the maps of an image to OUT/STAMP.npz."""
-    maps = {"depth": result.out.depth, "variance": result.out.variance, "disagreement": result.out.disagreement}
+    of = result.out
+    maps = {"depth": of.depth, "variance": of.variance, "disagreement": of.disagreement}
+    if of.ufm.posterior_depth is not None:
+        maps |= {"network_depth": of.prediction.depth, "ufm_variance": of.ufm.variance}
     arrays = {name: value[0].cpu().numpy() for name, value in maps.items()}
     camera = {"T_world_cam": result.T_world_cam, "intrinsics": result.out.intrinsics[0].cpu().numpy()}
     write_atomic(out / f"{result.stamp:.6f}.npz", lambda file: np.savez(file, allow_pickle=False, **arrays, **camera))
@@ -255,7 +253,7 @@ def _figures(result: LiveResult, live: LiveDepth) -> dict[str, float]:
     return {
         "stamp": round(result.stamp, 6),
         "latency_ms": round(1000 * result.latency, 2),
-        "depth_m": round(float(depth.median()), 3),
+        "depth_m": round(float(depth.nanmedian()), 3),
         "sigma_m": round(float(std.nanmedian()), 3),
         "components": int(result.out.ufm.statistics.components[0]),
         "dropped": sum(counts.dropped.values()),

@@ -5,14 +5,14 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 
 from ufmstar_torch.anchors.landmarks import LandmarkSource
-from ufmstar_torch.anchors.sources import CORNERS, DENSE
+from ufmstar_torch.anchors.sources import DENSE
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.commands.depth import SECTIONS, MapOptions, NetworkOptions, UfMOptions
+from ufmstar_torch.eval.commands.depth import SECTIONS, MapOptions, NetworkOptions, PosteriorOptions, UfMOptions
 from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, positional, reader, usage_errors
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.engine.anchors import landmarks_of
@@ -26,6 +26,7 @@ from ufmstar_torch.eval.run.summary import FINISHED, INTERRUPTED
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_slice
 from ufmstar_torch.eval.sequences.open import open_sequence, scale_poses
 from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.stream_warnings import LOGGER
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,10 +66,11 @@ class StreamOptions(MachineOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(StreamOptions):
-    """Depth with a variance for every pixel of a sequence of posed images.
+    """Depth with a standard deviation for every pixel of a sequence of posed images.
 
-    The depth comes from a network (--model, --weights), from maps that another program predicted (--depth DIR), or
-    from the sequence itself (--depth self).
+    Depths that are searched in earlier images correct the predicted depth and its sigma; --plain is UfM* alone. The
+    predicted depth comes from a network (--model, --weights), from maps that another program predicted (--depth DIR),
+    or from the sequence itself (--depth self).
 
     Attributes:
         sequence: folder of the sequence, or a video file, or tour:SEED for rendered rooms
@@ -87,6 +89,7 @@ class RunOptions(StreamOptions):
     overwrite: bool = False
     no_video: bool = False
     no_sheet: bool = False
+    uncertainty: PosteriorOptions
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -95,6 +98,7 @@ class RunOptions(StreamOptions):
 
 
 read = reader(RunOptions, "ufmstar run")
+Stream = TypeVar("Stream", bound=StreamOptions)
 
 
 def main(options: RunOptions) -> int:
@@ -117,7 +121,9 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
         FileNotFoundError, NotADirectoryError: no such file or folder.
         ModuleNotFoundError: an optional package is missing.
     """
-    sequence, ufm = open_sequence(path, **options.opening.changed()), options.uncertainty
+    sequence = open_sequence(path, **options.opening.changed())
+    options = _without_images(options, sequence)
+    ufm = options.uncertainty
     if not sequence.posed:
         raise ValueError(f"{sequence.name!r} holds single images without poses, which UfM* needs to compare views")
     indices = range(len(sequence))[parse_slice(options.frames)]
@@ -143,20 +149,34 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
         device=torch.device(options.device),
         settings=options.settings(),
         every=options.network.mode == "full",
-        landmarks=_landmarks(ufm.anchors or DENSE, sequence) if options.config.anchors else CORNERS,
+        landmarks=DENSE if options.config.anchors is None else _landmarks(ufm.anchors or DENSE, sequence),
         scale=scale,
     )
 
 
-def _landmarks(value: str | bool, sequence: FrameSequence) -> str | LandmarkSource:
-    """The source of anchors of ``--anchors``. Raises ValueError: the images to track are missing; others as
+def _without_images(options: Stream, sequence: FrameSequence) -> Stream:
+    """The options, plain if the default anchors are searched in images that the sequence lacks."""
+    ufm = options.uncertainty
+    if not isinstance(ufm, PosteriorOptions) or ufm.plain or ufm.anchors is not None or _has_images(sequence):
+        return options
+    missed = "UfM* alone, without anchors and the depth that the posterior corrects with them"
+    LOGGER.warning("%s: the sequence %r has no images", missed, sequence.name)
+    return replace(options, uncertainty=replace(ufm, plain=True))
+
+
+def _has_images(sequence: FrameSequence) -> bool:
+    return any(entry.load_image is not None for entry in sequence.entries)
+
+
+def _landmarks(value: str, sequence: FrameSequence) -> str | LandmarkSource:
+    """The source of anchors of ``--anchors``. Raises ValueError: the images to search are missing; others as
     ``landmarks_of``."""
     source = landmarks_of(value, sequence.folder, sequence.pose_scale)
     if not source.needs_image:
         return source
-    if all(entry.load_image is None for entry in sequence.entries):
-        raise ValueError(f"--anchors tracks corners of images, of which the sequence {sequence.name!r} has none")
-    return CORNERS if value is True else str(value)
+    if not _has_images(sequence):
+        raise ValueError(f"--anchors {value} searches images, of which the sequence {sequence.name!r} has none")
+    return value
 
 
 def _report(summary: Mapping[str, Any], out: str) -> int:
@@ -169,7 +189,10 @@ def _report(summary: Mapping[str, Any], out: str) -> int:
     for name, reason in summary["outputs"].items():
         if reason is not None:
             print(f"no {name}: {reason}")
-    print(f"{out}: {', '.join(['summary.json', 'frames.jsonl', 'frames/', 'depth/', 'sigma/', *made])}")
+    maps = ["depth/", "sigma/"]
+    if "ufm" in summary:
+        maps = ["depth/ and sigma/ (of the posterior)", "network_depth/", "ufm_sigma/"]
+    print(f"{out}: {', '.join(['summary.json', 'frames.jsonl', 'frames/', *maps, *made])}")
     state = f"ufmstar run: {summary['state']}: {summary['reason']}"
     if summary["state"] == FINISHED:
         print(state)

@@ -139,17 +139,16 @@ class AnchorSource:
         return np.random.default_rng([self._setting.seed, index, purpose])
 
 
-def landmarks_of(value: str | bool, folder: Path | None, scale: float = 1.0) -> LandmarkSource:
+def landmarks_of(value: str, folder: Path | None, scale: float = 1.0) -> LandmarkSource:
     """The source of landmarks of a sequence. Errors as ``landmark_source``.
 
     Args:
-        value: True = corners; else as for ``landmark_source``, with files in the sequence's or the working folder.
+        value: as for ``landmark_source``, with files in the sequence's or the working folder.
         folder: of the sequence.
         scale: metres per unit of the poses, which is the unit of the file.
     """
-    name = CORNERS if value is True else str(value)
-    is_file = Path(name).suffix.lower() in FILE_TYPES
-    source = landmark_source(resolve(folder or Path(), name) if is_file else name)
+    is_file = Path(value).suffix.lower() in FILE_TYPES
+    source = landmark_source(resolve(folder or Path(), value) if is_file else value)
     if isinstance(source, LandmarkMap) and scale != 1:
         return LandmarkMap(scale * source.points_world, scale * source.sigma)
     return source

@@ -95,7 +95,7 @@ def folder_source(
     selected = [name for index in chosen if (name := sequence.names[index]) not in (run.skipped if run else ())]
     if not selected:
         raise ValueError(f"{folder}: none of the {len(chosen)} frames has a map")
-    found = DepthFolder(run.frames if run else folder, scale, variance)
+    found = DepthFolder(run.frames if run else folder, scale, variance, run.depth if run else "depth")
     maps = found.for_frames(sequence.names, sequence.names_on_disk, selected)
     number = {name: i for i, name in enumerate(selected)}
     K_given = None if intrinsics is None else read_intrinsics(intrinsics)

@@ -31,7 +31,7 @@ _IMAGES, _ESTIMATOR, _TRACKER, _DRIFT = "image_index", "ufm.", "tracker.", "drif
 class RowResult:
     """One row's result for a frame: its maps [h, w] on the CPU, its prediction and its anchors."""
 
-    depth: Tensor  # predicted, or the posterior's if the row has one [m]
+    depth: Tensor  # predicted, or the posterior's if the row is its evaluation [m]
     variance: Tensor | None  # total [m^2], NaN where not valid; None if the network predicts depth alone
     valid: Tensor  # bool, True where the depth is positive and finite and every variance that is used is valid
     # A and E as far as the row uses them [m^2], or None.
@@ -54,6 +54,13 @@ class RowResult:
     member: int | None  # index of the network that predicted; None if all predicted, and for maps
     landmarks: Landmarks | None  # from which the frame's anchors were made; None for a row without anchors
     ms: dict[str, float]  # "network" if one ran, "anchors" if some were tracked, and "uncertainty" [ms]
+
+    @property
+    def best(self) -> tuple[Tensor, Tensor | None]:
+        """Depth [m] and its variance [m^2]: the posterior's if there is one, else ``depth`` and ``variance``."""
+        if self.posterior_depth is None:
+            return self.depth, self.variance
+        return self.posterior_depth, self.posterior_variance
 
     @property
     def mixture(self) -> tuple[Tensor, Tensor] | None:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ufmstar_torch.eval.engine.judge import POSTERIOR
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.names import count
 from ufmstar_torch.eval.report.table import markdown
@@ -21,9 +22,10 @@ _RUN_COLUMNS = {
     "delta1": "delta1", "abs_rel": "AbsRel", "rmse": "RMSE [m]", "nll": "NLL", "ece_delta": "ECE_delta",
     "ece_q": "ECE_q", "spearman": "Spearman",
 }  # fmt: skip
+_OFF = 1.1  # ratio of depths from which an error matters
 _TARGET_MS, _TARGET_LOST = 50.0, 0.01  # of the onboard demo
 _CALIBRATED = 4.0  # largest mean z^2 of held-out anchors, and inverse of the smallest: sigma is right within a factor 2
-_UNSUPPORTED = "mean sigma not shown: neither truth nor held-out anchors (--posterior) support it"
+_UNSUPPORTED = "mean sigma not shown: neither truth nor held-out anchors (which --plain leaves out) support it"
 # By source of anchors, the names of the count of anchors with a depth and of the total.
 _FOUND = {
     "corners": ("triangulated", "tracked"),
@@ -62,7 +64,7 @@ def run_table(summary: Mapping[str, Any]) -> str:
     if uncertainty["unmeasured_share"]:
         lines.append(
             f"not compared: {uncertainty['unmeasured_share']:.0%} of the pixels show what one view alone has seen; "
-            "there M is that of --ufm.unmeasured, and sigma is striped in the pictures"
+            "there M is that of --ufm.unmeasured, and the sigma of UfM* is striped in the pictures"
         )
     if summary["anchors"] is not None:
         lines += _anchor_lines(summary)
@@ -79,10 +81,21 @@ def run_table(summary: Mapping[str, Any]) -> str:
     if (fit := summary["image_fit"]) is not None and not fit["problem"]:
         lines.append(f"poses disagree with the images by {fit['error']:.1f} px (limit: {fit['limit']:.1f})")
     if (depth := summary["depth_fit"]) is not None and not depth["problem"]:
-        lines.append(
-            f"depth is {depth['ratio']:.2g} times that of tracked corners, rank correlation {depth['order']:.2f}"
-        )
+        lines.append(_depth_line(depth, summary))
     return "\n".join([*lines, *(f"warning: {text}" for text in summary["warnings"])])
+
+
+def _depth_line(depth: Mapping[str, Any], summary: Mapping[str, Any]) -> str:
+    """The predicted depth compared with that of tracked corners, and what follows for the run's depth and sigma."""
+    line = f"the predicted depth is {depth['ratio']:.2g} times that of tracked corners, rank correlation "
+    line += f"{depth['order']:.2f}"
+    if max(depth["ratio"], 1 / depth["ratio"]) < _OFF:
+        return line
+    if summary["result"] == POSTERIOR:
+        return f"{line}: the posterior corrects it"
+    if summary["anchors"] is not None:
+        return f"{line}: --plain adds this error to sigma, and does not correct the depth"
+    return f"{line}: sigma lacks this error, which all views share; without --plain, the posterior corrects it"
 
 
 def _metric_lines(summary: Mapping[str, Any]) -> list[str]:
@@ -91,11 +104,14 @@ def _metric_lines(summary: Mapping[str, Any]) -> list[str]:
     if metrics is None:
         sigma = f"mean sigma {number(uncertainty['mean_sigma'])} m" if supported(summary) else _UNSUPPORTED
         return [f"no metrics: {summary['metrics_reason']}; {sigma}"]
-    rows = [("UfM*" if summary["anchors"] is None else "UfM*, anchored", metrics, uncertainty["mean_sigma"])]
+    ufm = "UfM*" if summary["anchors"] is None else "UfM*, anchored"
+    if "ufm" in summary:
+        before = summary["ufm"]
+        rows = [("posterior", metrics, uncertainty["mean_sigma"]), (ufm, before["metrics"], before["mean_sigma"])]
+    else:
+        rows = [(ufm, metrics, uncertainty["mean_sigma"])]
     if alone is not None:
         rows.append(("network alone", alone, uncertainty["mean_network_sigma"]))
-    if "posterior" in summary:
-        rows.append(("posterior", summary["posterior"]["metrics"], summary["posterior"]["mean_sigma"]))
     body = [[name, *(number(figures.get(key)) for key in _RUN_COLUMNS), number(sigma)] for name, figures, sigma in rows]
     lines = aligned([["", *_RUN_COLUMNS.values(), "sigma [m]"], *body])
     if alone is None:

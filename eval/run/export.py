@@ -1,7 +1,7 @@
 """A run's result for other programs: depth and sigma, a cloud of points, the trajectory, or ``transforms.json``.
 
-The files are below OUT/export. Depth and sigma are the posterior's if the run has one. Pixels that are not valid, or
-whose sigma exceeds a limit, are left out.
+The files are below OUT/export. Depth and sigma are the run's: the posterior's unless it is plain. Pixels that are not
+valid, or whose sigma exceeds a limit, are left out.
 """
 
 from __future__ import annotations
@@ -76,8 +76,7 @@ def gated_frames(out: Path, max_sigma: float, max_relative_sigma: float) -> Iter
 
 def _gated(out: Path, record: Mapping[str, Any], max_sigma: float, max_relative_sigma: float) -> RunFrame:
     maps = read_frame(frame_file(out, record["name"]))
-    prefix = "posterior_" if "posterior_depth" in maps else ""
-    depth, variance = maps[f"{prefix}depth"], maps[f"{prefix}variance"]
+    depth, variance = maps["depth"], maps["variance"]
     with np.errstate(invalid="ignore"):
         sigma = np.sqrt(variance)
         mask = maps["valid"] & (depth > 0) & np.isfinite(depth)

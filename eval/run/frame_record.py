@@ -14,10 +14,7 @@ from ufmstar_torch.eval.engine.rows import RowResult
 from ufmstar_torch.eval.engine.stream import FrameResult
 from ufmstar_torch.eval.sequences.frame import Frame
 
-_MAPS = (
-    "depth", "variance", "disagreement", "measured", "anchored", "bias",
-    "posterior_depth", "posterior_variance", "posterior_inlier_variance", "posterior_outlier",
-)  # fmt: skip
+_MAPS = ("disagreement", "measured", "anchored", "bias", "posterior_inlier_variance", "posterior_outlier")
 _COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels", "unmeasured", "single_view")
 # [m] No depth network is more accurate than this sigma.
 NEAR_ZERO = 1e-3
@@ -25,7 +22,10 @@ NEAR_ZERO = 1e-3
 
 def frame_arrays(frame: Frame | None, row: RowResult) -> dict[str, NDArray[Any]]:
     """The arrays of a frame's file, by name: maps, pose, intrinsics and anchors (``writers``)."""
-    maps = {name: value for name in _MAPS if (value := getattr(row, name)) is not None}
+    depth, variance = row.best
+    of_network = {} if row.posterior_depth is None else {"network_depth": row.depth, "ufm_variance": row.variance}
+    named = {"depth": depth, "variance": variance, **of_network, **{name: getattr(row, name) for name in _MAPS}}
+    maps = {name: value for name, value in named.items() if value is not None}
     arrays = {name: value.cpu().numpy().astype(np.float32, copy=False) for name, value in maps.items()}
     arrays |= {"valid": row.valid.cpu().numpy(), "T_world_cam": row.T_world_cam, "intrinsics": row.intrinsics}
     if row.landmarks is None or frame is None:
@@ -51,10 +51,11 @@ def frame_record(result: FrameResult, key: str, writing: float, saving: float) -
 def _figures(row: RowResult) -> dict[str, Any]:
     """Counts and means of a frame."""
     statistics, network_variance, K = row.statistics, row.network_variance, row.intrinsics.tolist()
+    variance = row.best[1]
     assert statistics is not None
-    assert row.variance is not None
+    assert variance is not None
     assert row.disagreement is not None
-    std, valid = row.variance.sqrt(), row.valid
+    std, valid = variance.sqrt(), row.valid
     return {
         "size": list(row.size),
         "intrinsics": [K[0][0], K[1][1], K[0][2], K[1][2]],
@@ -113,17 +114,17 @@ def _anchor_figures(row: RowResult) -> dict[str, Any]:
 
 
 def _posterior_figures(row: RowResult) -> dict[str, Any]:
-    """The posterior's mean sigma [m] and figures of held-out anchors (``FrameStatistics``); {} without one."""
-    variance, statistics = row.posterior_variance, row.statistics
+    """Figures of held-out anchors (``FrameStatistics``), and the mean of sqrt(V) of UfM* [m], which ``mean_sigma`` is
+    not; {} without a posterior."""
+    variance, statistics = row.variance, row.statistics
     if variance is None or statistics is None or statistics.calibration is None or statistics.unseen is None:
         return {}
     calibration = float(statistics.calibration[0])
     figures = {
-        "mean_sigma": _mean(variance.sqrt(), row.valid),
         "calibration": calibration if math.isfinite(calibration) else None,
         "unseen": float(statistics.unseen[0]),
     }
-    return {"posterior": figures}
+    return {"posterior": figures, "mean_ufm_sigma": _mean(variance.sqrt(), row.valid)}
 
 
 def _mean(values: Tensor, valid: Tensor) -> float:

@@ -162,13 +162,13 @@ def draw_bar(axes: Any, bar: Bar) -> None:
 
 # The maps of a frame, in the order of their columns: label, and name of their shared scale.
 MAPS = {
+    "network_depth": ("depth, network", "depth"),
     "depth": ("depth", "depth"),
-    "posterior": ("posterior", "depth"),
     "sigma": ("σ", "length"),
     "anchored": ("√B", "length"),
     "error": ("|error|", "length"),
-    "posterior_sigma": ("σ, posterior", "length"),
-    "posterior_error": ("|error|, posterior", "length"),
+    "ufm_sigma": ("σ, UfM*", "length"),
+    "network_error": ("|error|, network", "length"),
 }
 DECADES = 2  # range of the logarithmic scale of errors: a linear one would show the posterior's errors as black
 
@@ -178,7 +178,7 @@ class FramePanel:
     """One displayed frame: its image [H, W, 3] uint8 RGB of any size, and its maps [h, w] [m], NaN where unknown.
 
     ``maps`` has names of ``MAPS``, "depth" and "sigma" always, and "measured", the share of the disagreement from two
-    views or more, which draws stripes on sigma. ``note`` ("K = 31") is next to the name.
+    views or more, which draws stripes on the sigma of UfM*. ``note`` ("K = 31") is next to the name.
     """
 
     name: str
@@ -200,11 +200,13 @@ class MapColumn(NamedTuple):
     field: str
 
     def rgb(self, panel: FramePanel) -> NDArray[np.uint8] | None:
-        """[h, w, 3] the coloured map, sigma striped where no two views were compared; None if the panel has none."""
+        """[h, w, 3] the coloured map, the sigma of UfM* striped where no two views were compared; None if the panel has
+        none."""
         if self.field not in panel.maps:
             return None
         rgb = self.scale.rgb(panel.maps[self.field])
-        measured = panel.maps.get("measured") if self.field == "sigma" else None
+        of_ufm = "ufm_sigma" if "ufm_sigma" in panel.maps else "sigma"
+        measured = panel.maps.get("measured") if self.field == of_ufm else None
         return rgb if measured is None else colours.striped(rgb, measured < unmeasured.HALF)
 
 
@@ -213,10 +215,8 @@ def map_columns(panels: Sequence[FramePanel]) -> list[MapColumn]:
     their 99th percentile; sigmas and errors share a logarithmic scale up to the largest of their 99th percentiles, so
     that equal sigma and error have the same colour."""
     maps_by_name = {name: [panel.maps[name] for panel in panels if name in panel.maps] for name in MAPS}
-    depth = colours.robust_range([*maps_by_name["depth"], *maps_by_name["posterior"]], from_zero=False)
-    lengths = [
-        maps_by_name[name] for name in ("sigma", "error", "posterior_sigma", "posterior_error") if maps_by_name[name]
-    ]
+    depth = colours.robust_range([*maps_by_name["depth"], *maps_by_name["network_depth"]], from_zero=False)
+    lengths = [maps_by_name[name] for name in ("sigma", "error", "ufm_sigma", "network_error") if maps_by_name[name]]
     high = max(colours.robust_range(maps, from_zero=True)[1] for maps in lengths)
     length = ColourScale(high / 10**DECADES, high, colours.ERROR_MAP, logarithmic=True)
     scales = {"depth": ColourScale(*depth, colours.DEPTH_MAP), "length": length}
@@ -240,8 +240,8 @@ def contact_sheet(
     position = 1
     for scale, of_scale in groupby(columns, key=lambda column: column.scale):
         labels = [column.label for column in of_scale]
-        words = f"{', '.join(labels) if len(labels) < 3 else 'σ and |error|'} [m]"
-        bars.append(Bar(words, scale, position, len(labels)))
+        names = dict.fromkeys(label.partition(", ")[0] for label in labels)
+        bars.append(Bar(f"{', '.join(names)} [m]", scale, position, len(labels)))
         position += len(labels)
     height, width = panels[0].shape
     draw_grid(Path(path), rows, bars, aspect=height / width, title=title, cell=2.4, words=1.2)

@@ -57,14 +57,13 @@ class FinishedRun:
         note = f"K = {record['components']}"
         if "anchored" in stored:
             note += f", {record['anchors']['used']} anchors"
-        if "posterior_depth" in stored:
-            maps["posterior"] = stored["posterior_depth"]
-            maps["posterior_sigma"] = np.sqrt(stored["posterior_variance"])
+        if "network_depth" in stored:
+            maps["network_depth"], maps["ufm_sigma"] = stored["network_depth"], np.sqrt(stored["ufm_variance"])
         elif "anchored" in stored:
             maps["anchored"] = np.sqrt(stored["anchored"])
         truth = truth_at(frame, K, size) if self.with_error and frame is not None else None
         if truth is not None:
-            pairs = {"error": "depth", "posterior_error": "posterior"}
+            pairs = {"error": "depth", "network_error": "network_depth"}
             maps |= {name: absolute_error(maps[of], truth) for name, of in pairs.items() if of in maps}
         valid, *square = (resample_nearest(m, K, K_square, size_square) for m in (stored["valid"], *maps.values()))
         shown = {name: known_where(valid, values) for name, values in zip(maps, square, strict=True)}

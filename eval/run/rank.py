@@ -104,7 +104,7 @@ class ImageScores(FrameSink):
 def require_part(job: RunJob, by: str) -> None:
     """Raises ValueError: the prediction of the first readable frame has no part to rank ``by``."""
     if by == "anchored" and job.config.anchors is None:
-        raise ValueError("--by anchored needs --anchors or --posterior")
+        raise ValueError("--by anchored needs --anchors")
     for index in job.indices if by in ("aleatoric", "epistemic") else ():
         try:
             prediction = FramePredictions(job.sequence[index], torch.device("cpu"), None, "").of(

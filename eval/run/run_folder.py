@@ -29,7 +29,7 @@ from ufmstar_torch.eval.run.frame_record import frame_arrays, frame_record
 from ufmstar_torch.eval.run.job import Checkpoint, RunJob
 from ufmstar_torch.eval.run.writers import FRAMES, PNGS, frame_file, write_frame, write_pngs
 from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
-from ufmstar_torch.models.checkpoints import read_tensors
+from ufmstar_torch.tensor_files import read_tensors
 
 # Outputs that are made from the finished frames.
 _MADE_AT_END = ("preview.mp4", "contact_sheet.png", "mixture.ply", "mixture.npz")
@@ -38,7 +38,7 @@ RUN = FolderKind(
     program="ufmstar run",
     noun="run",
     manifest="resume/run.json",
-    format=5,
+    format=6,
     lock="resume/lock",
     files=(f"{FRAMES}/*.npz", *(f"{f}/*.png" for f in PNGS), "summary.json", RECORDS, "resume/state.pt", *_MADE_AT_END),
     temporary=(".*.tmp", "*/.*.tmp"),

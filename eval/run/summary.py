@@ -37,6 +37,7 @@ def write_summary(
     job, checkpoint, records = folder.job, folder.checkpoint, folder.records
     done = [record for record in records if record["state"] == "done"]
     figures = job.metrics(checkpoint).figures()
+    result = UFM if job.config.posterior is None else POSTERIOR
     alone_reason = "the depth comes without a variance of its own"
     if any(record["mean_network_sigma"] is not None for record in done):
         alone_reason = "no variance where there is ground truth" if UFM in figures else "no ground truth"
@@ -50,11 +51,12 @@ def write_summary(
         "source": job.source_identity,
         "runtime": job.source.runtime,
         "prediction": {key: done[-1][key] for key in ("size", "intrinsics")} if done else None,
-        "metrics": figures.get(UFM),
+        "result": result,  # of which depth and sigma are, in the files and below
+        "metrics": figures.get(result),
         "metrics_reason": None if UFM in figures else "no ground truth",
         "network_alone": figures.get(ALONE),
         "network_alone_reason": None if ALONE in figures else alone_reason,
-        **_posterior(done, figures.get(POSTERIOR)),
+        **_posterior(done, figures.get(UFM)),
         "uncertainty": _uncertainty(done),
         "anchors": _anchors(done),
         "mixture": _mixture(done, job.ufm(checkpoint).mixture),
@@ -79,9 +81,8 @@ def _depth_fit(folder: RunFolder, done: Records) -> DepthFit | None:
         if index not in records:
             return None
         stored, K = _stored(folder, records[index]), pinhole(*records[index]["intrinsics"])
-        return depth_at_pixels(
-            stored["depth"], stored["valid"], K, sequence.intrinsics_of(sequence.entries[index]), pixel
-        )
+        K_image = sequence.intrinsics_of(sequence.entries[index])
+        return depth_at_pixels(_of_network(stored), stored["valid"], K, K_image, pixel)
 
     return depth_fit(sequence, folder.job.corners, depth_at)
 
@@ -94,7 +95,7 @@ def _part_of_image(folder: RunFolder, done: Records) -> str:
     for record in (done[i] for i in np.unique(np.linspace(0, len(done) - 1, _MAPS).astype(int))):
         frame, stored = job.sequence[record["index"]], _stored(folder, record)
         if frame.image is not None:
-            depth, K_map = np.where(stored["valid"], stored["depth"], 0.0), pinhole(*record["intrinsics"])
+            depth, K_map = np.where(stored["valid"], _of_network(stored), 0.0), pinhole(*record["intrinsics"])
             shown.append((image_at_map(frame.image, frame.intrinsics, K_map, depth.shape), depth))
     return part_of_image(shown) if shown else ""
 
@@ -102,6 +103,11 @@ def _part_of_image(folder: RunFolder, done: Records) -> str:
 def _stored(folder: RunFolder, record: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """The arrays of a finished frame."""
     return read_frame(frame_file(folder.path, record["name"]))
+
+
+def _of_network(stored: Mapping[str, np.ndarray]) -> np.ndarray:
+    """The depth that the posterior corrects, or the depth of a plain run."""
+    return stored["network_depth"] if "network_depth" in stored else stored["depth"]
 
 
 def _warnings(folder: RunFolder, depth: DepthFit | None, done: Records) -> list[str]:
@@ -121,12 +127,12 @@ def _warnings(folder: RunFolder, depth: DepthFit | None, done: Records) -> list[
 
 
 def _posterior(done: Records, figures: Mapping[str, float] | None) -> dict[str, Any]:
-    """The posterior's metrics, and the last frame's figures of held-out anchors."""
-    records = [record["posterior"] for record in done if "posterior" in record]
-    if not records:
+    """The last frame's figures of held-out anchors; and the figures of UfM* for the network's depth, before its
+    correction."""
+    if not done or "posterior" not in done[-1]:
         return {}
-    sigma = mean(record["mean_sigma"] for record in records)
-    return {"posterior": {**records[-1], "mean_sigma": sigma, "metrics": figures}}
+    before = {"metrics": figures, "mean_sigma": _pixel_mean(done, "mean_ufm_sigma")}
+    return {"posterior": done[-1]["posterior"], "ufm": before}
 
 
 def _sequence(sequence: FrameSequence) -> dict[str, Any]:
@@ -160,7 +166,8 @@ def _frames(records: Records, selected: int) -> dict[str, Any]:
 
 
 def _uncertainty(done: Records) -> dict[str, Any]:
-    """Means over all valid pixels of all frames. With perfect depth, they are the method's lower bound."""
+    """Means over all valid pixels of all frames. With perfect depth, those of a plain run are the method's lower
+    bound."""
     pixels = sum(record["valid_pixels"] for record in done)
     return {
         "mean_disagreement": _pixel_mean(done, "mean_disagreement"),

@@ -2,16 +2,16 @@
 
 The npz has
 
-- depth [m], variance [m^2], disagreement [m^2], measured (the share of the disagreement from two views or more) float32
-  and valid bool, each [H, W];
-- with anchors anchored [m^2] (B), bias (r: depth (1 + r) is the corrected depth), and anchors [N, 4]: u, v in the maps
-  [px], depth and its standard deviation [m];
-- with a posterior posterior_depth [m], posterior_variance [m^2], posterior_outlier (a probability) and
-  posterior_inlier_variance [m^2];
+- depth [m] and its variance [m^2] float32, the posterior's unless the run is plain, and valid bool, each [H, W];
+- with a posterior network_depth [m], which it corrects, and ufm_variance [m^2], V of UfM* for that depth;
+  posterior_outlier (a probability) and posterior_inlier_variance [m^2];
+- disagreement [m^2] (M) and measured, the share of M from two views or more;
+- with anchors anchored [m^2] (B), bias (r: the network's depth times 1 + r is to be expected), and anchors [N, 4]: u, v
+  in the maps [px], depth and its standard deviation [m];
 - T_world_cam [4, 4] camera-to-world [m] and intrinsics [3, 3] of the maps [px].
 
-depth/NAME.png and sigma/NAME.png are the posterior's if there is one; network_depth/ and network_sigma/ then have the
-network's.
+depth/NAME.png and sigma/NAME.png are depth and the root of variance; with a posterior, network_depth/ and ufm_sigma/
+are network_depth and the root of ufm_variance.
 """
 
 from __future__ import annotations
@@ -28,7 +28,10 @@ from ufmstar_torch.array_files import read_npz_whole
 from ufmstar_torch.eval.run.files import write_atomic, write_bytes_atomic
 
 FRAMES = "frames"
-PNGS = ("depth", "sigma", "network_depth", "network_sigma")
+# Folders of the PNGs, and the arrays of the npz with a frame's depth and variance for them.
+_RESULT = ("depth", "sigma"), ("depth", "variance")
+_BEFORE = ("network_depth", "ufm_sigma"), ("network_depth", "ufm_variance")
+PNGS = (*_RESULT[0], *_BEFORE[0])
 
 
 def frame_file(out: Path, name: str) -> Path:
@@ -48,14 +51,14 @@ def write_frame(file: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 def write_pngs(out: Path, name: str, maps: Mapping[str, NDArray[Any]], unit: float | None) -> float:
     """Write the PNGs of a frame's maps (0 = not valid). ``unit`` is the metres per count of depth, equal in a whole
     run; None = chosen from this frame. Sigma's unit is a tenth of it. Returns ``unit``."""
-    posterior = "posterior_depth" in maps
-    for source, folder in (("posterior_", ""), ("", "network_")) if posterior else (("", ""),):
-        depth = np.where(maps["valid"], maps[f"{source}depth"], np.nan)
+    for folders, names in (_RESULT, _BEFORE) if _BEFORE[1][0] in maps else (_RESULT,):
+        depth, variance = (np.where(maps["valid"], maps[key], np.nan) for key in names)
         with np.errstate(invalid="ignore"):
-            sigma = np.sqrt(np.where(maps["valid"], maps[f"{source}variance"], np.nan))
+            sigma = np.sqrt(variance)
         unit = unit or fitting_unit(depth)
-        for kind, values, metres in (("depth", depth, unit), ("sigma", sigma, unit / 10)):
-            content, file = encode_length_png(values, metres, kind), out / f"{folder}{kind}" / f"{name}.png"
+        for folder, values, metres in zip(folders, (depth, sigma), (unit, unit / 10), strict=True):
+            kind = "sigma" if values is sigma else "depth"
+            content, file = encode_length_png(values, metres, kind), out / folder / f"{name}.png"
             file.parent.mkdir(exist_ok=True)
             write_bytes_atomic(file, content)
     assert unit is not None

@@ -17,18 +17,19 @@ _VARIANCE_SUFFIXES = (".npy", ".npz", ".exr", ".tif", ".tiff")
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """Predicted depth of a sequence's frames, decoded lazily: ``maps[i]`` belongs to frame i. The scale [m per unit] is
-    that of :class:`DepthFolder`."""
+    """Predicted depth of a sequence's frames, decoded lazily: ``maps[i]`` belongs to frame i. Scale [m per unit] and
+    key are those of :class:`DepthFolder`."""
 
     depth_files: tuple[Path, ...]
     variance_files: tuple[Path, ...] = ()
     scale: float | None = None
+    key: str = "depth"
 
     def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Depth [H, W] float32 [m] (0 = invalid) and variance [H, W] float32 [m^2], or None without variance files.
         Where the variance is negative or not finite, both are 0. Raises FrameError: a file cannot be decoded, or the
         two differ in size."""
-        depth = read_depth(self.depth_files[index], self.scale)
+        depth = read_depth(self.depth_files[index], self.scale, self.key)
         if not self.variance_files:
             return depth, None
         path = self.variance_files[index]
@@ -47,21 +48,25 @@ class DepthFolder:
         scale: metres per unit. None = by the text ``depth_scale`` of a PNG; other formats are in metres.
         variance: folder of variance maps [m^2] as npy, npz, EXR or float TIFF. It may be ``path`` if npz files have the
             keys ``depth`` and ``variance``.
+        key: name of the depth in npz files with several arrays.
 
     Raises:
         NotADirectoryError: a folder does not exist.
         ValueError: no map, maps of several formats, or integers of unknown scale.
     """
 
-    def __init__(self, path: str | Path, scale: float | None = None, variance: str | Path | None = None) -> None:
+    def __init__(
+        self, path: str | Path, scale: float | None = None, variance: str | Path | None = None, key: str = "depth"
+    ) -> None:
         check_scale(scale)
+        self.key = key
         self.path = Path(path)
         self.scale = scale
         self.files = _maps(self.path, DEPTH_SUFFIXES, "depth")
         self.variance_files = [] if variance is None else _maps(Path(variance), _VARIANCE_SUFFIXES, "variance")
         for file in self.files if scale is None else ():
             try:
-                values, named = read_map(file, key="depth")
+                values, named = read_map(file, key=key)
             except FrameError:  # counted when its turn comes
                 continue
             if named is None and np.issubdtype(values.dtype, np.integer):
@@ -77,7 +82,7 @@ class DepthFolder:
         expected = names if selected is None else selected
         orders = (names_on_disk or names, names, expected)
         depth = _paired(self.files, expected, orders)
-        return DepthMaps(depth, _paired(self.variance_files, expected, orders), self.scale)
+        return DepthMaps(depth, _paired(self.variance_files, expected, orders), self.scale, self.key)
 
 
 def _maps(folder: Path, suffixes: tuple[str, ...], what: str) -> list[Path]:

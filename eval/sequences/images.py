@@ -49,20 +49,23 @@ def read_color(path: str | Path, content: bytes | None = None) -> np.ndarray:
         raise FrameError(path, f"cannot be decoded: {error}") from error
 
 
-def read_depth(path: str | Path, scale: float | None = None, *, default_scale: float = _MILLIMETRE) -> np.ndarray:
-    """A depth map as [H, W] float32 [m], 0 = invalid, of a 16-bit PNG or TIFF, float TIFF, EXR, npy or npz (key
-    ``depth``, or its only array).
+def read_depth(
+    path: str | Path, scale: float | None = None, key: str = "depth", *, default_scale: float = _MILLIMETRE
+) -> np.ndarray:
+    """A depth map as [H, W] float32 [m], 0 = invalid, of a 16-bit PNG or TIFF, float TIFF, EXR, npy or npz (``key``, or
+    its only array).
 
     Args:
         path: of the file.
         scale: metres per unit of the stored values. None = floats are metres, integers have the unit in a PNG's text
             ``depth_scale``, or else ``default_scale``.
+        key: name of the depth in an npz with several arrays.
         default_scale: default metres per unit of integers.
 
     Raises:
         FrameError: missing, truncated, corrupt, or not a depth map (8-bit, several channels).
     """
-    values, named_scale = read_map(path, key="depth")
+    values, named_scale = read_map(path, key)
     if scale is None and np.issubdtype(values.dtype, np.integer):
         scale = named_scale or default_scale
     return positive(values.astype(np.float32) if scale is None else (values * np.float64(scale)).astype(np.float32))

@@ -15,10 +15,11 @@ RECORDS = "frames.jsonl"
 
 
 class OwnOutput(NamedTuple):
-    """The maps NAME.npz of a run: their folder; by frame name the intrinsics [3, 3] of finished frames' maps [px], and
-    the reasons of skipped frames."""
+    """The maps NAME.npz of a run: their folder; the name in them of the network's depth, which is not that of the
+    posterior; by frame name the intrinsics [3, 3] of finished frames' maps [px], and the reasons of skipped frames."""
 
     frames: Path
+    depth: str
     intrinsics: Mapping[str, np.ndarray]
     skipped: Mapping[str, str]
 
@@ -32,6 +33,7 @@ def own_output(path: Path) -> OwnOutput | None:
             done = [record for record in records if record["state"] == "done"]
             return OwnOutput(
                 out / "frames",
+                "network_depth" if any("posterior" in record for record in done) else "depth",
                 {record["name"]: pinhole(*record["intrinsics"]) for record in done},
                 {record["name"]: record["reason"] for record in records if record["state"] == "skipped"},
             )

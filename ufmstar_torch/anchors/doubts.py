@@ -18,7 +18,10 @@ _FEW = 8  # least anchors of a frame that are judged
 _OUTSIDE, _EXCHANGED = 0.6, 0.05
 # Largest median ratio of the anchors' and the predicted depth, in successive judged frames: networks err by .6 to 1.5.
 _RATIO, _SUCCESSIVE = 4.0, 8
-
+# A ratio that is named after the second such frame. Largest rank correlation of the two depths that suggests inverse
+# depth, with at least so many anchors, whose logarithms of depth have at least this standard deviation.
+_UNIT, _AT_ONCE = 8.0, 2
+_INVERSE, _RANKED, _SPREAD = -0.3, 20, 0.1
 
 # Frames that are all judged, and the interval of those after them: a frame takes .1 ms.
 _FIRST, _EVERY = 64, 16
@@ -30,7 +33,8 @@ class AnchorDoubts:
     def __init__(self) -> None:
         self._calls = 0
         self._logged = set[tuple[int, str]]()
-        self._off = Counter[int]()  # by stream, successive frames with depths of another scale
+        # By stream, successive frames: with depths of another scale, by more than _UNIT, and in the opposite order.
+        self._off, self._far_off, self._inverse = Counter[int](), Counter[int](), Counter[int]()
 
     def judge(self, anchors: Anchors, checked: AnchorInput, size: tuple[int, int]) -> None:
         """Warn of implausible anchors [B, N] of a frame of ``size`` (H, W), given to the step and as checked."""
@@ -75,7 +79,26 @@ class AnchorDoubts:
                 yield b, "far", text + ". Check that depth, poses and anchors are in metres"
             if count < _FEW or math.isnan(ratio):
                 continue
+            if text := self._inverted(b, checked):
+                yield b, "inverse", text
+            self._far_off[b] = self._far_off[b] + 1 if max(ratio, 1 / ratio) > _UNIT else 0
+            if self._far_off[b] == _AT_ONCE:
+                text = f"the predicted depth is {1 / ratio:.2g} times what the anchors show: another unit, or a scene "
+                yield b, "scale", text + "far from the training data; the variance is increased"
             self._off[b] = self._off[b] + 1 if max(ratio, 1 / ratio) > _RATIO else 0
             if self._off[b] == _SUCCESSIVE:
                 text = f"in {_SUCCESSIVE} frames the anchors' median depth was {ratio:.2g} times the predicted one; "
                 yield b, "scale", text + "the variance is increased. Are depth, poses and anchors in metres?"
+
+    def _inverted(self, b: int, checked: AnchorInput) -> str:
+        """Count a frame where predicted depths have the anchors' opposite order; returns a warning after some."""
+        valid = checked.valid[b]
+        anchors, predicted = checked.depth[b][valid].log(), checked.predicted[b][valid]
+        if len(anchors) < _RANKED or float(anchors.std()) < _SPREAD:
+            return ""
+        ranks = torch.stack([anchors.argsort().argsort(), predicted.argsort().argsort()]).double()
+        order = float(torch.corrcoef(ranks)[0, 1])
+        self._inverse[b] = self._inverse[b] + 1 if order < _INVERSE else 0
+        if self._inverse[b] != _SUCCESSIVE:
+            return ""
+        return f"far is near in the depth (rank correlation {order:.2f} with the anchors): is it inverse depth?"

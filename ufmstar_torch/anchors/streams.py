@@ -7,12 +7,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.dense import DenseEvidence
-from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, LandmarkSource
+from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, LandmarkSource, OtherCameraError
 from ufmstar_torch.anchors.sources import landmark_source
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.camera import rotation_deviation
@@ -39,12 +41,14 @@ class StreamLandmarks:
     """One source of landmarks for each stream of a batch.
 
     Args:
-        sources: an argument of :func:`landmark_source`, or a list of them, one for each stream.
+        sources: a name or a file for :func:`landmark_source`, from which every stream gets a source; or a source; or a
+            list of all these, one for each stream.
 
     Attributes:
         needs_image: whether a source reads the images.
         searching: types of the sources that search the images, and compile kernels for it.
         last: landmarks of the last image of every stream.
+        restarts: how often an image of another size or camera restarted a source.
 
     Raises:
         FileNotFoundError, ValueError: as :func:`landmark_source`.
@@ -52,14 +56,28 @@ class StreamLandmarks:
 
     def __init__(self, sources: SourceLike | list[SourceLike] | tuple[SourceLike, ...]) -> None:
         listed = sources if isinstance(sources, list | tuple) else [sources]
-        self._sources = [landmark_source(source) for source in listed]
-        self._before = self._states()
+        self._each = sources if isinstance(sources, str | Path) else None  # of every stream, however many there are
+        self._follow([landmark_source(source) for source in listed])
         self.needs_image = any(source.needs_image for source in self._sources)
         kinds = {type(source) for source in self._sources}
         self.searching = tuple(kind for kind in (LandmarkTracker, DenseEvidence) if kind in kinds)
         self.last: list[Landmarks] = []
-        self._contradicted = [0] * len(self._sources)  # successive images; -1 = warned
-        self._late = [0] * len(self._sources)  # likewise, images with a time offset
+        self.restarts = 0
+
+    def _follow(self, sources: list[LandmarkSource]) -> None:
+        """Use these sources from now on."""
+        self._sources = sources
+        self._before, self._replaced = self._states(), sources
+        self._contradicted = [0] * len(sources)  # successive images; -1 = warned
+        self._late = [0] * len(sources)  # likewise, images with a time offset
+
+    def _require(self, streams: int) -> None:
+        """Have a source for each of ``streams`` streams. Raises ValueError: another number of sources was listed."""
+        if streams == len(self._sources):
+            return
+        if self._each is None or not streams:
+            raise ValueError(f"anchors must name a source for each of the {streams} streams, got {len(self._sources)}")
+        self._follow([landmark_source(self._each) for _ in range(streams)])
 
     def update(
         self,
@@ -71,6 +89,7 @@ class StreamLandmarks:
         skip: bool = True,
     ) -> Anchors:
         """Compute the anchors of the next image of every stream, in its pixels. An error leaves all sources unchanged.
+        An image of another size or camera than before restarts its stream's source.
 
         Args:
             image: [B, 3, H, W] RGB, uint8, or floating-point in [0, 1]; None: the sources need none.
@@ -87,12 +106,11 @@ class StreamLandmarks:
             ValueError: the numbers of streams and sources differ, the image has another dtype or range, there is a
                 fault, or as :meth:`LandmarkSource.update`.
         """
-        b = len(self._sources) if image is None else len(image)
-        if b != len(self._sources):
-            raise ValueError(f"anchors must name a source for each of the {b} streams, got {len(self._sources)}")
+        b, replaced = len(self._sources) if image is None else len(image), self._sources
         images = None if image is None else as_bytes(image).permute(0, 2, 3, 1).contiguous().cpu().numpy()
         T = pose.detach().double().expand(b, 4, 4).cpu().numpy()
         K = intrinsics.detach().double().expand(b, 3, 3).cpu()
+        self._require(b)
         before, faults = self._states(), [0] * b
         if rotation_tolerance is not None:
             size = (torch.inf, torch.inf) if images is None else images.shape[1:3]
@@ -103,13 +121,15 @@ class StreamLandmarks:
             result = [
                 Landmarks.skipped(FRAME_FAULTS[fault])
                 if fault
-                else source.update(None if images is None else images[i], T[i], K[i].numpy())
+                else self._updated(source, None if images is None else images[i], T[i], K[i].numpy())
                 for i, (source, fault) in enumerate(zip(self._sources, faults, strict=True))
             ]
         except BaseException:
             self._restore(before, range(b))
+            if replaced is not self._sources:
+                self._follow(replaced)
             raise
-        self._before, self.last = before, result
+        self._before, self._replaced, self.last = before, replaced, result
         for i, landmarks in enumerate(result):
             late = abs(landmarks.lag) > _LARGEST_LAG and not landmarks.contradicted
             self._late[i] = self._late[i] + 1 if late and self._late[i] >= 0 else min(self._late[i], 0)
@@ -130,14 +150,29 @@ class StreamLandmarks:
         fields = (torch.cat([getattr(anchors, name) for anchors in by_stream]) for name in _FIELDS)
         return Anchors(*fields).to(pose.device if image is None else image.device)
 
+    def _updated(
+        self, source: LandmarkSource, image: NDArray[np.uint8] | None, T: NDArray[np.float64], K: NDArray[np.float64]
+    ) -> Landmarks:
+        try:
+            return source.update(image, T, K)
+        except OtherCameraError:
+            source.reset()
+            self.restarts += 1
+            if self.restarts == 1:
+                _LOG.warning("an image has another size or camera than before: its evidence starts anew (logged once)")
+            return source.update(image, T, K)
+
     def undo(self, streams: Sequence[int] | None = None) -> None:
         """Restore the state before the last image of these streams (None = of all)."""
+        if streams is None and self._replaced is not self._sources:
+            self._follow(self._replaced)
         self._restore(self._before, range(len(self._sources)) if streams is None else streams)
 
     def reset(self, streams: Sequence[int] | None = None) -> None:
         """Reset the sources of these streams (None = of all)."""
-        for i in range(len(self._sources)) if streams is None else streams:
-            self._sources[i].reset()
+        for i, source in enumerate(self._sources):
+            if streams is None or i in streams:
+                source.reset()
 
     def state(self) -> dict[str, Tensor]:
         """State of all sources, by names "STREAM.NAME"."""
@@ -150,19 +185,25 @@ class StreamLandmarks:
         Raises:
             ValueError: the state belongs to other sources; the sources stay unchanged.
         """
+        replaced = self._sources
+        if self._each is not None:
+            self._require(len({key.partition(".")[0] for key in state}) or 1)
         before, parts = self._states(), [dict[str, Tensor]() for _ in self._sources]
-        for key, value in state.items():
-            stream, _, name = key.partition(".")
-            if not stream.isdigit() or int(stream) >= len(parts):
-                raise ValueError(f"anchors: the state holds {key!r}, but the streams are 0 to {len(parts) - 1}")
-            parts[int(stream)][name] = value
         try:
+            for key, value in state.items():
+                stream, _, name = key.partition(".")
+                if not stream.isdigit() or int(stream) >= len(parts):
+                    raise ValueError(f"anchors: the state holds {key!r}, but the streams are 0 to {len(parts) - 1}")
+                parts[int(stream)][name] = value
             for source, source_state, part in zip(self._sources, before, parts, strict=True):
                 if part.keys() != source_state.keys():
-                    raise ValueError(f"anchors: the state must hold {sorted(source_state)}, got {sorted(part)}")
+                    names = ", ".join(sorted(part.keys() ^ source_state.keys())[:3])
+                    raise ValueError(f"anchors: the state must hold the values of this source, other: {names}, ...")
                 source.load_state(part)
         except BaseException:
             self._restore(before, range(len(before)))
+            if replaced is not self._sources:
+                self._follow(replaced)
             raise
 
     def _states(self) -> list[dict[str, Tensor]]:
