@@ -132,7 +132,7 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
         source = options.maps.source(sequence, indices)
     scale = None
     if ufm.scale_from is not None:
-        scale = network_scale(sequence, source, indices)
+        scale = network_scale(sequence, source, indices, options.opening.model_index)
         sequence = scale_poses(sequence, scale.metres)
     return RunJob(
         sequence=sequence,
