@@ -126,7 +126,8 @@ class UfMOptions:
             take precedence
         anchors: depths that show the error on which all views agree (docs/anchors.md). Without a word, or with corners:
             corners tracked in the images; dense: a depth in every cell of the image, searched in earlier images; FILE:
-            landmarks, a line x y z sigma [m] each, in the world of the poses
+            landmarks, a line x y z sigma [m] each, in the world of the poses; run, rank: sensor (or sensor:stereo,
+            sensor:tof), the recording's own depth, dense where it has none
         posterior: also a depth that anchors correct, with its variance (docs/results/posterior.md); --anchors chooses
             the anchors, default: dense
         scale_from: network: its scale for COLMAP poses without one; anchors then show shape only

@@ -15,7 +15,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.depth import SECTIONS, MapOptions, NetworkOptions, UfMOptions
 from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, positional, reader, usage_errors
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-from ufmstar_torch.eval.engine.anchors import landmarks_of
+from ufmstar_torch.eval.engine.anchors import landmarks_of, sensor_of
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.job import RunJob
@@ -130,6 +130,9 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
         source = options.network.load(options) if networks is None else networks
     else:
         source = options.maps.source(sequence, indices)
+    sensor = sensor_of(ufm.anchors, sequence) if options.config.anchors else None
+    if sensor is not None and source.is_truth:
+        raise ValueError("--anchors sensor goes with the depth of a network: with --depth self, nothing is to correct")
     scale = None
     if ufm.scale_from is not None:
         scale = network_scale(sequence, source, indices, options.opening.model_index)
@@ -144,6 +147,7 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
         settings=options.settings(),
         every=options.network.mode == "full",
         landmarks=_landmarks(ufm.anchors or DENSE, sequence) if options.config.anchors else CORNERS,
+        sensor=sensor,
         scale=scale,
     )
 
@@ -151,6 +155,8 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
 def _landmarks(value: str | bool, sequence: FrameSequence) -> str | LandmarkSource:
     """The source of anchors of ``--anchors``. Raises ValueError: the images to track are missing; others as
     ``landmarks_of``."""
+    if sensor_of(value, sequence) is not None:
+        return DENSE
     source = landmarks_of(value, sequence.folder, sequence.pose_scale)
     if not source.needs_image:
         return source

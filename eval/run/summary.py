@@ -37,9 +37,10 @@ def write_summary(
     job, checkpoint, records = folder.job, folder.checkpoint, folder.records
     done = [record for record in records if record["state"] == "done"]
     figures = job.metrics(checkpoint).figures()
+    no_truth = "no ground truth" if job.sensor is None else "the recording's depth serves as anchors"
     alone_reason = "the depth comes without a variance of its own"
     if any(record["mean_network_sigma"] is not None for record in done):
-        alone_reason = "no variance where there is ground truth" if UFM in figures else "no ground truth"
+        alone_reason = "no variance where there is ground truth" if UFM in figures else no_truth
     summary = {
         "program": RUN.program,
         "state": state,
@@ -51,7 +52,7 @@ def write_summary(
         "runtime": job.source.runtime,
         "prediction": {key: done[-1][key] for key in ("size", "intrinsics")} if done else None,
         "metrics": figures.get(UFM),
-        "metrics_reason": None if UFM in figures else "no ground truth",
+        "metrics_reason": None if UFM in figures else no_truth,
         "network_alone": figures.get(ALONE),
         "network_alone_reason": None if ALONE in figures else alone_reason,
         **_posterior(done, figures.get(POSTERIOR)),
