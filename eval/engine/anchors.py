@@ -1,4 +1,4 @@
-"""Anchors of a row: corners tracked in images, landmarks of a file, the depth of the recording's depth camera, or ground
+"""Anchors of a row: corners tracked in images, landmarks of a file, the depth of the sequence's depth camera, or ground
 truth as the upper bound.
 """
 
