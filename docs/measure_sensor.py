@@ -3,9 +3,9 @@
     python docs/measure_sensor.py fastdepth_nyu.onnx SEQUENCE ...
 
 prints for each sequence figures on the removed half: of the network, and of the posterior with the rest of the depth as
-anchors (``--anchors sensor``), with dense anchors of the images alone, and with both depth and images. In each frame,
-a sixth of the depth is removed at depth edges, a sixth because it is farthest, and the remainder in discs of .03 to .12
-image widths.
+anchors alone, with dense anchors of the images alone, and with both (``--anchors sensor``); of both also by the cause of
+the removal. In each frame, a sixth of the depth is removed at depth edges, a sixth because it is farthest, and the
+remainder in discs of .03 to .12 image widths.
 """
 
 from __future__ import annotations
@@ -33,38 +33,42 @@ DISCS = 0.03, 0.12  # radii [widths]
 FIGURES = ("rmse", "delta1", "ece_delta", "mixture_ece_delta", "ece_q", "nll")
 
 
-def removed(depth: NDArray[np.float32], seed: int) -> NDArray[np.bool_]:
-    """[H, W] True at half of the pixels with a depth."""
+CAUSES = EDGE, FAR, DISC = "edges", "far", "discs"
+
+
+def removed(depth: NDArray[np.float32], seed: int) -> dict[str, NDArray[np.bool_]]:
+    """By cause, [H, W] True at the removed pixels, which are half of those with a depth."""
     import cv2
 
     valid, rng, kernel = depth > 0, np.random.default_rng(seed), np.ones((9, 9), np.uint8)
     filled = np.where(valid, depth, np.nan).astype(np.float32)
     high, low = cv2.dilate(np.nan_to_num(filled, nan=0.0), kernel), cv2.erode(np.nan_to_num(filled, nan=1e6), kernel)
     contrast = np.where(valid, high / low, 0)
-    gone = valid & (contrast > np.quantile(contrast[valid], 1 - EACH))
-    left = valid & ~gone
-    gone |= left & (depth > np.quantile(depth[left], 1 - EACH * valid.sum() / left.sum()))
+    edge = valid & (contrast > np.quantile(contrast[valid], 1 - EACH))
+    left = valid & ~edge
+    far = left & (depth > np.quantile(depth[left], 1 - EACH * valid.sum() / left.sum()))
+    left, disc = left & ~far, np.zeros_like(valid)
     height, width = depth.shape
     v, u = np.ogrid[:height, :width]
-    while gone.sum() < SHARE * valid.sum():
+    while (edge | far | disc).sum() < SHARE * valid.sum():
         radius, row, column = rng.uniform(*DISCS) * width, rng.uniform(0, height), rng.uniform(0, width)
-        gone |= valid & ((v - row) ** 2 + (u - column) ** 2 < radius**2)
-    return np.asarray(gone)
+        disc |= left & ((v - row) ** 2 + (u - column) ** 2 < radius**2)
+    return {EDGE: edge, FAR: far, DISC: disc}
 
 
 def rest(entry: Entry, seed: int) -> NDArray[np.float32]:
     """The depth that serves as anchors."""
     assert entry.load_depth is not None
     depth = entry.load_depth()
-    return np.where(removed(depth, seed), np.float32(0), depth)
+    return np.where(np.any([*removed(depth, seed).values()], axis=0), np.float32(0), depth)
 
 
 class RemovedHalf(FrameSink):
     """Figures of the network and of the posterior on the removed half of a sequence's depth."""
 
     def __init__(self, whole: FrameSequence) -> None:
-        self._whole, self.network, self.posterior = whole, SequenceMetrics(), SequenceMetrics()
-        self.anchors: list[int] = []
+        self._whole, self.anchors = whole, list[int]()
+        self.network, self.posterior = ({cause: SequenceMetrics() for cause in ("all", *CAUSES)} for _ in range(2))
 
     def take(self, result: FrameResult) -> None:
         """Add a frame."""
@@ -73,12 +77,14 @@ class RemovedHalf(FrameSink):
         row, frame = result.rows[UFM], self._whole[result.index]
         if frame.depth is None or row.posterior_depth is None or row.landmarks is None:
             return
-        hidden = np.where(removed(frame.depth, result.index), frame.depth, np.float32(0))
-        truth = truth_at(replace(frame, depth=hidden), row.intrinsics, row.size)
-        assert truth is not None
-        target = torch.from_numpy(truth)
-        self.network.update(row.depth, row.variance, target, row.valid)
-        self.posterior.update(row.posterior_depth, row.posterior_variance, target, row.valid, row.mixture)
+        causes = removed(frame.depth, result.index)
+        for cause, gone in {"all": np.any([*causes.values()], axis=0), **causes}.items():
+            hidden = np.where(gone, frame.depth, np.float32(0))
+            truth = truth_at(replace(frame, depth=hidden), row.intrinsics, row.size)
+            assert truth is not None
+            target = torch.from_numpy(truth)
+            self.network[cause].update(row.depth, row.variance, target, row.valid)
+            self.posterior[cause].update(row.posterior_depth, row.posterior_variance, target, row.valid, row.mixture)
         self.anchors.append(len(row.landmarks.depth))
 
 
@@ -116,12 +122,17 @@ def main() -> None:
         kinds = {"sensor": (options.sensor, False), "images": (None, True), "both": (options.sensor, True)}
         for name, (sensor, images) in kinds.items():
             judged = measure(path, options.weights, sensor, images, options.frames)
-            network, posterior = judged.network.compute(), judged.posterior.compute()
             if name == "sensor":
-                print("  network ", {figure: round(network[figure], 3) for figure in FIGURES if figure in network})
-            figures = {figure: round(posterior[figure], 3) for figure in FIGURES}
-            share = posterior["rmse"] / network["rmse"]
-            print(f"  {name:8}", figures, f"RMSE x {share:.3f}, {np.mean(judged.anchors):.0f} anchors")
+                print("  network      ", figures_of(judged.network["all"]))
+            for cause in ("all", *CAUSES) if name == "both" else ("all",):
+                share = judged.posterior[cause].compute()["rmse"] / judged.network[cause].compute()["rmse"]
+                text = f"RMSE x {share:.3f}, {np.mean(judged.anchors):.0f} anchors"
+                print(f"  {name:6} {cause:6}", figures_of(judged.posterior[cause]), text)
+
+
+def figures_of(metrics: SequenceMetrics) -> dict[str, float]:
+    computed = metrics.compute()
+    return {figure: round(computed[figure], 3) for figure in FIGURES if figure in computed}
 
 
 if __name__ == "__main__":

@@ -167,7 +167,7 @@ def export_transforms(frames: Iterator[RunFrame], out: Path) -> str:
     can be read."""
     import cv2
 
-    folder, unit, listed = export_folder(out, "transforms"), None, []
+    folder, unit, listed = export_folder(out, "transforms"), None, list[dict[str, Any]]()
     for name in ("images", "depth", "sigma"):
         export_folder(out, "transforms", name)
     world = np.eye(4)

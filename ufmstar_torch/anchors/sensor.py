@@ -85,11 +85,13 @@ def completed(sensor: Landmarks, others: Landmarks, covered: NDArray[np.bool_]) 
         np.rint(x).astype(int).clip(0, size - 1) for x, size in zip(others.pixel.T, (width, height), strict=True)
     )
     apart = ~(_spread(covered.astype(np.float32)) > 0)[row, column]
-    parts = {
-        name: np.concatenate([getattr(sensor, name), getattr(others, name)[apart]])
-        for name in ("pixel", "depth", "variance")
-    }
-    return replace(others, **parts, tracked=sensor.tracked + others.tracked)
+    return replace(
+        others,
+        pixel=np.concatenate([sensor.pixel, others.pixel[apart]]),
+        depth=np.concatenate([sensor.depth, others.depth[apart]]),
+        variance=np.concatenate([sensor.variance, others.variance[apart]]),
+        tracked=sensor.tracked + others.tracked,
+    )
 
 
 def _sigma(z: NDArray[np.float64], kind: str) -> NDArray[np.float64]:
