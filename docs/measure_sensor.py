@@ -3,7 +3,7 @@
     python docs/measure_sensor.py fastdepth_nyu.onnx SEQUENCE ...
 
 prints for each sequence figures on the removed half: of the network, and of the posterior with the rest of the depth as
-anchors alone, with dense anchors of the images alone, and with both (``--anchors sensor``); of both also by the cause of
+anchors alone, with dense anchors of the images alone, and with both (``--anchors sensor``), also by the cause of
 the removal. In each frame, a sixth of the depth is removed at depth edges, a sixth because it is farthest, and the
 remainder in discs of .03 to .12 image widths.
 """

@@ -129,9 +129,9 @@ class CameraNode:
         image = sensor.CompressedImage if settings.compressed else sensor.Image
         node.create_subscription(sensor.CameraInfo, "camera_info", self._on_info, qos.qos_profile_sensor_data)
         node.create_subscription(image, "image", self._on_image, qos.qos_profile_sensor_data)
-        kept = qos.QoSProfile(depth=100, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)
+        latched = qos.QoSProfile(depth=100, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)
         tf = import_module("tf2_msgs.msg").TFMessage
-        node.create_subscription(tf, "/tf_static", self._on_static, kept)
+        node.create_subscription(tf, "/tf_static", self._on_static, latched)
         if settings.poses == "tf":
             node.create_subscription(tf, "/tf", self._on_tf, qos.QoSProfile(depth=100))
         elif settings.poses == "odometry":

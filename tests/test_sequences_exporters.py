@@ -439,8 +439,34 @@ def test_a_bag_of_12_bit_images_and_png_depth(tmp_path, caplog):
         expected = scene.images[i][..., :1] * (0.05 if i == 1 else 1.0)
         np.testing.assert_allclose(frame.image, np.repeat(expected, 3, axis=2), atol=0.6)
         np.testing.assert_allclose(frame.depth, scene.depths[i], atol=5e-4 + 1e-6)
-    assert "mono16, images of 16 bits, are read as 0 to 4095 and scaled to bytes" in caplog.text
+    assert "/infra/image: images of 16 bits, read as 0 to 4095 and scaled to bytes" in caplog.text
     assert open_sequence(path)[0].depth is None
+
+
+def test_a_topic_and_its_transports_are_one(tmp_path):
+    """A recording of all topics has the same images several times."""
+
+    def transports(bag):
+        for i, image in enumerate(scene.images):
+            stamp = layouts_bag.START + i * layouts_bag.STEP
+            png = cv2.imencode(".png", image[..., ::-1])[1].tobytes()
+            bag.write("/camera/image/compressed", stamp, bag.compressed(stamp, "optical", png, "bgr8; png compressed"))
+            png = cv2.imencode(".png", np.rint(1000 * scene.depths[i]).astype(np.uint16))[1].tobytes()
+            for name, head, form in (
+                ("compressed", 0, "png compressed "),
+                ("compressedDepth", 12, "compressedDepth png"),
+            ):
+                message = bag.compressed(stamp, "optical", bytes(head) + png, f"16UC1; {form}")
+                bag.write(f"/aligned/{name}", stamp, message)
+
+    scene = layouts.truth(layouts_bag.K)
+    path, _ = layouts_bag.write_bag(tmp_path, depth=None, change=transports)
+    sequence = open_sequence(path)
+    for frame, image, depth in zip(sequence, scene.images, scene.depths, strict=True):
+        np.testing.assert_array_equal(frame.image, image)
+        np.testing.assert_allclose(frame.depth, depth, atol=5e-4 + 1e-6)
+    for topic in ("/camera/image/compressed", "/aligned/compressed"):
+        assert len(open_sequence(path, topics=[topic])) == 6
 
 
 def test_16_bit_colours_in_png_messages(tmp_path):

@@ -44,6 +44,7 @@ _POSES = (_ODOMETRY, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWit
 _TYPES = (_IMAGE, _COMPRESSED, _INFO, _TF, *_POSES)
 _OLD_NAMES = {"tf/msg/tfMessage": _TF}
 _NANOSECOND = 1e-9
+_TRANSPORTS = ("compressed", "compressedDepth")  # last parts of the names of image_transport's topics
 _SCALE_SAMPLES = 5  # images of a bag that determine the range of their 16 bits
 # Errors of rosbags for damaged files, besides its own classes.
 _BROKEN = (
@@ -216,16 +217,16 @@ def _full_scale(bag: Bag, keys: Sequence[MessageKey]) -> int | None:
     scales = []
     for number in chosen:
         try:
-            scales.append(ros.full_scale_of(message := bag.read(keys[number]), bag.path))
+            scale = ros.full_scale_of(bag.read(keys[number]), bag.path)
         except FrameError:  # counted when its turn comes
             continue
-        if scales[-1] is None:
+        if scale is None:
             return None
+        scales.append(scale)
     if not scales:
         return None
-    full = max(scale for scale in scales if scale is not None)
-    encoding = getattr(message, "encoding", None) or message.format
-    LOGGER.warning("%s: %s, images of 16 bits, are read as 0 to %d and scaled to bytes", bag.path, encoding, full)
+    topic, full = keys[0].topic, max(scales)
+    LOGGER.warning("%s: %s: images of 16 bits, read as 0 to %d and scaled to bytes", bag.path, topic, full)
     return full
 
 
@@ -249,7 +250,8 @@ def _choose(bag: Bag, options: Options) -> _Topics:
         (depths if ros.is_depth(first) else images)[name] = ros.frame_name(first.header.frame_id)
 
     def one(kind: str, candidates: Iterable[str]) -> str:
-        chosen = [name for name in candidates if name in named] or list(candidates)
+        listed = list(candidates)
+        chosen = [name for name in listed if name in named] or _without_transports(listed)
         if len(chosen) > 1:
             raise ValueError(f"{bag.path}: {kind} may be {', '.join(sorted(chosen))}: name one with --topics")
         return chosen[0] if chosen else ""
@@ -287,6 +289,20 @@ def _choose(bag: Bag, options: Options) -> _Topics:
         if not pose:
             raise ValueError(f"{bag.path} has no poses: pass trajectory")
     return _Topics(image, info, depth, pose, ros.frame_name(named.get(pose, "")))
+
+
+def _without_transports(topics: list[str]) -> list[str]:
+    """The topics without those with the same images as another one: X/compressed and X/compressedDepth beside X, and
+    X/compressed beside X/compressedDepth."""
+    pairs = [(name, *name.rpartition("/")[::2]) for name in topics]
+    return [
+        name
+        for name, base, transport in pairs
+        if not (
+            transport in _TRANSPORTS
+            and (base in topics or (transport == _TRANSPORTS[0] and f"{base}/{_TRANSPORTS[1]}" in topics))
+        )
+    ]
 
 
 def _listing(types: dict[str, str]) -> str:
