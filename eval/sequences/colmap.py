@@ -98,7 +98,7 @@ def _model_folders(path: Path) -> list[Path]:
     """The folders with a model: the numbered ones in ``sparse/`` in the order of their numbers, or else ``sparse/``, or
     else the path itself."""
     below = path / MODELS
-    numbered = sorted((f for f in below.iterdir() if f.name.isdecimal()), key=natural_key) if below.is_dir() else []
+    numbered = sorted((f for f in below.glob("*") if f.name.isdecimal()), key=natural_key) if below.is_dir() else []
     return next(
         (found for found in (list(filter(_is_model, group)) for group in (numbered, [below], [path])) if found), []
     )

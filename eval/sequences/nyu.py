@@ -13,7 +13,7 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence
-from ufmstar_torch.eval.sequences.images import first_depth_size, is_sidecar, list_files, natural_key, positive
+from ufmstar_torch.eval.sequences.images import first_depth_size, is_sidecar, natural_key, positive
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
 
@@ -64,7 +64,7 @@ def _files(path: Path) -> list[Path]:
     if path.resolve().name in PARTS:
         return part_files(path)
     if path.is_dir() and path.resolve().parent.name in PARTS:
-        return list_files(path.resolve(), (".h5",))
+        return sorted((file for file in path.resolve().glob("*.h5") if not is_sidecar(file)), key=natural_key)
     return []
 
 

@@ -21,7 +21,7 @@ from ufmstar_torch.eval.sequences import scannet
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import UNKNOWN
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Size, Skipped
-from ufmstar_torch.eval.sequences.images import list_files, read_color
+from ufmstar_torch.eval.sequences.images import read_color
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
 
@@ -117,7 +117,7 @@ def _take(file: BinaryIO, path: Path, count: int) -> bytes:
 
 
 def _files(folder: Path) -> list[Path]:
-    return list_files(folder, (_SUFFIX,))
+    return sorted(p for p in folder.glob(f"*{_SUFFIX}") if p.is_file() and not p.name.startswith("."))
 
 
 def _frames(file: BinaryIO, path: Path, count: int, depth_size: Size, scale: float) -> list[Entry | Skipped]:
