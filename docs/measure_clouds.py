@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-_KINDS = {"float": "<f4", "uchar": "|u1"}
+_KINDS = {"float": "<f4", "double": "<f8", "uchar": "|u1"}
 
 
 def read_points(path: Path) -> NDArray[np.float64]:

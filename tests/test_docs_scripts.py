@@ -110,7 +110,8 @@ def test_distances_of_clouds(script: Any, tmp_path: Path) -> None:
     moved = plane + np.array([0, 0, 0.03])
     moved[:36] += [0, 0, 0.5]
     for name, points in (("truth", plane), ("cloud", moved)):
-        table = vertex_table(dict.fromkeys(("x", "y", "z", "sigma"), "<f4"), points, np.ones((400, 1)))
+        kinds = dict.fromkeys(("x", "y", "z"), "<f8") | {"sigma": "<f4"}  # as `ufmstar export`
+        table = vertex_table(kinds, points, np.ones((400, 1)))
         write_ply(tmp_path / f"{name}.ply", table, "x y z sigma [m]")
     clouds = script("measure_clouds")
     read = [clouds.read_points(tmp_path / f"{name}.ply") for name in ("cloud", "truth")]

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from rerun_stand_in import Made, stand_in
 from runs import own_depth_job
+from scipy.spatial import cKDTree
+from test_ply import parse
 
 from ufmstar_torch import cli
 from ufmstar_torch.eval.run.run import run
@@ -41,7 +43,7 @@ def finished(tmp_path_factory):
 
 def read_ply(path):
     head, body = path.read_bytes().split(b"end_header\n")
-    kinds = {"float": "<f4", "uchar": "|u1"}
+    kinds = {"float": "<f4", "double": "<f8", "uchar": "|u1"}
     names = [line.split()[1:] for line in head.decode().splitlines() if line.startswith("property")]
     return np.frombuffer(body, [(name, kinds[kind]) for kind, name in names])
 
@@ -120,6 +122,65 @@ def test_transforms_are_read_back(finished):
         depth = read_depth(out / "export" / "transforms" / "depth" / f"{frame.name}.png")
         np.testing.assert_allclose(depth[20:], truth.depths[i][20:], atol=1.1e-3)
         assert not depth[:20].any()
+
+
+FAR = np.array([458_074.6, 9_429_380.2, 162.9])  # UTM
+
+
+@pytest.fixture(scope="module")
+def far(tmp_path_factory):
+    """The run of a walk 10^7 m from the origin, and the poses."""
+    path, truth = layouts.write_generic(tmp_path_factory.mktemp("far"))
+    poses = np.array(truth.T_world_cam)
+    poses[:, :3, 3] += FAR
+    np.savetxt(path / "poses.txt", poses[:, :3].reshape(6, 12), fmt="%.17g")
+    out = tmp_path_factory.mktemp("run") / "out"
+    words = ["run", str(path), "--depth", "self", "--no-video", "--no-sheet", "--out", str(out)]
+    assert cli.main(words) == 0
+    return out, poses, truth
+
+
+def test_exports_far_from_the_origin_keep_millimetres(far, stand_in):
+    out, poses, truth = far
+    for kind in ("tum", "cloud", "transforms", "mcap", "rrd"):
+        assert cli.main(["export", str(out), "--to", kind, "--voxel", "0.001"]) == 0
+    trajectory = read_trajectory(out / "export" / "trajectory.txt")
+    np.testing.assert_allclose(trajectory.T_world_cam, poses, rtol=0, atol=3e-9)
+    for folder in ("transforms", "bag"):
+        again = open_sequence(out / "export" / folder)
+        np.testing.assert_allclose([frame.T_world_cam for frame in again], poses, rtol=0, atol=1e-7)
+    cloud = read_ply(out / "export" / "cloud.ply")
+    v, u = np.indices(layouts.SIZE).reshape(2, -1)
+    rays = np.linalg.inv(truth.K) @ np.stack([u, v, np.ones_like(u)])
+    depths = [read_frame(out / "frames" / f"{i + 7}.npz")["depth"].ravel() for i in range(6)]
+    surface = [(rays * z).T @ T[:3, :3].T + T[:3, 3] for T, z in zip(poses, depths, strict=True)]
+    points = np.stack([cloud[name] for name in "xyz"], -1)
+    assert len(points) > 3000
+    distance, _ = cKDTree(np.concatenate(surface) - FAR).query(points - FAR)
+    assert np.median(distance) < 1e-6, "most voxels have a single pixel"
+    file = json.loads((out / "export" / "transforms" / "transforms.json").read_text())
+    assert np.abs([frame["transform_matrix"] for frame in file["frames"]]).max() < 1000, "float32 keeps .06 mm"
+    gaussians, comments = parse(out / "mixture.ply")
+    (offset,) = [np.array(line.split()[2:5], float) for line in comments if line.startswith("comment offset")]
+    near = np.stack([gaussians["vertex"][name] for name in "xyz"], -1)
+    mixture = np.load(out / "mixture.npz")
+    T = mixture["T_world_first"].reshape(4, 4)
+    expected = mixture["mean"][0][mixture["weight"][0] > 0] @ T[:3, :3].T + (T[:3, 3] - offset)
+    np.testing.assert_allclose(near, expected, rtol=0, atol=1e-4)
+    logged = [made.named["translation"] for made in stand_in.logged("world/camera")]
+    np.testing.assert_allclose(logged + offset, poses[:, :3, 3], rtol=0, atol=1e-9)
+    assert np.abs(logged).max() < 1000
+    (centres,) = [made.named["centers"] for made in stand_in.logged("world/gaussians")]
+    np.testing.assert_allclose(centres, expected, rtol=0, atol=1e-6)
+    assert stand_in.logged("offset")[0].words[0].startswith("offset 458000 9429000 0 m: add it")
+
+
+def test_an_empty_cloud_is_an_error(finished, tmp_path, capfd):
+    words = ["export", str(finished[0]), "--to", "cloud"]
+    assert cli.main([*words, "--max-sigma", "1e-9"]) == 2
+    assert "the cloud is empty: no pixel has a depth within the limits of sigma" in capfd.readouterr().err
+    assert cli.main([*words, "--voxel", "1e-7"]) == 2
+    assert "left out (--voxel 1e-07)" in capfd.readouterr().err
 
 
 def test_the_size_of_a_voxel_is_positive(finished, capfd):

@@ -1,4 +1,4 @@
-"""The examples of ``LiveDepth``, with stand-ins for the camera and ROS; the onboard demo."""
+"""The camera example of ``LiveDepth`` with a stand-in for the camera; the onboard demo."""
 
 from __future__ import annotations
 
@@ -10,75 +10,17 @@ from types import SimpleNamespace
 import live_camera
 import numpy as np
 import pytest
-import ros_node
 import torch
 from demo_networks import write_members
 from onnx_files import small_network, write_fastdepth
-from scipy.spatial.transform import Rotation
 
-from ufmstar_torch import DepthPrediction, UncertainDepth, cli
+from ufmstar_torch import cli
 from ufmstar_torch.eval.bench import onboard
 from ufmstar_torch.eval.sequences import live as sources
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.eval.tour import tour_sequence
 from ufmstar_torch.models.quantise import quantise
 from ufmstar_torch.models.trained import load_trained
-
-
-class Flat(torch.nn.Module):
-    """Two metres everywhere."""
-
-    def forward(self, x):
-        return DepthPrediction(torch.full(x[:, 0].shape, 2.0))
-
-
-class Node:
-    """Stores the callbacks and the published messages."""
-
-    def __init__(self):
-        self.callbacks, self.published = {}, {}
-
-    def create_publisher(self, kind, topic, depth):
-        sent = self.published.setdefault(topic, [])
-        return SimpleNamespace(publish=sent.append)
-
-    def create_subscription(self, kind, topic, callback, depth):
-        self.callbacks[topic] = callback
-
-
-def header(stamp):
-    return SimpleNamespace(stamp=SimpleNamespace(sec=int(stamp), nanosec=round(stamp % 1 * 1e9)))
-
-
-def image_message(**values):
-    return SimpleNamespace(header=header(0), **values)
-
-
-def test_the_ros_node_publishes_depth_and_sigma():
-    node = Node()
-    sensor = SimpleNamespace(Image=image_message, CameraInfo=None)
-    model = UncertainDepth(Flat())
-    model(np.zeros((48, 64, 3), np.uint8), np.eye(4), (50.0, 50.0, 31.5, 23.5))  # compiles
-    model.reset()
-    with ros_node.attach(node, model, sensor, SimpleNamespace(PoseStamped=None)) as live:
-        x, y, z, w = Rotation.from_euler("y", 30, degrees=True).as_quat()
-        pose = SimpleNamespace(
-            position=SimpleNamespace(x=1.0, y=2.0, z=3.0), orientation=SimpleNamespace(x=x, y=y, z=z, w=w)
-        )
-        node.callbacks["pose"](SimpleNamespace(header=header(7.25), pose=pose))
-        pixels = np.zeros((48, 3 * 64 + 8), np.uint8)  # rows are padded
-        message = image_message(height=48, width=64, step=pixels.shape[1], data=pixels.tobytes())
-        message.header = header(7.25)
-        node.callbacks["image"](message)  # before the camera is known
-        node.callbacks["camera_info"](SimpleNamespace(k=np.array([50.0, 0, 31.5, 0, 50, 23.5, 0, 0, 1])))
-        node.callbacks["image"](message)
-        assert live.wait_idle(20)
-    assert live.statistics.images == live.statistics.results == 1
-    ((depth,), (sigma,)) = node.published["depth"], node.published["sigma"]
-    assert (depth.height, depth.width, depth.step, depth.encoding) == (48, 64, 256, "32FC1")
-    assert set(np.frombuffer(depth.data, np.float32)) == {2.0}
-    assert (np.frombuffer(sigma.data, np.float32) > 0).any()
-    assert (depth.header.stamp.sec, depth.header.stamp.nanosec) == (7, 250_000_000)
 
 
 def test_the_camera_is_shown(tmp_path, monkeypatch):

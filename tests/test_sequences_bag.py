@@ -54,29 +54,93 @@ def test_compressed_images_and_depth(tmp_path, how, atol):
     require_same(open_sequence(path), truth, atol)
 
 
-@pytest.mark.parametrize("encoding", ["rgb8", "rgba8", "mono8", "bayer_rggb8", "yuv422_yuy2"])
+GREY, RGB = 90, (200, 100, 50)
+BAYER = {"rggb": [[200, 100], [100, 50]], "bggr": [[50, 100], [100, 200]], "gbrg": [[100, 50], [200, 100]]}
+
+
+def encoded(encoding, full=255):
+    """[4, 6, ...] values of a uniform image in an encoding, and its colour (8 bits)."""
+    one = np.ones((4, 6, 1))
+    colours = {"rgb": RGB, "bgr": RGB[::-1], "rgba": (*RGB, 7), "bgra": (*RGB[::-1], 7)}
+    name = encoding.removesuffix("16").removesuffix("8")
+    if name in colours:
+        values = one * colours[name]
+    elif name.startswith("bayer_"):
+        values = np.tile([[100, 200], [50, 100]] if name.endswith("grbg") else BAYER[name[6:]], (2, 3))
+    elif name in ("uyvy", "yuv422"):
+        values = one * (128, GREY)
+    elif name in ("yuyv", "yuv422_yuy2"):
+        values = one * (GREY, 128)
+    elif name in ("nv12", "nv21"):
+        values = np.concatenate([np.full((4, 6), GREY), np.full((2, 6), 128)])
+    else:
+        values = GREY * one[..., 0]
+    kind = np.uint16 if encoding.endswith("16") else np.uint8
+    return np.rint(values * full / 255).astype(kind), RGB if name[:3] in ("rgb", "bgr", "bay") else (GREY,) * 3
+
+
+def image_message(encoding, values, height=None, *, big=False, pad=3):
+    rows = np.ascontiguousarray(values.astype(values.dtype.newbyteorder(">")) if big else values)
+    rows = np.pad(rows.view(np.uint8).reshape(len(values), -1), ((0, 0), (0, pad)))
+    size = {"height": height or len(values), "width": values.shape[1], "step": rows.shape[1]}
+    return SimpleNamespace(encoding=encoding, is_bigendian=int(big), data=rows.ravel(), **size)
+
+
+EIGHT_BITS = (
+    *("rgb8", "bgr8", "rgba8", "bgra8", "mono8", "uyvy", "yuv422", "yuyv", "yuv422_yuy2", "nv12", "nv21"),
+    *("bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"),
+)
+SIXTEEN_BITS = ("mono16", "rgb16", "bgr16", "rgba16", "bgra16", "bayer_rggb16", "bayer_grbg16")
+
+
+@pytest.mark.parametrize("encoding", EIGHT_BITS)
 def test_encodings(encoding):
-    rgb = np.zeros((4, 6, 3), np.uint8) + np.uint8([200, 100, 50])
-    grey = np.full((4, 6), 90, np.uint8)
-    bayer = np.tile(np.uint8([[200, 100], [100, 50]]), (2, 3))
-    stored = {"rgb8": rgb, "rgba8": np.dstack([rgb, grey]), "mono8": grey, "bayer_rggb8": bayer}
-    stored["yuv422_yuy2"] = np.dstack([grey, grey * 0 + 128])
-    expected = rgb if encoding[0] in "rb" else np.dstack([grey] * 3)
-    with_padding = np.pad(stored[encoding].reshape(4, -1), ((0, 0), (0, 3)))
-    message = SimpleNamespace(
-        encoding=encoding, height=4, width=6, step=with_padding.shape[1], data=with_padding.ravel()
-    )
-    np.testing.assert_allclose(ros_messages.colour(message, Path("a.bag")).astype(int), expected, atol=4)
+    values, expected = encoded(encoding)
+    message = image_message(encoding, values, 4)
+    found = ros_messages.colour(message, None, Path("a.bag"))
+    assert (found.shape, found.dtype) == ((4, 6, 3), np.uint8)
+    np.testing.assert_allclose(found.astype(int), np.broadcast_to(expected, (4, 6, 3)), atol=4)
+    assert not ros_messages.is_depth(message)
+    assert ros_messages.full_scale_of(message, Path("a.bag")) is None
+
+
+@pytest.mark.parametrize("big", [False, True])
+@pytest.mark.parametrize("full", [1023, 4095, 65535])
+@pytest.mark.parametrize("encoding", SIXTEEN_BITS)
+def test_images_of_more_than_8_bits_are_scaled_by_their_range(encoding, full, big):
+    values, expected = encoded(encoding, full)
+    message = image_message(encoding, values, big=big)
+    assert ros_messages.full_scale_of(message, Path("a.bag")) == full
+    for scale in (None, full):
+        found = ros_messages.colour(message, scale, Path("a.bag"))
+        np.testing.assert_allclose(found.astype(int), np.broadcast_to(expected, (4, 6, 3)), atol=4)
+    darker = ros_messages.colour(image_message(encoding, values // 16, big=big), full, Path("a.bag"))
+    np.testing.assert_allclose(darker.astype(int), np.broadcast_to(expected, (4, 6, 3)) // 16, atol=4)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "meaning"), [("8UC1", "mono8"), ("8UC3", "bgr8"), ("8UC4", "bgra8"), ("16UC3", "bgr16")]
+)
+def test_types_without_a_colour_order_are_opencvs(encoding, meaning):
+    values, expected = encoded(meaning, 255 if meaning.endswith("8") else 65535)
+    found = ros_messages.colour(image_message(encoding, values), None, Path("a.bag"))
+    np.testing.assert_allclose(found.astype(int), np.broadcast_to(expected, (4, 6, 3)), atol=4)
+
+
+def test_images_that_cannot_be_decoded_are_named():
+    message = image_message("rgb8", encoded("rgb8")[0])
     message.data = message.data[:-1]
-    with pytest.raises(FrameError, match="an image of 6x4"):
-        ros_messages.colour(message, Path("a.bag"))
-    message.height, message.width, message.encoding = 1, 5, "yuv422_yuy2"
-    message.step, message.data = 10, np.zeros(10, np.uint8)
+    with pytest.raises(FrameError, match="an image of 6x4 rgb8 has 83 bytes, 21 a row"):
+        ros_messages.colour(message, None, Path("a.bag"))
+    odd = image_message("yuv422_yuy2", np.zeros((1, 5, 2), np.uint8), pad=0)
     with pytest.raises(FrameError, match="must have an even width, got 5"):
-        ros_messages.colour(message, Path("a.bag"))
-    message.encoding = "rgb16"
-    with pytest.raises(FrameError, match=r"encoding must be one of rgb8, .* got 'rgb16'"):
-        ros_messages.colour(message, Path("a.bag"))
+        ros_messages.colour(odd, None, Path("a.bag"))
+    with pytest.raises(FrameError, match="must have an even height, got 3"):
+        ros_messages.colour(image_message("nv12", np.zeros((4, 6), np.uint8), 3), None, Path("a.bag"))
+    with pytest.raises(FrameError, match="encoding must be one of ROS's, got 'h264'"):
+        ros_messages.colour(image_message("h264", np.zeros((4, 6), np.uint8)), None, Path("a.bag"))
+    with pytest.raises(FrameError, match="must have colours or grey, got '32SC2'"):
+        ros_messages.colour(image_message("32SC2", np.zeros((4, 6, 2), np.int32)), None, Path("a.bag"))
 
 
 def test_the_camera_info_describes_the_lens(tmp_path):

@@ -132,9 +132,9 @@ def test_what_is_no_depth_map_is_named(tmp_path):
         read_depth(tmp_path / "object.npy")
     with pytest.raises(FrameError):
         read_depth(tmp_path / "absent.png")
-    write_depth_png(tmp_path / "depth.png", np.ones((4, 5)), 1000)
-    with pytest.raises(FrameError, match="expected an 8-bit colour or grey image"):
-        read_color(tmp_path / "depth.png")
+    Image.fromarray(np.ones((4, 5), np.float32)).save(tmp_path / "depth.tif")
+    with pytest.raises(FrameError, match="expected an image of 8 or 16 bits, got mode F"):
+        read_color(tmp_path / "depth.tif")
 
 
 def _npy(shape: str, descr: str = "'<f4'", content: bytes = bytes(64)) -> bytes:

@@ -26,6 +26,7 @@ _QUANTILES = (0.01, 0.99)
 _CUSTOMARY = (1.0, 0.1, 0.01, 1e-3, 1e-4, 1e-5, 1 / 5000, 1 / 256, 1 / 4000, 1 / 1024)
 _CUSTOMARY_WITHIN = 1.1
 _REGISTERED = "depth is registered"  # part of check_sequence's undecided questions about registration
+_NO_UNIT = "the unit of the poses: their file does not state it, and `run` needs it in metres: --pose-scale M"
 _FEW = 0.5  # smallest share of the frames on disk that must be usable; below, the trajectory is another recording's
 
 
@@ -115,7 +116,7 @@ def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **opti
         checked=checked,
         problems=(*problems, *outcome.problems),
         remedies=(*remedies, *_remedies(outcome, sequence, path, options)),
-        undecided=outcome.undecided,
+        undecided=(*outcome.undecided, *([] if sequence.metric else [_NO_UNIT])),
     )
 
 
@@ -160,6 +161,8 @@ def _scale_remedy(factor: float, sequence: FrameSequence, path: str | Path, opti
     if options.get("trajectory") is not None:
         return f"a single camera's trajectory has no scale: {positions}"
     unit = _metres_per_unit(sequence, path, options)
+    if not sequence.metric:
+        return f"--pose-scale {1 / factor:.4g}"
     if unit is None:
         return positions
     scale = unit * factor

@@ -126,8 +126,9 @@ class UfMOptions:
         ufm_preset: paper: the paper's own settings (UfMStarConfig.paper; with --plain, its method), default: ours;
             --preset and single --ufm.* take precedence
         anchors: depths that show the error on which all views agree (docs/anchors.md): dense, a depth in every cell of
-            the image, searched in earlier images; corners, tracked in the images; or FILE, landmarks, a line x y z
-            sigma [m] each, in the world of the poses
+            the image, searched in earlier images; corners, tracked in the images; FILE, landmarks, a line x y z
+            sigma [m] each, in the world of the poses; run, rank: sensor (or sensor:stereo, sensor:tof), the
+            recording's own depth, dense where it has none
         scale_from: network: its scale for COLMAP poses without one; anchors then show shape only
         recalibration: file of `ufmstar recalibrate`, or none; default: WEIGHTS.recalibration.json beside the weights
     """

@@ -15,7 +15,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.depth import SECTIONS, MapOptions, NetworkOptions, PosteriorOptions, UfMOptions
 from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, positional, reader, usage_errors
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-from ufmstar_torch.eval.engine.anchors import landmarks_of
+from ufmstar_torch.eval.engine.anchors import landmarks_of, sensor_of
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.job import RunJob
@@ -136,9 +136,12 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
         source = options.network.load(options) if networks is None else networks
     else:
         source = options.maps.source(sequence, indices)
+    sensor = sensor_of(ufm.anchors, sequence) if options.config.anchors else None
+    if sensor is not None and source.is_truth:
+        raise ValueError("--anchors sensor goes with the depth of a network: with --depth self, nothing is to correct")
     scale = None
     if ufm.scale_from is not None:
-        scale = network_scale(sequence, source, indices)
+        scale = network_scale(sequence, source, indices, options.opening.model_index)
         sequence = scale_poses(sequence, scale.metres)
     return RunJob(
         sequence=sequence,
@@ -150,6 +153,7 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
         settings=options.settings(),
         every=options.network.mode == "full",
         landmarks=DENSE if options.config.anchors is None else _landmarks(ufm.anchors or DENSE, sequence),
+        sensor=sensor,
         scale=scale,
     )
 
@@ -171,6 +175,8 @@ def _has_images(sequence: FrameSequence) -> bool:
 def _landmarks(value: str, sequence: FrameSequence) -> str | LandmarkSource:
     """The source of anchors of ``--anchors``. Raises ValueError: the images to search are missing; others as
     ``landmarks_of``."""
+    if sensor_of(value, sequence) is not None:
+        return DENSE
     source = landmarks_of(value, sequence.folder, sequence.pose_scale)
     if not source.needs_image:
         return source

@@ -1,4 +1,6 @@
-"""Anchors of a row: corners tracked in images, landmarks of a file, or ground truth as the upper bound."""
+"""Anchors of a row: corners tracked in images, landmarks of a file, the depth of the sequence's depth camera, or ground
+truth as the upper bound.
+"""
 
 from __future__ import annotations
 
@@ -14,13 +16,15 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.landmarks import Landmarks, LandmarkSource
+from ufmstar_torch.anchors.sensor import SENSORS, completed, sensor_landmarks
 from ufmstar_torch.anchors.sources import CORNERS, DENSE, FILE_TYPES, LandmarkMap, landmark_source
 from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.anchors.tracker import TrackerConfig
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import TRUTH, Setting
-from ufmstar_torch.eval.sequences.frame import Frame
+from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
+from ufmstar_torch.eval.sequences.ground_truth import depth_camera, resample_nearest
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.eval.sequences.options import resolve
 from ufmstar_torch.prediction import DepthPrediction
@@ -31,6 +35,10 @@ TRUTH_COUNT, TRUTH_SIGMA = 100, 0.01
 # Third number of the seeds for the choice of anchors and for noise. The seed of poses has two numbers.
 _CHOICE, _NOISE = 1, 2
 _NO_IMAGE = Landmarks(np.zeros((0, 2)), np.zeros(0), np.zeros(0), tracked=0, none="no image")
+_NO_DEPTH = replace(_NO_IMAGE, none="no depth map")
+SENSOR = "sensor"
+# Layouts whose depth is that of a laser or time of flight; the depth cameras of the others measure disparities.
+_TIME_OF_FLIGHT = ("stray", "arkitscenes", "transforms", "kitti360")
 
 
 class Tracks:
@@ -70,15 +78,16 @@ class Tracks:
 
 
 class AnchorSource:
-    """The anchors of a row, from ``tracks``; None = ground truth at random pixels.
+    """The anchors of a row, from ``tracks``; None = ground truth at random pixels. With a ``sensor``, a kind of
+    ``SENSORS``, they are the depth of the frame, completed by the tracks; that depth is then no ground truth.
 
     Noise on tracked positions is applied to the anchors: it moves an anchor in the image, and gives its depth the
     first-order error of that noise in every view (``track_noise`` times the tracker's standard deviation per
     ``pixel_noise``). The variance stays the tracker's. Noise is independent between frames.
     """
 
-    def __init__(self, setting: Setting, tracks: Tracks | None) -> None:
-        self._setting, self.tracks = setting, tracks
+    def __init__(self, setting: Setting, tracks: Tracks | None, sensor: str | None = None) -> None:
+        self._setting, self.tracks, self.sensor = setting, tracks, sensor
 
     def of(
         self,
@@ -98,6 +107,9 @@ class AnchorSource:
         Returns:
             landmarks in the pixels of the image (for ground truth: of the depth map); the same as anchors [1, N] in the
             pixels of the depth map, None without an image; and the time to compute them [ms].
+
+        Raises:
+            FrameError: the sensor's depth map has no camera.
         """
         device, K = prediction.depth.device, prediction.K[0]
         if self.tracks is None:
@@ -105,11 +117,31 @@ class AnchorSource:
             drawn = self._sampled(depth, frame.index)
             values = (torch.from_numpy(part)[None] for part in (drawn.pixel, drawn.depth, drawn.variance))
             return drawn, Anchors(*values).to(device), None
+        if self.sensor is not None:
+            return self._completed(frame, T_world_cam, prediction, self.tracks)
         tracked = self.tracks.of(frame, T_world_cam)
         if tracked is None:
             return _NO_IMAGE, None, None
         landmarks = self._thinned(self._disturbed(tracked[0], frame.index), frame.index)
         return landmarks, landmarks.anchors(frame.intrinsics, K).to(device), tracked[1]
+
+    def _completed(
+        self, frame: Frame, T_world_cam: NDArray[np.float64], prediction: DepthPrediction, tracks: Tracks
+    ) -> tuple[Landmarks, Anchors, float]:
+        """As :meth:`of`, from the frame's depth where it has one and from the tracks elsewhere."""
+        assert self.sensor is not None
+        started, landmarks, covered = perf_counter(), _NO_DEPTH, None
+        if frame.depth is not None:
+            K_depth = depth_camera(frame)
+            landmarks = sensor_landmarks(frame.depth, K_depth, frame.intrinsics, self.sensor)
+            if frame.image is not None:
+                size = frame.image.shape[0], frame.image.shape[1]
+                covered = resample_nearest(frame.depth > 0, K_depth, frame.intrinsics, size)
+        tracked = tracks.of(frame, T_world_cam)
+        if tracked is not None:
+            landmarks = tracked[0] if covered is None else completed(landmarks, tracked[0], covered)
+        anchors = landmarks.anchors(frame.intrinsics, prediction.K[0]).to(prediction.depth.device)
+        return landmarks, anchors, 1000 * (perf_counter() - started)
 
     def _sampled(self, truth: NDArray[np.float32], index: int) -> Landmarks:
         v, u = np.nonzero(truth > 0)
@@ -137,6 +169,19 @@ class AnchorSource:
 
     def _drawn(self, index: int, purpose: int) -> np.random.Generator:
         return np.random.default_rng([self._setting.seed, index, purpose])
+
+
+def sensor_of(value: str | None, sequence: FrameSequence) -> str | None:
+    """The kind of the sequence's depth camera for "sensor", which is that of its layout, or "sensor:KIND"; None for
+    another source of anchors. Raises ValueError: an unknown kind, or the sequence has no depth."""
+    name, colon, kind = str(value).partition(":")
+    if name != SENSOR:
+        return None
+    if colon and kind not in SENSORS:
+        raise ValueError(f"--anchors {value}: the kind of sensor must be one of {', '.join(SENSORS)}")
+    if len(sequence.without_depth) == len(sequence):
+        raise ValueError(f"--anchors {value}: the sequence {sequence.name!r} has no depth maps")
+    return kind or ("tof" if sequence.layout in _TIME_OF_FLIGHT else "stereo")
 
 
 def landmarks_of(value: str, folder: Path | None, scale: float = 1.0) -> LandmarkSource:

@@ -49,7 +49,8 @@ class RowResult:
     confidence: Tensor | None = None  # of the prediction, in the network's unit, if UfM* used it; or None
     network_variance: Tensor | None  # A + E of the prediction, even if the row ignores them [m^2]; None without both
     intrinsics: NDArray[np.float64]  # [3, 3] of the maps [px]
-    truth: NDArray[np.float32] | None  # [h, w] ground truth at the maps' pixels [m], 0 = none; None without a depth map
+    # [h, w] ground truth at the maps' pixels [m], 0 = none; None without a depth map, or if it serves as anchors
+    truth: NDArray[np.float32] | None
     T_world_cam: NDArray[np.float64]  # [4, 4] the row's pose, with noise [m]
     member: int | None  # index of the network that predicted; None if all predicted, and for maps
     landmarks: Landmarks | None  # from which the frame's anchors were made; None for a row without anchors
@@ -138,7 +139,7 @@ class RowRunner:
             **answer,
             network_variance=None if network_variance is None else network_variance[0].cpu(),
             intrinsics=prediction.K[0].numpy(),
-            truth=truth,
+            truth=None if self.anchors is not None and self.anchors.sensor else truth,
             T_world_cam=T,
             member=member,
             landmarks=landmarks,

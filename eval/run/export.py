@@ -20,6 +20,7 @@ from ufmstar_torch.conventions import CONVENTIONS
 from ufmstar_torch.eval.run.colours import known_where
 from ufmstar_torch.eval.run.files import write_bytes_atomic, write_json_atomic
 from ufmstar_torch.eval.run.gaussians import vertex_table, write_ply
+from ufmstar_torch.eval.run.offset import world_offset
 from ufmstar_torch.eval.run.writers import encode_length_png, fitting_unit, frame_file, read_frame
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
@@ -114,50 +115,66 @@ def export_trajectory(frames: Iterator[RunFrame], out: Path) -> str:
     for frame in frames:
         time = float(frame.index) if frame.timestamp is None else frame.timestamp
         quaternion = Rotation.from_matrix(frame.T_world_cam[:3, :3]).as_quat()
-        lines.append(" ".join([f"{time:.9f}", *(f"{x:.9g}" for x in (*frame.T_world_cam[:3, 3], *quaternion))]))
+        position = (f"{x:.9f}" for x in frame.T_world_cam[:3, 3])  # nm, however far the origin
+        lines.append(" ".join([f"{time:.9f}", *position, *(f"{x:.12g}" for x in quaternion)]))
     file = export_folder(out) / "trajectory.txt"
     write_bytes_atomic(file, "\n".join([*lines, ""]).encode())
     return f"{file}: {len(lines) - 1} poses"
 
 
 def export_cloud(frames: Iterator[RunFrame], out: Path, voxel: float) -> str:
-    """cloud.ply: x y z and sigma [m], and red green blue where images can be read.
+    """cloud.ply: x y z in double precision and sigma [m], and red green blue where images can be read.
 
     A point is the mean of the pixels in a voxel with side ``voxel`` [m], weighted by 1/sigma^2. Its sigma is
     sqrt(n / sum 1/sigma^2), which does not shrink with the number n of pixels, because their errors are correlated.
+    Pixels over 2^20 voxels from the first camera, along an axis, are left out and counted. Raises ValueError: no pixel
+    is left.
     """
+    origin, far = None, 0
     keys, sums = np.zeros(0, np.int64), np.zeros((0, 8))
     waiting: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
     coloured = False
     for frame in frames:
         coloured |= frame.image is not None
-        waiting.append(_voxels(frame, voxel))
+        origin = np.floor(frame.T_world_cam[:3, 3] / voxel) if origin is None else origin
+        number, values = _voxels(frame, voxel, origin)
+        near = (np.abs(number) < _HALF).all(axis=1)
+        far += int((~near).sum())
+        waiting.append((_keys(number[near]), values[near]))
         if sum(len(part) for part, _ in waiting) > _FOLD:
             keys, sums = _merged([(keys, sums), *waiting])
             waiting = []
     keys, sums = _merged([(keys, sums), *waiting])
+    left_out = f"{far} pixels over {_HALF * voxel:.4g} m from the first camera left out (--voxel {voxel:g})" * bool(far)
+    if not len(keys):
+        raise ValueError(f"{out}: the cloud is empty: {left_out or 'no pixel has a depth within the limits of sigma'}")
     weight, count = sums[:, :1], sums[:, 7:]
     position, colour, sigma = sums[:, 1:4] / weight, sums[:, 4:7] / weight, np.sqrt(count / weight)
-    kinds, columns = dict.fromkeys(("x", "y", "z", "sigma"), "<f4"), [position, sigma]
+    kinds, columns = dict.fromkeys(("x", "y", "z"), "<f8") | {"sigma": "<f4"}, [position, sigma]
     if coloured:
         kinds |= dict.fromkeys(("red", "green", "blue"), "|u1")
         columns.append(np.rint(colour))
     file = export_folder(out) / "cloud.ply"
     write_ply(file, vertex_table(kinds, *columns), "x y z sigma [m], world of the poses")
-    return f"{file}: {len(keys)} points"
+    return f"{file}: {len(keys)} points" + f"; {left_out}" * bool(far)
 
 
 def export_transforms(frames: Iterator[RunFrame], out: Path) -> str:
     """transforms.json with unchanged images, and depth and sigma at their pixels (16 bits, 0 = left out). Frames whose
-    image cannot be read are left out."""
+    image cannot be read are left out. More than a kilometre from the world's origin, positions are relative to an
+    offset, which ``applied_transform`` subtracts, because nerfstudio computes in float32. Raises ValueError: no image
+    can be read."""
     import cv2
 
-    folder, unit, listed = export_folder(out, "transforms"), None, []
+    folder, unit, listed = export_folder(out, "transforms"), None, list[dict[str, Any]]()
     for name in ("images", "depth", "sigma"):
         export_folder(out, "transforms", name)
+    world = np.eye(4)
     for frame in frames:
         if frame.image is None:
             continue
+        if not listed:
+            world[:3, 3] = -world_offset(frame.T_world_cam[:3, 3])
         seen = frame.at_image()
         unit = unit or fitting_unit(seen.depth)
         entry: dict[str, Any] = {"file_path": f"images/{frame.name}.png"}
@@ -169,8 +186,15 @@ def export_transforms(frames: Iterator[RunFrame], out: Path) -> str:
         fx, fy, cx, cy = pinhole_values(seen.intrinsics)
         height, width = seen.depth.shape
         camera = {"fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5, "w": width, "h": height}
-        listed.append(entry | camera | {"transform_matrix": CONVENTIONS["opengl"].convert(frame.T_world_cam)})
-    plain = {"camera_model": "OPENCV", "depth_unit_scale_factor": unit, "frames": listed}
+        listed.append(entry | camera | {"transform_matrix": CONVENTIONS["opengl"].convert(world @ frame.T_world_cam)})
+    if not listed:
+        raise ValueError(f"{out}: no image of the recording can be read")
+    plain = {
+        "camera_model": "OPENCV",
+        "depth_unit_scale_factor": unit,
+        "applied_transform": world[:3],
+        "frames": listed,
+    }
     write_json_atomic(folder / "transforms.json", plain)
     return f"{folder / 'transforms.json'}: {len(listed)} frames"
 
@@ -189,8 +213,11 @@ def points_of(u: NDArray[Any], v: NDArray[Any], depth: NDArray[Any], K: NDArray[
     return np.stack([(u - K[0, 2] - K[0, 1] * y) / K[0, 0] * z, y * z, z], axis=-1)
 
 
-def _voxels(frame: RunFrame, voxel: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """[P] the key of each pixel's voxel, and [P, 8] its weight w, w x, w y, w z, w r, w g, w b, and 1."""
+def _voxels(
+    frame: RunFrame, voxel: float, origin: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """[P, 3] the number of each pixel's voxel on the axes, from the voxel ``origin`` on, and [P, 8] its weight w, w x,
+    w y, w z, w r, w g, w b, and 1."""
     in_camera, (v, u) = frame.points()
     sigma, K, T = np.maximum(frame.sigma[v, u], _LEAST_SIGMA), frame.intrinsics, frame.T_world_cam
     points = in_camera @ T[:3, :3].T + T[:3, 3]
@@ -199,11 +226,15 @@ def _voxels(frame: RunFrame, voxel: float) -> tuple[NDArray[np.int64], NDArray[n
         seen = resample_nearest(frame.image, frame.image_intrinsics, K, (frame.depth.shape[0], frame.depth.shape[1]))
         colour = seen[v, u].astype(np.float64)
     weight = 1 / np.square(sigma.astype(np.float64))[:, None]
-    number = np.floor(points / voxel)
-    near = (np.abs(number) < _HALF).all(axis=1)
-    x, y, z = (number[near].astype(np.int64) + _HALF).T
-    sums = np.hstack([weight, weight * points, weight * colour, np.ones_like(weight)])[near]
-    return (x << 42) | (y << 21) | z, sums
+    return np.floor(points / voxel) - origin, np.hstack(
+        [weight, weight * points, weight * colour, np.ones_like(weight)]
+    )
+
+
+def _keys(number: NDArray[np.float64]) -> NDArray[np.int64]:
+    """[P] one integer for the three numbers of a voxel, each within +- ``_HALF``."""
+    x, y, z = (number.astype(np.int64) + _HALF).T
+    return (x << 42) | (y << 21) | z
 
 
 def _merged(

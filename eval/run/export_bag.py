@@ -13,10 +13,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.eval.run.export import RunFrame, export_folder
+from ufmstar_torch.eval.sequences.message_builder import MessageBuilder
 from ufmstar_torch.optional import optional
 
 WORLD, CAMERA = "world", "camera"
@@ -24,7 +23,6 @@ IMAGE, INFO, DEPTH, SIGMA = "/camera/image", "/camera/camera_info", "/camera/dep
 CLOUD, TF = "/camera/points", "/tf"
 _FIELDS = ("x", "y", "z", "variance")
 _LATEST = 2.0**31 - 1  # [s], of builtin_interfaces/Time
-_FLOAT32 = 7  # of sensor_msgs/PointField
 
 
 def export_bag(frames: Iterator[RunFrame], out: Path) -> str:
@@ -37,18 +35,18 @@ def export_bag(frames: Iterator[RunFrame], out: Path) -> str:
     folder = export_folder(out) / "bag"
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         raise ValueError(f"{folder} is no folder of an earlier export: move it away")
-    ros = _Messages(stores.get_typestore(stores.Stores.ROS2_HUMBLE))
+    store = stores.get_typestore(stores.Stores.ROS2_HUMBLE)
     with TemporaryDirectory(dir=folder.parent, prefix=".bag") as new:
-        count = _write_bag(rosbag2, ros, Path(new) / "bag", frames)
+        count = _write_bag(rosbag2, store, Path(new) / "bag", frames)
         if folder.exists():
             shutil.rmtree(folder)
         (Path(new) / "bag").rename(folder)
     return f"{folder}: {count} frames"
 
 
-def _write_bag(rosbag2: Any, ros: _Messages, folder: Path, frames: Iterator[RunFrame]) -> int:
+def _write_bag(rosbag2: Any, store: Any, folder: Path, frames: Iterator[RunFrame]) -> int:
     """Write the bag into a new folder. Returns the number of frames."""
-    count = 0
+    count, ros = 0, MessageBuilder(lambda kind, **values: store.types[kind](**values))
     with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
         connections: dict[str, Any] = {}
         for frame in frames:
@@ -60,72 +58,22 @@ def _write_bag(rosbag2: Any, ros: _Messages, folder: Path, frames: Iterator[RunF
             stamp = round(max(0.0, seconds) * 1e9)
             for topic, message in _of_frame(ros, stamp, frame).items():
                 if topic not in connections:
-                    connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=ros.store)
-                writer.write(connections[topic], stamp, ros.store.serialize_cdr(message, message.__msgtype__))
+                    connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=store)
+                writer.write(connections[topic], stamp, store.serialize_cdr(message, message.__msgtype__))
     return count
 
 
-def _of_frame(ros: _Messages, stamp: int, frame: RunFrame) -> dict[str, Any]:
+def _of_frame(ros: MessageBuilder, stamp: int, frame: RunFrame) -> dict[str, Any]:
     """A frame's messages by topic."""
     seen, (points, (v, u)) = frame.at_image(), frame.points()
-    image = {} if frame.image is None else {IMAGE: ros.image(stamp, frame.image, "rgb8")}
+    header = ros.header(stamp, CAMERA)
+    image = {} if frame.image is None else {IMAGE: ros.image(header, frame.image, "rgb8")}
+    variance = np.square(frame.sigma[v, u])
     return {
-        TF: ros.tf(stamp, frame.T_world_cam),
+        TF: ros.tf(ros.header(stamp, WORLD), CAMERA, frame.T_world_cam),
         **image,
-        INFO: ros.info(stamp, seen.intrinsics, seen.depth.shape),
-        DEPTH: ros.image(stamp, seen.depth, "32FC1"),
-        SIGMA: ros.image(stamp, seen.sigma, "32FC1"),
-        CLOUD: ros.cloud(stamp, np.column_stack([points, np.square(frame.sigma[v, u])])),
+        INFO: ros.info(header, seen.intrinsics, seen.depth.shape),
+        DEPTH: ros.image(header, seen.depth, "32FC1"),
+        SIGMA: ros.image(header, seen.sigma, "32FC1"),
+        CLOUD: ros.cloud(header, dict(zip(_FIELDS, (*points.T, variance), strict=True))),
     }
-
-
-class _Messages:
-    """Makes ROS 2's messages from arrays."""
-
-    def __init__(self, store: Any) -> None:
-        self.store = store
-
-    def _make(self, kind: str, /, **values: Any) -> Any:
-        return self.store.types[kind](**values)
-
-    def _header(self, stamp: int, frame: str = CAMERA) -> Any:
-        time = self._make("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
-        return self._make("std_msgs/msg/Header", stamp=time, frame_id=frame)
-
-    def image(self, stamp: int, values: NDArray[Any], encoding: str) -> Any:
-        data = np.ascontiguousarray(values).view(np.uint8).ravel()
-        size = {"height": len(values), "width": values.shape[1], "step": data.size // len(values)}
-        how = {"encoding": encoding, "is_bigendian": 0, "data": data}
-        return self._make("sensor_msgs/msg/Image", header=self._header(stamp), **size, **how)
-
-    def info(self, stamp: int, K: NDArray[np.float64], size: tuple[int, ...]) -> Any:
-        region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
-        roi = self._make("sensor_msgs/msg/RegionOfInterest", **region, do_rectify=False)
-        P = np.hstack([K, np.zeros((3, 1))]).ravel()
-        camera = {"d": np.zeros(5), "k": K.ravel().copy(), "r": np.eye(3).ravel(), "p": P, "roi": roi}
-        how = {"height": size[0], "width": size[1], "distortion_model": "plumb_bob", "binning_x": 0, "binning_y": 0}
-        return self._make("sensor_msgs/msg/CameraInfo", header=self._header(stamp), **camera, **how)
-
-    def cloud(self, stamp: int, points: NDArray[Any]) -> Any:
-        data = np.ascontiguousarray(points, dtype="<f4")
-        field, width = "sensor_msgs/msg/PointField", data.itemsize * len(_FIELDS)
-        how = {"datatype": _FLOAT32, "count": 1}
-        fields = [self._make(field, name=n, offset=data.itemsize * i, **how) for i, n in enumerate(_FIELDS)]
-        size = {"height": 1, "width": len(data), "point_step": width, "row_step": width * len(data)}
-        return self._make(
-            "sensor_msgs/msg/PointCloud2", header=self._header(stamp), fields=fields, is_bigendian=False, is_dense=True,
-            data=data.view(np.uint8).ravel(), **size,
-        )  # fmt: skip
-
-    def tf(self, stamp: int, T_world_cam: NDArray[np.float64]) -> Any:
-        quaternion = Rotation.from_matrix(T_world_cam[:3, :3]).as_quat()
-        position = dict(zip("xyz", T_world_cam[:3, 3].tolist(), strict=True))
-        motion = self._make(
-            "geometry_msgs/msg/Transform",
-            translation=self._make("geometry_msgs/msg/Vector3", **position),
-            rotation=self._make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", quaternion.tolist(), strict=True))),
-        )
-        how = {"header": self._header(stamp, WORLD), "child_frame_id": CAMERA, "transform": motion}
-        return self._make(
-            "tf2_msgs/msg/TFMessage", transforms=[self._make("geometry_msgs/msg/TransformStamped", **how)]
-        )

@@ -1,8 +1,8 @@
 """The mixture as files: splat attributes (binary PLY) for viewers, npz for programs.
 
 Positions are in the frame of the mixture (the first camera: x right, y down, z forward), or in the world with
-``T_world_first``. Lengths are in metres. PLY stores float32, as viewers expect: sub-millimetre up to kilometres from
-the origin.
+``T_world_first``. Lengths are in metres. PLY stores float32, as viewers expect, relative to an offset in its header if
+the world's origin is far away (``offset``).
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from torch import Tensor
 
 from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range
 from ufmstar_torch.eval.run.files import write_atomic, write_bytes_atomic
+from ufmstar_torch.eval.run.offset import offset_text, world_offset
 from ufmstar_torch.mixture import GaussianMixture
 
 # Lower limit of the standard deviation of an axis [m], because files store its logarithm and viewers divide by it.
@@ -28,7 +29,7 @@ SIGMA_FLOOR = 1e-6
 SH_DC = 0.5 / np.sqrt(np.pi)
 OPACITY = 0.8
 RADIUS = 2.0  # of the ellipsoids of a rerun recording
-_TYPES = {"<f4": "float", "<i4": "int", "|u1": "uchar"}
+_TYPES = {"<f4": "float", "<f8": "double", "<i4": "int", "|u1": "uchar"}
 
 
 def write_mixture_ply(path: str | Path, mixture: GaussianMixture, *, T_world_first: Tensor | None = None) -> int:
@@ -39,16 +40,24 @@ def write_mixture_ply(path: str | Path, mixture: GaussianMixture, *, T_world_fir
     Sigma = R diag(exp(scale))^2 R^T. The last ones are weight [px], disagreement [m^2] and views (n). The
     colour is sqrt(disagreement) in magma from 0 to its 99th percentile, which the header states; components seen from
     one view are grey. ``T_world_first`` [4, 4] or [1, 4, 4] maps the mixture's frame to the world; None = keep the
-    frame.
+    frame. More than a kilometre from the world's origin, the header has a comment "offset X Y Z m", to be added to
+    positions.
     """
     parts = Components(mixture, T_world_first)
     quaternion = Rotation.from_matrix(parts.axes).as_quat(canonical=True, scalar_first=True)
     opacity = np.full(len(parts.mean), np.log(OPACITY / (1 - OPACITY)))
-    columns = (parts.mean, parts.axes[:, :, 0], (parts.colour / 255 - 0.5) / SH_DC, opacity, np.log(parts.sigma))
+    offset = world_offset(parts.origin)
+    columns = (
+        parts.mean - offset,
+        parts.axes[:, :, 0],
+        (parts.colour / 255 - 0.5) / SH_DC,
+        opacity,
+        np.log(parts.sigma),
+    )
     names = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
     kinds = dict.fromkeys((*names.split(), "weight", "disagreement", "views"), "<f4")
     table = vertex_table(kinds, *columns, quaternion, parts.weight, parts.disagreement, parts.views)
-    write_ply(Path(path), table, parts.legend)
+    write_ply(Path(path), table, parts.legend, offset_text(offset))
     return len(table)
 
 
@@ -64,9 +73,9 @@ def write_mixture_npz(path: str | Path, mixture: GaussianMixture, *, T_world_fir
 
 class Components:
     """The occupied components of the first stream in float64, in the world or in the mixture's frame (without
-    ``T_world_first``): mean [K, 3] [m]; axes [K, 3, 3], rotations whose columns are the principal axes, shortest first;
-    sigma [K, 3], standard deviations along them [m]; weight, disagreement, views [K]; colour [K, 3] uint8 and its
-    legend."""
+    ``T_world_first``): mean [K, 3] [m]; origin [3], of the mixture's frame [m]; axes [K, 3, 3], rotations whose columns
+    are the principal axes, shortest first; sigma [K, 3], standard deviations along them [m]; weight, disagreement,
+    views [K]; colour [K, 3] uint8 and its legend."""
 
     def __init__(self, mixture: GaussianMixture, T_world_first: Tensor | None) -> None:
         used = mixture.valid[0]
@@ -79,6 +88,7 @@ class Components:
         T = np.eye(4) if T_world_first is None else T_world_first.detach().cpu().double().numpy().reshape(4, 4)
         R, t = T[:3, :3], T[:3, 3]
         self.mean: NDArray[np.float64] = mean @ R.T + t
+        self.origin: NDArray[np.float64] = t
         self.axes: NDArray[np.float64] = R @ axes
         self.sigma: NDArray[np.float64] = np.sqrt(np.maximum(variance, SIGMA_FLOOR**2))
         root = np.sqrt(np.maximum(self.disagreement, 0))
@@ -93,9 +103,10 @@ def vertex_table(kinds: Mapping[str, str], *columns: NDArray[Any]) -> NDArray[An
     return unstructured_to_structured(np.column_stack(columns), np.dtype(list(kinds.items())))
 
 
-def write_ply(path: Path, vertices: NDArray[Any], comment: str) -> None:
-    """Write the structured array ``vertices`` as binary little-endian PLY."""
-    lines = ["ply", "format binary_little_endian 1.0", f"comment {comment}", f"element vertex {len(vertices)}"]
+def write_ply(path: Path, vertices: NDArray[Any], *comments: str) -> None:
+    """Write the structured array ``vertices`` as binary little-endian PLY; empty comments are left out."""
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments if comment)]
+    lines.append(f"element vertex {len(vertices)}")
     lines += [f"property {_TYPES[vertices.dtype[name].str]} {name}" for name in vertices.dtype.names or ()]
     content = "\n".join([*lines, "end_header", ""]).encode("ascii")
     write_bytes_atomic(path, content + vertices.tobytes())

@@ -57,6 +57,7 @@ class RunJob:
     video: bool = True  # True to make preview.mp4
     sheet: bool = True  # True to make contact_sheet.png
     landmarks: str | LandmarkSource = CORNERS  # "corners", "dense" or a map of landmarks; for ``config.anchors``
+    sensor: str | None = None  # kind of the depth camera whose depth, completed by ``landmarks``, serves as anchors
     scale: NetworkScale | None = None  # of the poses, if it is the network's; anchors then correct shape alone
 
     @cached_property
@@ -78,7 +79,7 @@ class RunJob:
         estimator = Gaussians(self.config, torch.device("cpu"), recalibration=self.recalibration)
         anchors = None
         if self.config.anchors is not None:
-            anchors = AnchorSource(Setting(anchors=CORNERS), Tracks(landmark_source(self.landmarks)))
+            anchors = AnchorSource(Setting(anchors=CORNERS), Tracks(landmark_source(self.landmarks)), self.sensor)
         row = RowRunner(UFM, self.source, estimator, every=self.every, anchors=anchors, skips_faults=True)
         if checkpoint.state:
             row.load_state(checkpoint.state)
@@ -94,7 +95,8 @@ class RunJob:
     def source_identity(self) -> dict[str, Any]:
         """Plain values on which depth and anchors depend."""
         anchors = {} if self.config.anchors is None else landmark_source(self.landmarks).identity
-        return {**self.source.identity, **anchors}
+        sensor = {} if self.sensor is None else {"sensor": self.sensor}
+        return {**self.source.identity, **anchors, **sensor}
 
     def identity(self) -> dict[str, Any]:
         """Plain values on which the results depend. A run is only continued with equal values."""

@@ -25,6 +25,7 @@ from ufmstar_torch.array_files import read_npz_whole
 from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range
 from ufmstar_torch.eval.run.export import RunFrame, export_folder, points_of
 from ufmstar_torch.eval.run.gaussians import RADIUS, Components
+from ufmstar_torch.eval.run.offset import offset_text, world_offset
 from ufmstar_torch.eval.run.writers import fitting_unit
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.optional import optional
@@ -47,11 +48,13 @@ def rerun() -> Any:
 
 
 class RerunLog:
-    """Logs frames to a ``rerun.RecordingStream``. The first frame sets the scales of depth and sigma (``scale``)."""
+    """Logs frames to a ``rerun.RecordingStream``. The first frame sets the scales of depth and sigma (``scale``), and
+    the ``offset`` [3] that is subtracted from positions [m], which rerun stores in float32."""
 
     def __init__(self, stream: Any) -> None:
         self._rr, self._stream = rerun(), stream
         self.scale: ColourScale | None = None
+        self.offset: NDArray[np.float64] = np.zeros(3)
         self._unit: float | None = None
         stream.log(WORLD, self._rr.ViewCoordinates.RDF, static=True)
 
@@ -60,11 +63,14 @@ class RerunLog:
         rr, log, T = self._rr, self._stream.log, frame.T_world_cam
         if self.scale is None:
             self.scale = ColourScale(*robust_range([frame.sigma], from_zero=True), ERROR_MAP)
+            self.offset = world_offset(T[:3, 3])
+            if text := offset_text(self.offset):
+                log("offset", rr.TextDocument(text), static=True)
         self._unit = self._unit or fitting_unit(frame.depth)
         self._stream.set_time("frame", sequence=frame.index)
         if frame.timestamp is not None:
             self._stream.set_time("time", duration=frame.timestamp)
-        log(CAMERA, rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+        log(CAMERA, rr.Transform3D(translation=T[:3, 3] - self.offset, mat3x3=T[:3, :3]))
         if frame.image is not None:
             if frame.image_intrinsics is not None:
                 size = [frame.image.shape[1], frame.image.shape[0]]
@@ -156,22 +162,22 @@ def export_rerun(frames: Iterator[RunFrame], out: Path) -> str:
         with rr.RecordingStream("ufmstar") as stream:
             stream.save(Path(new) / file.name, default_blueprint=blueprint())
             log = RerunLog(stream)
-            _log_gaussians(rr, stream, out / "mixture.npz")
             for frame in frames:
                 count += 1
                 log.add(frame)
+            _log_gaussians(rr, stream, out / "mixture.npz", log.offset)
             stream.flush()
         (Path(new) / file.name).replace(file)
     return f"{file}: {count} frames; sigma is coloured from 0 to {log.scale.high if log.scale else 0:.3g} m"
 
 
-def _log_gaussians(rr: Any, stream: Any, file: Path) -> None:
+def _log_gaussians(rr: Any, stream: Any, file: Path, offset: NDArray[np.float64]) -> None:
     if not file.is_file():
         return
     stored = {name: torch.from_numpy(values) for name, values in read_npz_whole(file).items()}
     T = stored.pop("T_world_first")[:1]
     parts = Components(GaussianMixture(**stored), T)
     quaternions = Rotation.from_matrix(parts.axes).as_quat()
-    shape = {"centers": parts.mean, "half_sizes": RADIUS * parts.sigma, "quaternions": quaternions}
+    shape = {"centers": parts.mean - offset, "half_sizes": RADIUS * parts.sigma, "quaternions": quaternions}
     solid = rr.components.FillMode.Solid
     stream.log(f"{WORLD}/gaussians", rr.Ellipsoids3D(**shape, colors=parts.colour, fill_mode=solid), static=True)

@@ -37,14 +37,17 @@ def require_metric(sequence: FrameSequence) -> None:
         raise ValueError(_NO_SCALE.format(name=sequence.name))
 
 
-def network_scale(sequence: FrameSequence, source: DepthSource, indices: range) -> NetworkScale:
-    """The scale of a COLMAP model's poses by the depths of a source, on at most 24 of the frames ``indices``. Raises
-    ValueError: the poses are metric or not a COLMAP model's, or fewer than three frames have ten landmarks each."""
+def network_scale(
+    sequence: FrameSequence, source: DepthSource, indices: range, model_index: int | None = None
+) -> NetworkScale:
+    """The scale of a COLMAP model's poses by the depths of a source, on at most 24 of the frames ``indices``;
+    ``model_index`` is the option with which the sequence was opened. Raises ValueError: the poses are metric or not a
+    COLMAP model's, or fewer than three frames have ten landmarks each."""
     if sequence.metric or sequence.folder is None or sequence.layout != "colmap":
         raise ValueError(
             "--scale-from network is for COLMAP models whose scale is not known, which have landmarks to compare with"
         )
-    landmarks = read_landmarks(sequence.folder)
+    landmarks = read_landmarks(sequence.folder, model_index)
     medians = []
     spaced = np.linspace(0, len(indices) - 1, min(_MOST_FRAMES, len(indices))).round().astype(int)
     for turn, number in enumerate(np.unique(spaced).tolist()):

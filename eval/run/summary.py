@@ -38,9 +38,10 @@ def write_summary(
     done = [record for record in records if record["state"] == "done"]
     figures = job.metrics(checkpoint).figures()
     result = UFM if job.config.posterior is None else POSTERIOR
+    no_truth = "no ground truth" if job.sensor is None else "the recording's depth serves as anchors"
     alone_reason = "the depth comes without a variance of its own"
     if any(record["mean_network_sigma"] is not None for record in done):
-        alone_reason = "no variance where there is ground truth" if UFM in figures else "no ground truth"
+        alone_reason = "no variance where there is ground truth" if UFM in figures else no_truth
     summary = {
         "program": RUN.program,
         "state": state,
@@ -53,7 +54,7 @@ def write_summary(
         "prediction": {key: done[-1][key] for key in ("size", "intrinsics")} if done else None,
         "result": result,  # of which depth and sigma are, in the files and below
         "metrics": figures.get(result),
-        "metrics_reason": None if UFM in figures else "no ground truth",
+        "metrics_reason": None if UFM in figures else no_truth,
         "network_alone": figures.get(ALONE),
         "network_alone_reason": None if ALONE in figures else alone_reason,
         **_posterior(done, figures.get(UFM)),

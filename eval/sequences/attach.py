@@ -95,7 +95,7 @@ def frame_of_image(
 ) -> Entry | Skipped:
     """A frame of an image file; skipped if that is missing."""
     if image is None or not image.is_file():
-        return Skipped(name, "missing image file")
+        return Skipped(name, "missing image file", image)
     return Entry(name, T_world_cam, partial(read_color, image), load_depth, timestamp)
 
 

@@ -7,10 +7,12 @@ later. Messages have ROS's standard types, so no definition in the file is compi
 
 from __future__ import annotations
 
+import re
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from heapq import merge
 from pathlib import Path
 from typing import Any, NamedTuple
 from weakref import finalize
@@ -21,6 +23,7 @@ from ufmstar_torch.eval.sequences import ros_messages as ros
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import UNKNOWN
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Skipped
+from ufmstar_torch.eval.sequences.images import is_sidecar, natural_key
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import associate
@@ -28,9 +31,11 @@ from ufmstar_torch.optional import optional
 from ufmstar_torch.stream_warnings import LOGGER
 from ufmstar_torch.trajectory import interpolate_pose
 
-LOOKED_FOR = "a .bag, .db3 or .mcap file, or a folder that holds one"
+LOOKED_FOR = "a .bag, .db3 or .mcap file, or a folder that holds one, or the numbered files of one (walk_0.db3, ...)"
 _SUFFIXES = (".bag", ".db3", ".mcap")
 _METADATA = "metadata.yaml"
+# Name of one of the files that a recorder starts after a size or time; ROS 1 also writes the time at which it started.
+_PART = re.compile(r"(.*?)(?:_?\d{4}(?:-\d\d){5})?_(\d+)")
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _INFO, _TF = "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
 _TF_FIELDS = "geometry_msgs/TransformStamped[] transforms"
@@ -39,6 +44,8 @@ _POSES = (_ODOMETRY, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWit
 _TYPES = (_IMAGE, _COMPRESSED, _INFO, _TF, *_POSES)
 _OLD_NAMES = {"tf/msg/tfMessage": _TF}
 _NANOSECOND = 1e-9
+_TRANSPORTS = ("compressed", "compressedDepth")  # last parts of the names of image_transport's topics
+_SCALE_SAMPLES = 5  # images of a bag that determine the range of their 16 bits
 # Errors of rosbags for damaged files, besides its own classes.
 _BROKEN = (
     *(OSError, EOFError, LookupError, AssertionError, ArithmeticError, AttributeError, RuntimeError, TypeError),
@@ -60,27 +67,34 @@ class MessageKey(NamedTuple):
 
 class Bag:
     """A bag that is opened at the first read, separately in each worker process. Raises FrameError: it cannot be
-    read."""
+    read.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._reader: Any = None
+    Args:
+        path: of the bag, for messages.
+        files: of one recording, or its folder with metadata; None = ``path``.
+    """
+
+    def __init__(self, path: Path, files: Sequence[Path] | None = None) -> None:
+        self.path, self._files = path, tuple(files or [path])
+        self._readers: list[Any] = []
         self._store: Any = None
 
     @property
     def topics(self) -> dict[str, str]:
         """The types of the topics with messages, by name."""
-        with self._opened() as reader:
-            return {c.topic: _OLD_NAMES.get(c.msgtype, c.msgtype) for c in reader.connections if c.msgcount}
+        with self._opened() as readers:
+            connections = [c for reader in readers for c in reader.connections if c.msgcount]
+            return {c.topic: _OLD_NAMES.get(c.msgtype, c.msgtype) for c in connections}
 
     def messages(self, topics: Iterable[str], *when: int) -> Iterator[tuple[MessageKey, Any]]:
         """The messages of topics in the order of reception, those in [start, stop) [ns] if ``when`` has both."""
         types, wanted = self.topics, set(topics)
         last: dict[str, tuple[int, int]] = {}
-        with self._opened() as reader:
-            decode = self._store.deserialize_ros1 if self.path.suffix == ".bag" else self._store.deserialize_cdr
-            chosen = [c for c in reader.connections if c.topic in wanted]
-            for connection, received, raw in reader.messages(chosen, *when) if chosen else ():
+        with self._opened() as readers:
+            decode = self._store.deserialize_ros1 if self._ros1 else self._store.deserialize_cdr
+            chosen = [[c for c in reader.connections if c.topic in wanted] for reader in readers]
+            parts = [reader.messages(some, *when) for reader, some in zip(readers, chosen, strict=True) if some]
+            for connection, received, raw in merge(*parts, key=lambda message: message[1]):
                 before, number = last.get(connection.topic, (-1, 0))
                 number = number + 1 if before == received else 0
                 last[connection.topic] = (received, number)
@@ -93,14 +107,18 @@ class Bag:
                 return message
         raise FrameError(self.path, f"the message of {key.topic} at {key.received} ns is missing")
 
+    @property
+    def _ros1(self) -> bool:
+        return self._files[0].suffix == ".bag"
+
     @contextmanager
-    def _opened(self) -> Iterator[Any]:
+    def _opened(self) -> Iterator[list[Any]]:
         reader_errors = [_module(f"rosbags.{name}").ReaderError for name in ("rosbag1", "rosbag2")]
         zstd = _module("rosbags.rosbag2.storage_mcap").zstd
         try:
-            if self._reader is None:
+            if not self._readers:
                 self._open()
-            yield self._reader
+            yield self._readers
         except (
             *reader_errors,
             _module("rosbags.serde").SerdeError,
@@ -112,17 +130,18 @@ class Bag:
             raise FrameError(self.path, f"the bag cannot be read: {reason}") from error
 
     def _open(self) -> None:
-        stores, ros1 = _module("rosbags.typesys"), self.path.suffix == ".bag"
-        reader = _module("rosbags.rosbag1" if ros1 else "rosbags.rosbag2").Reader(self.path)
-        reader.open()
-        self._store = stores.get_typestore(stores.Stores.ROS1_NOETIC if ros1 else stores.Stores.ROS2_HUMBLE)
-        if ros1:  # ROS 1's types in rosbags have no tf
+        stores = _module("rosbags.typesys")
+        readers = [_module("rosbags.rosbag1" if self._ros1 else "rosbags.rosbag2").Reader(file) for file in self._files]
+        for reader in readers:
+            reader.open()
+            finalize(self, reader.close)
+        self._store = stores.get_typestore(stores.Stores.ROS1_NOETIC if self._ros1 else stores.Stores.ROS2_HUMBLE)
+        if self._ros1:  # ROS 1's types in rosbags have no tf
             self._store.register(stores.get_types_from_msg(_TF_FIELDS, _TF))
-        self._reader = reader
-        finalize(self, reader.close)
+        self._readers = readers
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"path": self.path, "_reader": None, "_store": None}
+        return {"path": self.path, "_files": self._files, "_readers": [], "_store": None}
 
 
 class _Topics(NamedTuple):
@@ -137,30 +156,39 @@ class _Topics(NamedTuple):
 
 def detect(path: Path) -> bool:
     """True if the path is a bag, or a folder with one."""
-    return _bag_path(path) is not None
+    return bool(_bag_files(path))
 
 
-def _bag_path(path: Path) -> Path | None:
+def _bag_files(path: Path) -> list[Path]:
+    """The files of one recording in the order of their numbers, or its folder with metadata; [] for other paths."""
     if path.is_file():
-        return path if path.suffix in _SUFFIXES else None
-    files = [p for p in path.glob("*") if any(end in p.suffixes for end in _SUFFIXES)]
+        return [path] if path.suffix in _SUFFIXES else []
+    files = [p for p in path.glob("*") if any(end in p.suffixes for end in _SUFFIXES) and not is_sidecar(p)]
     if files and (path / _METADATA).is_file():
-        return path
-    return files[0] if len(files) == 1 and files[0].suffix in _SUFFIXES else None
+        return [path]
+    if len(files) > 1:
+        parts = [_PART.fullmatch(file.stem) for file in files]
+        if (
+            not all(parts)
+            or len({(part and part[1], file.suffix) for part, file in zip(parts, files, strict=True)}) > 1
+        ):
+            return []
+    return sorted(files, key=natural_key) if files and files[0].suffix in _SUFFIXES else []
 
 
 def read(path: Path, options: Options) -> FrameSequence:
     """Open the images of one camera, named by their number. Times are the headers', or the times of reception if those
     are 0. ``options.topics`` chooses among several. Raises ModuleNotFoundError: rosbags is not installed; ValueError: a
     damaged bag, topics that are missing or not unique (listed), or a camera without calibration."""
-    file = _bag_path(path)
-    assert file is not None
-    bag = Bag(file)
+    files = _bag_files(path)
+    file = files[0] if len(files) == 1 else path
+    bag = Bag(file, files)
     try:
         topics = _choose(bag, options)
         content = _Content(bag, topics)
     except FrameError as error:
         raise ValueError(error) from error
+    full = _full_scale(bag, [key for _, key in content.images])
     entries: list[Entry | Skipped] = []
     stamps, depth_stamps = (np.array([time for time, _ in keyed]) for keyed in (content.images, content.depths))
     paired = associate(stamps, depth_stamps, options.max_time_difference)
@@ -173,14 +201,33 @@ def read(path: Path, options: Options) -> FrameSequence:
         if T is None:
             entries.append(Skipped(name, f"no pose within {options.max_pose_gap:g} s around the image"))
         else:
-            entries.append(Entry(name, T, partial(_decoded, ros.colour, bag, key), load_depth, time))
+            entries.append(Entry(name, T, partial(_decoded, ros.colour, bag, key, full), load_depth, time))
     size = None
     if content.lens is None:
         if not content.images:
             raise ValueError(f"{file} holds no image")
-        height, width = _decoded(ros.colour, bag, content.images[0][1]).shape[:2]
+        height, width = _decoded(ros.colour, bag, content.images[0][1], full).shape[:2]
         size = height, width
     return assemble("bag", path, entries, content.lens, options, name=path.resolve().stem, size=size)
+
+
+def _full_scale(bag: Bag, keys: Sequence[MessageKey]) -> int | None:
+    """The largest value that the camera stores, by some of its images; None for images of 8 bits."""
+    chosen = np.unique(np.linspace(0, len(keys) - 1, min(_SCALE_SAMPLES, len(keys))).astype(int)).tolist()
+    scales = []
+    for number in chosen:
+        try:
+            scale = ros.full_scale_of(bag.read(keys[number]), bag.path)
+        except FrameError:  # counted when its turn comes
+            continue
+        if scale is None:
+            return None
+        scales.append(scale)
+    if not scales:
+        return None
+    topic, full = keys[0].topic, max(scales)
+    LOGGER.warning("%s: %s: images of 16 bits, read as 0 to %d and scaled to bytes", bag.path, topic, full)
+    return full
 
 
 def _decoded(decode: Callable[..., np.ndarray], bag: Bag, key: MessageKey, *how: Any) -> np.ndarray:
@@ -203,7 +250,8 @@ def _choose(bag: Bag, options: Options) -> _Topics:
         (depths if ros.is_depth(first) else images)[name] = ros.frame_name(first.header.frame_id)
 
     def one(kind: str, candidates: Iterable[str]) -> str:
-        chosen = [name for name in candidates if name in named] or list(candidates)
+        listed = list(candidates)
+        chosen = [name for name in listed if name in named] or _without_transports(listed)
         if len(chosen) > 1:
             raise ValueError(f"{bag.path}: {kind} may be {', '.join(sorted(chosen))}: name one with --topics")
         return chosen[0] if chosen else ""
@@ -241,6 +289,20 @@ def _choose(bag: Bag, options: Options) -> _Topics:
         if not pose:
             raise ValueError(f"{bag.path} has no poses: pass trajectory")
     return _Topics(image, info, depth, pose, ros.frame_name(named.get(pose, "")))
+
+
+def _without_transports(topics: list[str]) -> list[str]:
+    """The topics without those with the same images as another one: X/compressed and X/compressedDepth beside X, and
+    X/compressed beside X/compressedDepth."""
+    pairs = [(name, *name.rpartition("/")[::2]) for name in topics]
+    return [
+        name
+        for name, base, transport in pairs
+        if not (
+            transport in _TRANSPORTS
+            and (base in topics or (transport == _TRANSPORTS[0] and f"{base}/{_TRANSPORTS[1]}" in topics))
+        )
+    ]
 
 
 def _listing(types: dict[str, str]) -> str:

@@ -1,9 +1,10 @@
 """COLMAP: ``sparse/0/{cameras,images,points3D}.{bin,txt}`` next to ``images/``, of any number of cameras.
 
-Poses are world-to-camera in an arbitrary unit; they are in metres only if ``poses.json`` of ``ufmstar poses`` has a
-scale, or with ``pose_scale``. COLMAP's first pixel has its centre at (0.5, 0.5). Depth maps may be in ``depth/``. This
-module reads the files, because pycolmap accepts truncated cameras and does not return from truncated images.
-https://colmap.github.io/format.html
+If images were divided into several models, ``sparse/0``, ``sparse/1``, ..., the one with most images is read, and the
+others are named; each has its own world and unit. Poses are world-to-camera in an arbitrary unit; they are in metres
+only if ``poses.json`` of ``ufmstar poses`` has a scale, or with ``pose_scale``. COLMAP's first pixel has its centre at
+(0.5, 0.5). Depth maps may be in ``depth/``. This module reads the files, because pycolmap accepts truncated cameras and
+does not return from truncated images. https://colmap.github.io/format.html
 """
 
 from __future__ import annotations
@@ -22,13 +23,14 @@ from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_image, pair_depth
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.generic import depth_folder, listed_times
-from ufmstar_torch.eval.sequences.images import depth_loader, natural_key
+from ufmstar_torch.eval.sequences.images import depth_loader, listed_path, natural_key
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.poses import numbered_lines, poses_from_columns
+from ufmstar_torch.stream_warnings import LOGGER
 
-LOOKED_FOR = "cameras and images (.bin or .txt) in sparse/0/, sparse/ or the folder itself"
-SCALE_FILE, MODEL = "poses.json", "sparse/0"
+LOOKED_FOR = "cameras and images (.bin or .txt) in sparse/0/ (or another number), sparse/ or the folder itself"
+SCALE_FILE, MODELS = "poses.json", "sparse"
 # By COLMAP's number: name, number of focal lengths, and number of distortion coefficients (None = no model of OpenCV);
 # the other parameters are the principal point.
 _MODELS: tuple[tuple[str, int, int | None], ...] = (
@@ -50,15 +52,15 @@ class _View(NamedTuple):
 
 def detect(path: Path) -> bool:
     """True if the folder contains a model."""
-    return _model_folder(path) is not None
+    return bool(_model_folders(path))
 
 
 def read(path: Path, options: Options) -> FrameSequence:
     """Open a model's images in the order of their names. ``images`` and ``truth`` name other folders than ``images/``
-    and ``depth/``; times come from ``rgb.txt`` next to the images. Raises ValueError: a file is truncated or malformed
-    (named), a camera model that is not OpenCV's, or no usable frame."""
-    model = _model_folder(path)
-    assert model is not None
+    and ``depth/``; times come from ``rgb.txt`` next to the images; ``model_index`` chooses among several models. Raises
+    ValueError: a file is truncated or malformed (named), a camera model that is not OpenCV's, no model of that index,
+    or no usable frame."""
+    model = _chosen_model(path, options.model_index)
     root = next((f for f in (path, *model.parents[:2]) if (f / "images").is_dir()), path)
     folder = resolve(path, options.images) if options.images is not None else root / "images"
     cameras = _cameras(_file(model, "cameras"))
@@ -77,16 +79,14 @@ def read(path: Path, options: Options) -> FrameSequence:
         load_depth = depth_loader(depth_of.get(name), options.truth_scale)
         time = None if times is None else float(times[number])
         frames.append(frame_of_image(name, folder / view.name, load_depth, _pose(view, model), time))
-    metric = _metric(root) and model == root / MODEL
+    metric = _metric(root) and model == root / MODELS / "0"
     return assemble("colmap", path, frames, lenses, options, metric=metric)
 
 
-def read_landmarks(path: Path) -> dict[str, np.ndarray]:
-    """By frame name, the triangulated points [N, 3] that the frame sees, in the axes and unit of the model's poses.
-    Raises ValueError: the folder has no model, or a file is truncated or malformed."""
-    model = _model_folder(path)
-    if model is None:
-        raise ValueError(f"{path} holds no COLMAP model: looked for {LOOKED_FOR}")
+def read_landmarks(path: Path, model_index: int | None = None) -> dict[str, np.ndarray]:
+    """By frame name, the triangulated points [N, 3] that the frame sees, in the axes and unit of the poses of the model
+    that :func:`read` reads. Raises ValueError: the folder has no such model, or a file is truncated or malformed."""
+    model = _chosen_model(path, model_index)
     points = _points(_file(model, "points3D"))
     return {
         _frame_name(view): np.array([points[key] for key in view.points.tolist() if key in points]).reshape(-1, 3)
@@ -94,11 +94,51 @@ def read_landmarks(path: Path) -> dict[str, np.ndarray]:
     }
 
 
-def _model_folder(path: Path) -> Path | None:
-    for folder in (path / MODEL, path / "sparse", path):
-        if all(any((folder / f"{part}{end}").is_file() for end in (".bin", ".txt")) for part in ("cameras", "images")):
-            return folder
-    return None
+def _model_folders(path: Path) -> list[Path]:
+    """The folders with a model: the numbered ones in ``sparse/`` in the order of their numbers, or else ``sparse/``, or
+    else the path itself."""
+    below = path / MODELS
+    numbered = sorted((f for f in below.glob("*") if f.name.isdecimal()), key=natural_key) if below.is_dir() else []
+    return next(
+        (found for found in (list(filter(_is_model, group)) for group in (numbered, [below], [path])) if found), []
+    )
+
+
+def _is_model(folder: Path) -> bool:
+    files = ([folder / f"{part}{end}" for end in (".bin", ".txt")] for part in ("cameras", "images"))
+    return all(any(file.is_file() for file in pair) for pair in files)
+
+
+def _chosen_model(path: Path, index: int | None) -> Path:
+    """The folder of the model ``index``, or of the model with most images (the first of equal ones), which is logged if
+    there are several. Raises ValueError: there is no model, or none with that index."""
+    models = _model_folders(path)
+    if index is not None:
+        chosen = next((model for model in models if model.name == str(index)), None)
+        if chosen is None:
+            listed = ", ".join(model.name for model in models if model.name.isdecimal()) or "one model without a number"
+            raise ValueError(f"model_index must be one of the models of {path} ({listed}), got {index}")
+        return chosen
+    if not models:
+        raise ValueError(f"{path} holds no COLMAP model: looked for {LOOKED_FOR}")
+    if len(models) == 1:
+        return models[0]
+    counts = {model: _image_count(_file(model, "images")) for model in models}
+    largest = max(models, key=lambda model: counts[model])
+    others = ", ".join(f"{model.name} with {counts[model]}" for model in models if model != largest)
+    LOGGER.warning(
+        "%s: the model %s with %d images is read, not %s; --model-index chooses another one",
+        path, largest.name, counts[largest], others,
+    )  # fmt: skip
+    return largest
+
+
+def _image_count(file: Path) -> int:
+    """Number of images that a model's file states."""
+    if file.suffix == ".bin":
+        with file.open("rb") as opened:
+            return int.from_bytes(opened.read(8), "little")
+    return (sum(1 for _ in _lines(file)) + 1) // 2  # two lines an image; the last one's line of points may be missing
 
 
 def _file(model: Path, part: str) -> Path:
@@ -177,7 +217,7 @@ def _views(file: Path) -> Iterator[_View]:
     take = _values_of(file)
     for _ in range(take("Q")[0]):
         _, *pose, camera = take("I7dI")
-        name = b"".join(iter(lambda: take("c")[0], b"\0")).decode()
+        name = listed_path(b"".join(iter(lambda: take("c")[0], b"\0")).decode()).as_posix()
         stored = take(f"{24 * take('Q')[0]}s")[0]
         points = np.frombuffer(stored, "<u8")[2::3]  # x, y and the point's id
         yield _View(name, camera, tuple(pose), points[points != _NO_POINT].astype(np.int64))
@@ -196,7 +236,8 @@ def _views_of_text(file: Path) -> Iterator[_View]:
         if len(points) % 3:
             raise ValueError(f"{file}:{below}: expected 'X Y POINT' for every point, got {len(points)} numbers")
         keys = np.array(_numbers(points[2::3], file, below, whole=len(points) // 3))
-        yield _View(" ".join(words[9:]), int(camera), tuple(pose), keys[keys >= 0].astype(np.int64))
+        name = listed_path(" ".join(words[9:])).as_posix()
+        yield _View(name, int(camera), tuple(pose), keys[keys >= 0].astype(np.int64))
 
 
 def _points(file: Path) -> dict[int, np.ndarray]:

@@ -68,6 +68,7 @@ class Skipped:
 
     name: str
     reason: str
+    path: Path | None = None  # of the file that is missing or unusable, if that is the reason
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,6 +186,8 @@ def make_sequence(
     if not entries:
         reasons = Counter(frame.reason for frame in skipped).most_common(3)
         summary = "; ".join(f"{count} x {reason}" for reason, count in reasons) or "no frame was found"
+        if (path := next((frame.path for frame in skipped if frame.path is not None), None)) is not None:
+            summary += f"; first {path}"
         raise ValueError(f"{layout} sequence {name!r} has no usable frame: {summary}")
     if repeated := [frame_name for frame_name, count in Counter(names).items() if count > 1]:
         raise ValueError(f"{layout} sequence {name!r}: frame names must be unique, {repeated[:3]} occur twice")

@@ -2,7 +2,7 @@
 
 The reader searches the sequence's folder (options override each): images in one of ``images image rgb color frames`` or
 in the folder itself, or one video file; a trajectory ``poses.txt trajectory.txt groundtruth.txt ...``; intrinsics
-``K.txt intrinsics.txt ...``; depth maps in ``depth``.
+``K.txt intrinsics.txt ...``, or KITTI's ``calib.txt``; depth maps in ``depth``.
 """
 
 from __future__ import annotations
@@ -32,16 +32,17 @@ from ufmstar_torch.eval.sequences.tum import SCALE as TUM_SCALE
 from ufmstar_torch.eval.sequences.tum import read_file_list
 from ufmstar_torch.eval.sequences.video import VIDEO_SUFFIXES, Video
 
-IMAGES = ("images", "image", "rgb", "color", "frames")
+IMAGES = ("images", "image", "rgb", "color", "frames", *(f"image_{camera}" for camera in range(4)))  # KITTI's last
 DEPTHS = ("depth", "depths")
 TRAJECTORIES = (
     *("poses.txt", "pose.txt", "trajectory.txt", "traj.txt", "groundtruth.txt"),
     *("CameraTrajectory.txt", "KeyFrameTrajectory.txt", "cam0_to_world.txt"),
 )
-INTRINSICS = ("K.txt", "intrinsics.txt", "intrinsic.txt", "camera.txt")
+_KITTI = "calib.txt"  # of KITTI's odometry benchmark; read if there is none of the others
+INTRINSICS = ("K.txt", "intrinsics.txt", "intrinsic.txt", "camera.txt", _KITTI)
 LOOKED_FOR = (
-    f"images ({', '.join(IMAGES)}/ or a video), a trajectory ({', '.join(TRAJECTORIES)}; `ufmstar poses` computes one "
-    f"from images alone), {INTRINSICS[0]}"
+    f"images ({', '.join(IMAGES)}/ or a video), a trajectory ({', '.join(TRAJECTORIES)}; "
+    f"`ufmstar poses` computes one from images alone), {INTRINSICS[0]}"
 )
 
 
@@ -101,7 +102,9 @@ def _lens(root: Path, options: Options, size: Size) -> Lens | None:
     """Read the camera from a file next to the images; None if the options have intrinsics."""
     if options.intrinsics is not None:
         return None
-    return Lens.of(read_intrinsics(_named_or_found(root, None, INTRINSICS, "intrinsics")), size)
+    others = tuple(name for name in INTRINSICS if name != _KITTI)
+    names = others if any((root / name).is_file() for name in others) else INTRINSICS
+    return Lens.of(read_intrinsics(_named_or_found(root, None, names, "intrinsics")), size)
 
 
 def open_images(path: Path, options: Options) -> tuple[list[Entry], Size]:

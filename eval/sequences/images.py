@@ -2,7 +2,8 @@
 
 PNGs of 8-bit RGB are decoded by kornia_rs, in a third of Pillow's time; all other files by Pillow, which raises errors
 for truncated files, while OpenCV returns partial images. An EXIF orientation is not applied, because intrinsics are
-those of the stored pixels.
+those of the stored pixels. 16-bit grey is scaled to bytes by the range of its folder's images, transparent pixels
+become black; both are logged once per folder.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from contextlib import redirect_stdout, suppress
-from functools import partial
+from functools import lru_cache, partial
 from io import BytesIO, StringIO
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from PIL import Image
 from ufmstar_torch.array_files import read_npy, read_npz
 from ufmstar_torch.eval.sequences.frame import Entry, Frame, FrameError, Loader, Size, Skipped
 from ufmstar_torch.optional import optional
+from ufmstar_torch.stream_warnings import LOGGER
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 DEPTH_SUFFIXES = (".png", ".exr", ".npy", ".npz", ".tif", ".tiff")
@@ -31,22 +33,45 @@ SCALE_KEY = "depth_scale"
 # Bit depth, colour type, compression, filter and interlacing, from a PNG's header.
 _SIGNATURE, _RGB = b"\x89PNG\r\n\x1a\n", bytes((8, 2, 0, 0, 0))
 _MILLIMETRE = 1e-3
+# Largest values of grey images of 8, 10, 12, 14 and 16 bits, which are all stored in 16 bits.
+_FULL_SCALES = (255, 1023, 4095, 16383, 65535)
+_SCALE_SAMPLES = 8  # images of a folder that determine its scale
+# macOS writes a file ._NAME beside NAME on disks that are not its own.
+_SIDECAR = "._"
 # Names of a depth channel of an EXR file, best first; Blender prefixes its layer ("ViewLayer.Depth.Z").
 _DEPTH_NAMES = ("Z", "depth", "V", "Y", "R")
 
 
 def read_color(path: str | Path, content: bytes | None = None) -> np.ndarray:
-    """An 8-bit image of a file, or of its ``content``, as [H, W, 3] uint8 RGB (grey is repeated, alpha dropped). Raises
-    FrameError: missing, truncated, corrupt, or not an 8-bit image."""
+    """An image of a file, or of its ``content``, as [H, W, 3] uint8 RGB; grey is repeated. 16-bit grey is scaled by the
+    range of the images in its folder (without a folder: of the image), and transparent colours are blended with black.
+    Raises FrameError: missing, truncated, corrupt, or an image of floating-point or negative numbers."""
     if content is None and (plain := _plain_png(Path(path))) is not None:
         return plain
     try:
         with Image.open(path if content is None else BytesIO(content)) as image:
             if image.mode[0] in "IF":  # Pillow would silently clip these at 255
-                raise FrameError(path, f"expected an 8-bit colour or grey image, got mode {image.mode}")
+                values = _grey_values(path, image)
+                full = (
+                    full_scale(values) if content is not None else _folder_scale(Path(path).parent, Path(path).suffix)
+                )
+                return np.repeat(grey_bytes(values, full)[..., None], 3, axis=2)
+            if image.has_transparency_data:
+                return _opaque(np.array(image.convert("RGBA")), Path(path).parent)
             return np.array(image.convert("RGB"))
     except _BROKEN_IMAGE as error:
         raise FrameError(path, f"cannot be decoded: {error}") from error
+
+
+def full_scale(values: np.ndarray) -> int:
+    """The largest value that a camera stores, by the bits of its largest value here: 8, 10, 12, 14 or 16."""
+    highest = int(values.max(initial=0))
+    return next((scale for scale in _FULL_SCALES if highest <= scale), _FULL_SCALES[-1])
+
+
+def grey_bytes(values: np.ndarray, full: int) -> np.ndarray:
+    """Integers from 0 to ``full`` as bytes from 0 to 255; larger ones become 255."""
+    return np.asarray(np.rint(np.minimum(values, full) * np.float32(255 / full)), np.uint8)
 
 
 def read_depth(
@@ -133,8 +158,18 @@ def first_depth_size(frames: Iterable[Entry | Skipped]) -> Size | None:
 def list_files(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:
     """The folder's files with one of the suffixes, numbers in names sorted by value (2 before 10). Broken links are
     included, so that their frames are skipped and counted."""
-    named = (path for path in folder.iterdir() if path.suffix.lower() in suffixes)
+    named = (path for path in folder.iterdir() if path.suffix.lower() in suffixes and not is_sidecar(path))
     return sorted((p for p in named if p.is_file() or (p.is_symlink() and not p.exists())), key=natural_key)
+
+
+def is_sidecar(path: Path) -> bool:
+    """True for the file of attributes that macOS writes beside another file; it has that file's suffix."""
+    return path.name.startswith(_SIDECAR)
+
+
+def listed_path(text: str) -> Path:
+    """The path that a text file states, also if a program on Windows wrote it with backslashes."""
+    return Path(text.replace("\\", "/"))
 
 
 def natural_key(path: Path) -> list[tuple[int, int, str]]:
@@ -185,6 +220,42 @@ def _plain_png(path: Path) -> np.ndarray | None:
         return None
 
 
+def _grey_values(path: str | Path, image: Image.Image) -> np.ndarray:
+    """[H, W] integers from 0 to 65535 of an opened image. Raises FrameError: other numbers."""
+    values = np.array(image)
+    if not np.issubdtype(values.dtype, np.integer) or values.min(initial=0) < 0 or values.max(initial=0) > 65535:
+        raise FrameError(path, f"expected an image of 8 or 16 bits, got mode {image.mode}: a depth map?")
+    return values
+
+
+@lru_cache(maxsize=64)
+def _folder_scale(folder: Path, suffix: str) -> int:
+    """The scale of a folder's 16-bit images, by the largest value in some of them, so that all are equally bright."""
+    files = list_files(folder, (suffix.lower(),))
+    chosen = [files[i] for i in np.unique(np.linspace(0, len(files) - 1, min(_SCALE_SAMPLES, len(files))).astype(int))]
+    scales = [_FULL_SCALES[0]]
+    for file in chosen:
+        with suppress(FrameError, *_BROKEN_IMAGE), Image.open(file) as image:
+            if image.mode[0] in "IF":
+                scales.append(full_scale(_grey_values(file, image)))
+    LOGGER.warning("%s: 16-bit grey images, read as 0 to %d and scaled to bytes", folder, max(scales))
+    return max(scales)
+
+
+def _opaque(rgba: np.ndarray, folder: Path) -> np.ndarray:
+    """[H, W, 3] colours of [H, W, 4], blended with black by their alpha. One alpha for all pixels has no meaning."""
+    alpha = rgba[..., 3:]
+    if (alpha == alpha[:1, :1]).all():
+        return np.ascontiguousarray(rgba[..., :3])
+    _log_transparency(folder)
+    return np.asarray(np.rint(rgba[..., :3] * (alpha / np.float32(255))), np.uint8)
+
+
+@lru_cache(maxsize=64)
+def _log_transparency(folder: Path) -> None:
+    LOGGER.warning("%s: images with transparent pixels, which are read as black", folder)
+
+
 def _from_image(path: Path) -> tuple[np.ndarray, float | None]:
     with Image.open(path) as image:
         image.load()
@@ -192,7 +263,10 @@ def _from_image(path: Path) -> tuple[np.ndarray, float | None]:
             raise FrameError(path, f"expected a 16-bit or float depth image with one channel, got {image.mode}")
         text = image.info.get(SCALE_KEY)
         values = np.array(image)
-    return values, None if text is None else float(text)
+    scale = None if text is None else float(text)
+    if scale is not None and not 0 < scale < np.inf:
+        raise FrameError(path, f"its text {SCALE_KEY} must be positive metres per unit, got {text}")
+    return values, scale
 
 
 def _read_exr(path: Path) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,20 +11,22 @@ import torch
 
 from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.sequences.frame import Size
-from ufmstar_torch.eval.sequences.poses import read_matrix
+from ufmstar_torch.eval.sequences.poses import numbered_lines, read_matrix
 
 # A file's path, a matrix [3, 3] (or ScanNet's [4, 4]), or the numbers fx, fy, cx, cy [px].
 IntrinsicsLike = str | Path | np.ndarray | Sequence[float]
 
 # Sizes whose aspect ratios differ by more than this were cropped, not resized.
 _ASPECT_TOLERANCE = 0.02
+_PROJECTION = re.compile(r"P(?:_rect_0)?\d\s*:(.*)")
 
 
 def read_intrinsics(source: IntrinsicsLike) -> np.ndarray:
-    """[3, 3] float64 [px] from a text file or numbers: 3x3, 4x4, 3x4, or ``fx fy cx cy``. Raises ValueError: the file
-    or array has another shape."""
+    """[3, 3] float64 [px] from a text file or numbers: 3x3, 4x4, 3x4, or ``fx fy cx cy``; or from KITTI's calib.txt or
+    calib_cam_to_cam.txt. Raises ValueError: the file or array has another shape, or KITTI's cameras differ."""
     if isinstance(source, str | Path):
-        values, source_name = read_matrix(source), f"intrinsics file {source}"
+        kitti = _projections(Path(source))
+        values, source_name = read_matrix(source) if kitti is None else kitti, f"intrinsics file {source}"
     else:
         values, source_name = np.array(source, dtype=np.float64), "intrinsics"
     if values.shape in ((4,), (1, 4), (4, 1)):
@@ -33,6 +36,21 @@ def read_intrinsics(source: IntrinsicsLike) -> np.ndarray:
     if values.shape not in ((3, 3), (3, 4), (4, 4)):
         raise ValueError(f"{source_name}: expected a 3x3 matrix or fx fy cx cy, got shape {list(values.shape)}")
     return np.ascontiguousarray(values[:3, :3])
+
+
+def _projections(path: Path) -> np.ndarray | None:
+    """[3, 3] of the projections ``P0:`` (or ``P_rect_00:``) ... of KITTI's rectified cameras, which have equal
+    intrinsics; None if the file has no such line. Raises ValueError: a line has no 12 numbers, or they differ."""
+    found = []
+    for number, text in numbered_lines(path):
+        if line := _PROJECTION.fullmatch(text.strip()):
+            try:
+                found.append(np.array(line[1].split(), dtype=np.float64).reshape(3, 4)[:, :3])
+            except ValueError:
+                raise ValueError(f"{path}:{number}: expected 12 numbers after ':', got {text.strip()[:60]!r}") from None
+    if found and not all(np.array_equal(K, found[0]) for K in found):
+        raise ValueError(f"{path}: the intrinsics of its cameras differ: pass intrinsics as fx fy cx cy")
+    return found[0] if found else None
 
 
 def parse_intrinsics(words: Sequence[str], option: str) -> str | list[float] | None:

@@ -72,6 +72,13 @@ class Lens:
             depth = partial(_undistorted, depth, self, depth_size, True) if depth and depth_size else depth
         return replace(entry, load_image=image, load_depth=depth)
 
+    def undistorted(self, image: np.ndarray) -> np.ndarray:
+        """An image [H, W, C] of this camera without distortion, of intrinsics ``K``. Raises ValueError: another size,
+        or no lens has these coefficients."""
+        if image.shape[:2] != self.size:
+            raise ValueError(f"image must have the camera's size {self.size}, got {image.shape[:2]}")
+        return _undistorted(lambda: image, self, self.size, False) if any(self.coefficients) else image
+
 
 def parse_distortion(words: str | Sequence[str | float]) -> tuple[tuple[float, ...], bool]:
     """Coefficients and True for a fisheye, from ``none``, numbers, or ``fisheye`` and numbers. Raises ValueError:

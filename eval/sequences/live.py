@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ufmstar_torch.conventions import CONVENTIONS, OURS
 from ufmstar_torch.eval.sequences.attach import stem_times
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
-from ufmstar_torch.eval.sequences.images import IMAGE_SUFFIXES, read_color
+from ufmstar_torch.eval.sequences.images import IMAGE_SUFFIXES, is_sidecar, listed_path, read_color
 from ufmstar_torch.eval.sequences.poses import in_metres, parse_pose, poses_from_columns
 
 _FPS = 30.0  # of a recording without timestamps
@@ -117,7 +117,7 @@ def growing_folder(
     while clock() - last <= idle:
         yield from poses.new()
         for path in sorted(folder.iterdir()):
-            if path.name in seen or path.suffix.lower() not in IMAGE_SUFFIXES:
+            if path.name in seen or path.suffix.lower() not in IMAGE_SUFFIXES or is_sidecar(path):
                 continue
             try:
                 written = path.stat().st_mtime
@@ -183,4 +183,4 @@ def _image(text: Any, folder: Path) -> NDArray[np.uint8]:
     head, comma, body = text.partition(",")
     if head.startswith("data:") and comma:
         return read_color("image", base64.b64decode(body, validate=True))
-    return read_color(folder / text)
+    return read_color(folder / listed_path(text))

@@ -13,7 +13,7 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence
-from ufmstar_torch.eval.sequences.images import first_depth_size, natural_key, positive
+from ufmstar_torch.eval.sequences.images import first_depth_size, is_sidecar, natural_key, positive
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
 
@@ -38,7 +38,8 @@ def parts(path: Path) -> list[Path]:
 
 def part_files(folder: Path) -> list[Path]:
     """The h5 files of a part, in the order of scenes and numbers."""
-    return sorted(folder.glob("*/*.h5"), key=lambda path: (path.parent.name, natural_key(path)))
+    files = (path for path in folder.glob("*/*.h5") if not is_sidecar(path))
+    return sorted(files, key=lambda path: (path.parent.name, natural_key(path)))
 
 
 def read(path: Path, options: Options) -> FrameSequence:
@@ -63,7 +64,7 @@ def _files(path: Path) -> list[Path]:
     if path.resolve().name in PARTS:
         return part_files(path)
     if path.is_dir() and path.resolve().parent.name in PARTS:
-        return sorted(path.resolve().glob("*.h5"), key=natural_key)
+        return sorted((file for file in path.resolve().glob("*.h5") if not is_sidecar(file)), key=natural_key)
     return []
 
 

@@ -25,6 +25,7 @@ _USED_BY = {
     "T_color_depth": ("7scenes",),
     "distortion": ("tum", "7scenes", "scannet", "sens", "tartanair", "kitti360", "generic"),
     "topics": ("bag",),
+    "model_index": ("colmap",),
     "drive": ("kitti360",),
     "scans": ("kitti360",),
 }

@@ -39,6 +39,7 @@ class Options:
         truth: folder with the ground-truth depth maps of a generic sequence
         T_color_depth: 7-Scenes: file with the 4x4 transform from the depth to the colour camera [m]
         topics: topics of a ROS bag; write a pose's as TOPIC=FRAME with the frame that it moves
+        model_index: COLMAP: number of the model in sparse/; default: the one with most images
         drive: KITTI-360: name or number of a drive below the root
         scans: KITTI-360: also use the laser scans of this many neighbouring frames
         plugin: Python files with READERS (eval: also METHODS, METRICS)
@@ -65,6 +66,7 @@ class Options:
     truth: str | Path | None = field(default=None, metadata=_WORD)
     T_color_depth: np.ndarray | str | Path | None = field(default=None, metadata=_WORD)
     topics: tuple[str, ...] = ()
+    model_index: int | None = None
     drive: str | int | None = field(default=None, metadata=_WORD)
     scans: int | None = None  # moving things smear
     plugin: tuple[str, ...] = ()

@@ -1,79 +1,95 @@
-"""Messages of a ROS bag as arrays: images, depth maps, cameras, poses, and the tree of frames (tf).
+"""ROS messages as arrays: images, depth maps, cameras, poses, and the tree of frames (tf); of a bag or a node.
 
 REP 103: an image's ``header.frame_id`` names the optical frame, x right, y down, z forward. REP 118: depth is 16UC1
-[mm] or 32FC1 [m]. https://ros.org/reps/rep-0103.html
+[mm] or 32FC1 [m]. The encoding of a message decides whether it is depth; of a CompressedImage it stands first in
+``format`` ("16UC1; png compressed"). https://ros.org/reps/rep-0103.html
 """
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Sequence
+from functools import partial
 from io import BytesIO
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from ufmstar_torch.eval.sequences.frame import FrameError
-from ufmstar_torch.eval.sequences.images import positive, read_color
+from ufmstar_torch.eval.sequences.images import full_scale, grey_bytes, positive, read_color
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.poses import trajectory_of
+from ufmstar_torch.optional import optional
 from ufmstar_torch.trajectory import Trajectory, interpolate_pose
 
-_DEPTHS = {"16UC1": "u2", "32FC1": "f4"}
-# By encoding, bytes per pixel and OpenCV's conversion to RGB (None = already RGB).
-_COLOURS: dict[str, tuple[int, str | None]] = {
-    "rgb8": (3, None),
-    "bgr8": (3, "BGR2RGB"),
-    "8UC3": (3, "BGR2RGB"),
-    "rgba8": (4, "RGBA2RGB"),
-    "bgra8": (4, "BGRA2RGB"),
-    "8UC4": (4, "BGRA2RGB"),
-    "mono8": (1, "GRAY2RGB"),
-    "8UC1": (1, "GRAY2RGB"),
-    **{f"bayer_{name}8": (1, f"BAYER_{name.upper()}2RGB") for name in ("rggb", "bggr", "gbrg", "grbg")},
-    "uyvy": (2, "YUV2RGB_UYVY"),
-    "yuv422": (2, "YUV2RGB_UYVY"),
-    "yuyv": (2, "YUV2RGB_YUYV"),
-    "yuv422_yuy2": (2, "YUV2RGB_YUYV"),
-}
+_DEPTHS = ("16UC1", "32FC1", "64FC1")
+# Encodings by OpenCV's names of types, which state no colour order; drivers mean these.
+_COLOURS = {"8UC1": "mono8", "8UC3": "bgr8", "8UC4": "bgra8", "16UC3": "bgr16", "16UC4": "bgra16"}
+_PLANES = ("nv12", "nv21")  # encodings with half as many further rows for the colours of 2 x 2 pixels
+_ROS_IMAGES = partial(optional, "rosbags.image.image", "ROS images need rosbags-image", "'ufmstar-torch[recordings]'")
 _RADIAL, _FISHEYES = ("plumb_bob", "rational_polynomial", ""), ("equidistant", "fisheye")
 _COUNTS = (4, 5, 8)  # of OpenCV's coefficients
 _STILL = 1e-9  # [m], [1] largest difference between samples of a static transform
 _NORM_TOLERANCE = 0.02  # of a quaternion
 
 
-def colour(message: Any, path: Path) -> np.ndarray:
-    """[H, W, 3] uint8 RGB of an Image or CompressedImage. Raises FrameError: it cannot be decoded."""
-    if not hasattr(message, "encoding"):
-        return read_color(path, bytes(message.data))
-    if message.encoding not in _COLOURS:
-        raise FrameError(path, f"an image's encoding must be one of {', '.join(_COLOURS)}, got {message.encoding!r}")
-    channels, conversion = _COLOURS[message.encoding]
-    pixels = _rows(message, np.dtype(np.uint8), channels, path)
-    if "YUV" in (conversion or "") and pixels.shape[1] % 2:  # two pixels share their colour
-        raise FrameError(path, f"an image in {message.encoding} must have an even width, got {pixels.shape[1]}")
-    if conversion is None:
-        return pixels
-    import cv2
+def colour(message: Any, full: int | None, path: Path) -> np.ndarray:
+    """[H, W, 3] uint8 RGB of an Image or CompressedImage.
 
-    return np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{conversion}")))
+    Args:
+        message: of ``rosbags`` or ``rclpy``.
+        full: the value of white in images of more than 8 bits; None = by this image (:func:`full_scale_of`).
+        path: of the bag, or a topic's name, for messages.
+
+    Raises:
+        FrameError: it cannot be decoded.
+    """
+    if not hasattr(message, "encoding"):
+        data = bytes(message.data)
+        grey = _grey16(data)
+        if grey is None:
+            return read_color(path, data)
+        return np.repeat(grey_bytes(grey, full or full_scale(grey))[..., None], 3, axis=2)
+    encoding = _encoding(message)
+    pixels = _pixels(message, encoding, path)
+    if encoding.endswith("16"):
+        pixels, encoding = grey_bytes(pixels, full or full_scale(pixels)), f"{encoding[:-2]}8"
+    rosbags_image = _ROS_IMAGES()
+    try:
+        return np.ascontiguousarray(rosbags_image.convert_color(pixels, encoding, "rgb8"))
+    except rosbags_image.ImageError as error:
+        raise FrameError(path, f"an image's encoding must have colours or grey, got {encoding!r}") from error
+
+
+def full_scale_of(message: Any, path: Path) -> int | None:
+    """The range of an image of more than 8 bits by its largest value (``images.full_scale``); None for 8 bits. Raises
+    FrameError: it cannot be decoded."""
+    if not hasattr(message, "encoding"):
+        grey = _grey16(bytes(message.data))
+        return None if grey is None else full_scale(grey)
+    encoding = _encoding(message)
+    return full_scale(_pixels(message, encoding, path)) if encoding.endswith("16") else None
 
 
 def is_depth(message: Any) -> bool:
     """True for an Image or CompressedImage that is a depth map."""
-    return getattr(message, "encoding", "") in _DEPTHS or "compressedDepth" in getattr(message, "format", "")
+    if hasattr(message, "encoding"):
+        return message.encoding in _DEPTHS
+    form = str(message.format)
+    return _form_encoding(form) in _DEPTHS or "compressedDepth" in form
 
 
 def depth(message: Any, scale: float | None, path: Path) -> np.ndarray:
-    """[H, W] float32 [m], 0 = invalid, of an Image or a CompressedImage of ``compressed_depth_image_transport``;
-    ``scale`` [m per unit] replaces REP 118's."""
+    """[H, W] float32 [m], 0 = invalid, of an Image, or a CompressedImage of ``compressed_image_transport`` or
+    ``compressed_depth_image_transport``; ``scale`` [m per unit] replaces REP 118's. Raises FrameError: it cannot be
+    decoded, or is no depth map."""
     if hasattr(message, "encoding"):
         if message.encoding not in _DEPTHS:
-            raise FrameError(path, f"depth must be 16UC1 or 32FC1, got {message.encoding!r}")
-        order = ">" if message.is_bigendian else "<"
-        values = _rows(message, np.dtype(order + _DEPTHS[message.encoding]), 1, path)
+            raise FrameError(path, f"depth must be one of {', '.join(_DEPTHS)}, got {message.encoding!r}")
+        values = _pixels(message, message.encoding, path)
     else:
         values = _compressed_depth(bytes(message.data), str(message.format), path)
     scale = scale or (1e-3 if values.dtype.kind == "u" else 1.0)
@@ -81,30 +97,75 @@ def depth(message: Any, scale: float | None, path: Path) -> np.ndarray:
         return positive((values * np.float64(scale)).astype(np.float32))
 
 
-def _compressed_depth(data: bytes, form: str, path: Path) -> np.ndarray:
-    """A 16-bit PNG after 12 bytes: i32 format, f32 a, f32 b; for 32FC1 its values are a / depth + b, 0 = invalid."""
+def _form_encoding(form: str) -> str:
+    """The encoding before compression in a CompressedImage's format; "" if it has only the compression's name."""
+    first, separator, _ = form.partition(";")
+    return first.strip() if separator else ""
+
+
+def _grey16(data: bytes) -> np.ndarray | None:
+    """[H, W] of a PNG of 16-bit grey; None for other files, or damaged ones."""
     try:
-        _, a, b = struct.unpack_from("<iff", data)
-        with Image.open(BytesIO(data[12:])) as image:
+        with Image.open(BytesIO(data)) as image:
+            values = np.array(image) if image.mode.startswith("I;16") else None
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        return None
+    return values
+
+
+def _compressed_depth(data: bytes, form: str, path: Path) -> np.ndarray:
+    """A 16-bit PNG or TIFF, with ``compressedDepth`` after 12 bytes: i32 format, f32 a, f32 b; for 32FC1 its values are
+    a / depth + b, 0 = invalid."""
+    quantised, a, b = "compressedDepth" in form, 0.0, 0.0
+    try:
+        if quantised:
+            _, a, b = struct.unpack_from("<iff", data)
+        with Image.open(BytesIO(data[12:] if quantised else data)) as image:
             values, mode = np.array(image), image.mode
     except (struct.error, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise FrameError(path, f"compressed depth ({form[:40]!r}) must be PNG: {error}") from error
-    if not mode.startswith("I"):
+    if not mode.startswith(("I", "F")) or (quantised and mode == "F"):
         raise FrameError(path, f"compressed depth must have one channel of 16 bits, got {mode!r}")
-    if not form.startswith("32FC1"):
+    if mode == "F":
+        return values
+    if not (quantised and form.startswith("32FC1")):
         return values.astype(np.uint16)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(values > 0, a / (values - np.float32(b)), 0).astype(np.float32)
 
 
-def _rows(message: Any, kind: np.dtype, channels: int, path: Path) -> np.ndarray:
-    """[H, W] or [H, W, C] pixels of an Image, whose rows may be padded."""
+def _encoding(message: Any) -> str:
+    """The encoding with colours, as rosbags-image names it."""
+    return _COLOURS.get(message.encoding, str(message.encoding))
+
+
+def _pixels(message: Any, encoding: str, path: Path) -> np.ndarray:
+    """[H, W] or [H, W, C] values of an Image in the machine's byte order; rows may be padded. Raises FrameError: an
+    unknown encoding, or data of another size than stated."""
+    rosbags_image = _ROS_IMAGES()
+    try:
+        _, _, kind, channels = rosbags_image.to_cvtype(encoding)
+    except rosbags_image.ImageError as error:
+        raise FrameError(
+            path, f"an image's encoding must be one of ROS's, got {str(message.encoding)[:40]!r}"
+        ) from error
     height, width, step = int(message.height), int(message.width), int(message.step)
-    used, data = width * channels * kind.itemsize, np.asarray(message.data, np.uint8)
-    if not (0 < used <= step and height > 0 and data.size == step * height):
+    rows = height + height // 2 if encoding in _PLANES else height
+    used, data = width * channels * np.dtype(kind).itemsize, np.frombuffer(message.data, np.uint8)
+    if not (0 < used <= step and height > 0 and data.size == step * rows):
         raise FrameError(path, f"an image of {width}x{height} {message.encoding} has {data.size} bytes, {step} a row")
-    pixels = data.reshape(height, step)[:, :used].copy().view(kind)  # a copy, because a bag's memory is read-only
-    return pixels if channels == 1 else pixels.reshape(height, width, channels)
+    if encoding in _PLANES and height % 2:
+        raise FrameError(path, f"an image in {message.encoding} must have an even height, got {height}")
+    if channels == 2 and width % 2:  # two pixels share their colour
+        raise FrameError(path, f"an image in {message.encoding} must have an even width, got {width}")
+    tight = SimpleNamespace(
+        encoding=encoding,
+        height=rows,
+        width=width,
+        is_bigendian=getattr(message, "is_bigendian", 0),
+        data=data.reshape(rows, step)[:, :used].copy(),  # rosbags-image expects rows without padding
+    )
+    return np.asarray(rosbags_image.image_to_cvimage(tight))
 
 
 def lens(info: Any, rectified: bool, where: str) -> Lens:

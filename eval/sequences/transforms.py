@@ -1,7 +1,11 @@
 """nerfstudio and instant-ngp: ``transforms.json``, also that of ``ns-process-data`` for Polycam and Record3D.
 
-Poses are camera-to-world with OpenGL axes; the first pixel's centre is (0.5, 0.5). Each frame may have its camera.
-Files from COLMAP have no metric scale (instant-ngp also scales all others).
+Poses are camera-to-world with OpenGL axes; the first pixel's centre is (0.5, 0.5). Each frame may have its camera. A
+folder may instead have ``transforms_train.json``, as NeRF's scenes; the files of the other parts are named.
+
+The file does not state the unit of the poses. They count as metric only if there is depth, with which ``ufmstar data
+check`` compares them; not if marks of structure from motion are in the file or folder, as from COLMAP and instant-ngp.
+A translation of the world in ``applied_transform``, as of ``ufmstar export`` far from the origin, is undone.
 https://docs.nerf.studio/quickstart/data_conventions.html
 """
 
@@ -19,15 +23,24 @@ from ufmstar_torch.conventions import CONVENTIONS
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import UNKNOWN
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Size, Skipped
-from ufmstar_torch.eval.sequences.images import IMAGE_SUFFIXES, depth_loader, image_size, read_color
+from ufmstar_torch.eval.sequences.images import (
+    IMAGE_SUFFIXES,
+    depth_loader,
+    image_size,
+    is_sidecar,
+    listed_path,
+    read_color,
+)
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.stream_warnings import LOGGER
 
-FILE = "transforms.json"
-LOOKED_FOR = f"{FILE}, also in one of its own name *.json"
+FILE, TRAIN = "transforms.json", "transforms_train.json"
+LOOKED_FOR = f"{FILE} or {TRAIN}, or the path of another file *.json"
 # Keys of a file or frame made by structure from motion.
 _NOT_METRIC = ("aabb_scale", "colmap_im_id")
+# A file and a folder that structure from motion leaves beside the file.
+_FROM_COLMAP = ("sparse_pc.ply", "colmap")
 _SIGMA = "sigma_file_path"  # of a frame of `ufmstar export`
 _FISHEYES = ("OPENCV_FISHEYE", "FISHEYE")
 _MODELS = (*_FISHEYES, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "")
@@ -35,19 +48,30 @@ _MODELS = (*_FISHEYES, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "")
 
 def detect(path: Path) -> bool:
     """True if the path is a file of this layout, or a folder with one."""
-    return (path / FILE).is_file() or (path.is_file() and path.suffix == ".json")
+    return _file(path).is_file() and _file(path).suffix.lower() == ".json" and not is_sidecar(path)
+
+
+def _file(path: Path) -> Path:
+    """The file of a folder; another path itself."""
+    if not path.is_dir():
+        return path
+    return next((path / name for name in (FILE, TRAIN) if (path / name).is_file()), path / FILE)
 
 
 def read(path: Path, options: Options) -> FrameSequence:
     """Open the frames in the file's order. Raises ValueError: no JSON of this layout (the message names the entry), an
     unknown camera model, or no usable frame."""
-    file = path if path.is_file() else path / FILE
+    file = _file(path)
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
         frames = [dict(frame) for frame in content["frames"]]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{file}: expected JSON with a list 'frames' of objects: {error}") from error
-    scale = options.truth_scale or _number(content, "depth_unit_scale_factor", file, 0.001)
+    others = sorted(other.name for other in file.parent.glob("transforms_*.json") if other != file)
+    if path.is_dir() and file.name == TRAIN and others:
+        LOGGER.warning("%s: %s is read, not %s: pass the path of another file", path, TRAIN, ", ".join(others))
+    scale = options.truth_scale or _unit(content, file)
+    offset = _offset(content, file)
     entries: list[Entry | Skipped] = []
     lenses = {}
     paths = [_path(frame, file) for frame in frames]
@@ -58,7 +82,7 @@ def read(path: Path, options: Options) -> FrameSequence:
         candidates = (whole, *(whole.with_name(whole.name + suffix) for suffix in IMAGE_SUFFIXES))
         image_file = next((path for path in candidates if path.is_file()), None)
         if image_file is None:
-            entries.append(Skipped(name, "missing image file"))
+            entries.append(Skipped(name, "missing image file", whole))
             continue
         try:
             lenses[name] = _lens({**content, **frame}, image_size(image_file), file)
@@ -66,12 +90,14 @@ def read(path: Path, options: Options) -> FrameSequence:
             entries.append(Skipped(name, "the image's header cannot be read"))
             continue
         depth = None if _SIGMA in frame else frame.get("depth_file_path")
-        load_depth = depth_loader(file.parent / depth, scale, scale) if isinstance(depth, str) else None
-        entries.append(Entry(name, _pose(frame, file), partial(read_color, image_file), load_depth))
+        load_depth = depth_loader(file.parent / listed_path(depth), scale, scale) if isinstance(depth, str) else None
+        entries.append(Entry(name, _pose(frame, offset, file), partial(read_color, image_file), load_depth))
     if any(_SIGMA in frame for frame in frames):
         LOGGER.warning("%s: no ground truth: its depth is a prediction, with a sigma beside it", file)
-    metric = not any(key in part for part in (content, *frames) for key in _NOT_METRIC)
-    name = file.parent.resolve().name if file.name == FILE else file.stem
+    marked = any(key in part for part in (content, *frames) for key in _NOT_METRIC)
+    marked |= any((file.parent / name).exists() for name in _FROM_COLMAP)
+    metric = not marked and any("depth_file_path" in frame for frame in frames)
+    name = file.parent.resolve().name if file == _file(file.parent) else file.stem
     return assemble("transforms", path, entries, lenses, options, name=name, metric=metric)
 
 
@@ -79,11 +105,32 @@ def _path(frame: Mapping[str, Any], file: Path) -> Path:
     value = frame.get("file_path")
     if not isinstance(value, str) or not value or "\0" in value:
         raise ValueError(f"{file}: a frame's file_path must be text, got {str(value)[:60]}")
-    return Path(value)
+    return listed_path(value)
 
 
-def _pose(frame: Mapping[str, Any], file: Path) -> np.ndarray:
-    """[4, 4] camera-to-world with our axes, NaN if it is not finite."""
+def _unit(content: Mapping[str, Any], file: Path) -> float:
+    """Metres per unit of the depth maps. Raises ValueError: not positive."""
+    unit = _number(content, "depth_unit_scale_factor", file, 0.001)
+    if not 0 < unit <= 1:
+        expected = "metres per unit of the depth maps, above 0 and at most 1 (0.001: millimetres)"
+        raise ValueError(f"{file}: depth_unit_scale_factor must be {expected}, got {unit}; --truth-scale replaces it")
+    return unit
+
+
+def _offset(content: Mapping[str, Any], file: Path) -> np.ndarray:
+    """[3] the translation that ``applied_transform`` added to the poses; 0 if it also changed the axes, which are then
+    those of the world. Raises ValueError: no matrix."""
+    try:
+        T = np.array(content.get("applied_transform", np.eye(4)), dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        T = np.zeros(0)
+    if T.shape not in ((4, 4), (3, 4)) or not np.isfinite(T).all():
+        raise ValueError(f"{file}: applied_transform must be 3x4 finite numbers")
+    return T[:3, 3] if (T[:3, :3] == np.eye(3)).all() else np.zeros(3)
+
+
+def _pose(frame: Mapping[str, Any], offset: np.ndarray, file: Path) -> np.ndarray:
+    """[4, 4] camera-to-world with our axes, without the world's ``offset`` [3]; NaN if it is not finite."""
     try:
         T = np.array(frame["transform_matrix"], dtype=np.float64)
         if T.shape not in ((4, 4), (3, 4)):
@@ -95,6 +142,7 @@ def _pose(frame: Mapping[str, Any], file: Path) -> np.ndarray:
         return UNKNOWN
     if np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3:
         raise ValueError(f"{file}: {frame['file_path']}: transform_matrix must be a rotation and a position, got {T}")
+    T[:3, 3] -= offset
     return CONVENTIONS["opengl"].convert(T)
 
 
@@ -120,7 +168,9 @@ def _lens(values: Mapping[str, Any], size: Size, file: Path) -> Lens:
 
 
 def _number(values: Mapping[str, Any], key: str, file: Path, default: float) -> float:
-    value = values.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e12:
+    if key not in values:
+        return default
+    value = values[key]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= 1e12:
         raise ValueError(f"{file}: {key} must be a number, got {str(value)[:60]}")
     return float(value)

@@ -15,7 +15,7 @@ import numpy as np
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_image
 from ufmstar_torch.eval.sequences.frame import FrameSequence
-from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size
+from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size, listed_path
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import associate, numbered_lines, read_trajectory
@@ -64,7 +64,7 @@ def read_file_list(path: Path) -> tuple[np.ndarray, list[str]]:
             continue
         try:
             times.append(float(words[0]))
-            files.append(words[1].strip())
+            files.append(listed_path(words[1].strip()).as_posix())
         except (ValueError, IndexError):
             raise ValueError(f"{path}:{number}: expected 'timestamp filename', got {text!r}") from None
     return np.array(times, dtype=np.float64), files

@@ -18,7 +18,11 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 class Video:
     """A video file with images of ``size`` (H, W). Frames are exact by index, and fast in increasing order: seeking is
     inexact in most containers, so an earlier frame is decoded again from the start. Raises FileNotFoundError: no such
-    file; ValueError: it is no video, or has no frame."""
+    file; ValueError: it is no video, or has no frame.
+
+    The whole file is decoded once at opening, because the number of frames that containers state is an estimate (of
+    Matroska: the duration times a guessed rate) or wrong (truncated files).
+    """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -34,24 +38,21 @@ class Video:
 
         height, width = capture.get(cv2.CAP_PROP_FRAME_HEIGHT), capture.get(cv2.CAP_PROP_FRAME_WIDTH)
         self.size: Size = int(height), int(width)
-        named = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        self._length = named if named > 0 else len(self._decoded_times())
-        if self._length == 0 or 0 in self.size:
+        self._times = self._decoded_times()
+        if self._times.size == 0 or 0 in self.size:
             raise ValueError(f"{self.path}: the video has no frame that can be decoded")
 
     def __len__(self) -> int:
-        """Number of frames stated in the file; a truncated file raises :class:`FrameError` earlier."""
-        return self._length
+        """Number of frames that can be decoded."""
+        return self._times.size
 
     def times(self) -> np.ndarray:
-        """[N] times of the frames [s], from 0 on, by the timestamps in the container, or by decoding if their number is
-        not that of the frames (an edited video). Raises FrameError: the file ends before its last frame."""
+        """[N] times of the frames [s], from 0 on, by the timestamps in the container, or by the decoder if their number
+        is not that of the frames (an edited or truncated video)."""
         stamps = _container_times(self.path)
-        if len(stamps) != self._length:
-            stamps = self._decoded_times()
-        if len(stamps) < self._length:
-            raise FrameError(self.path, f"it states {self._length} frames, of which {len(stamps)} can be decoded")
-        return stamps[: self._length] - stamps[0]
+        if len(stamps) != len(self):
+            stamps = self._times
+        return stamps - stamps[0]
 
     def read(self, index: int) -> np.ndarray:
         """Frame ``index`` as [H, W, 3] uint8 RGB. Raises FrameError: the file ends or cannot be decoded before it."""
@@ -65,8 +66,7 @@ class Video:
         return np.ascontiguousarray(image[..., ::-1])
 
     def _decoded_times(self) -> np.ndarray:
-        """[N] timestamps [s] of all frames, by decoding the file, if it does not state their number (a browser's
-        recording) or times."""
+        """[N] timestamps [s] of all frames, by decoding the file."""
         import cv2
 
         capture, times = self._open(), []

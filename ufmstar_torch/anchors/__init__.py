@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from ufmstar_torch.anchors.dense import DenseConfig as DenseConfig
     from ufmstar_torch.anchors.dense import DenseEvidence as DenseEvidence
     from ufmstar_torch.anchors.landmarks import Landmarks as Landmarks
+    from ufmstar_torch.anchors.sensor import sensor_landmarks as sensor_landmarks
     from ufmstar_torch.anchors.sources import LandmarkMap as LandmarkMap
     from ufmstar_torch.anchors.sources import landmark_source as landmark_source
     from ufmstar_torch.anchors.tracker import LandmarkTracker as LandmarkTracker
@@ -25,4 +26,5 @@ __all__ = [
     "Landmarks",
     "TrackerConfig",
     "landmark_source",
+    "sensor_landmarks",
 ]

@@ -1,0 +1,139 @@
+"""Measures the filling of a depth camera's holes: half of the depth is removed, the rest serves as anchors.
+
+    python docs/measure_sensor.py fastdepth_nyu.onnx SEQUENCE ...
+
+prints for each sequence figures on the removed half: of the network, and of the posterior with the rest of the depth as
+anchors alone, with dense anchors of the images alone, and with both (``--anchors sensor``), also by the cause of
+the removal. In each frame, a sixth of the depth is removed at depth edges, a sixth because it is farthest, and the
+remainder in discs of .03 to .12 image widths.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStarConfig
+from ufmstar_torch.eval.engine.judge import UFM
+from ufmstar_torch.eval.engine.load import NetworkChoice
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
+from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.eval.run.job import Checkpoint, RunJob
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence
+from ufmstar_torch.eval.sequences.ground_truth import truth_at
+from ufmstar_torch.eval.sequences.open import open_sequence
+
+SHARE, EACH = 0.5, 1 / 6  # of the depth: removed, and removed for each of the first two reasons
+DISCS = 0.03, 0.12  # radii [widths]
+FIGURES = ("rmse", "delta1", "ece_delta", "mixture_ece_delta", "ece_q", "nll")
+
+
+CAUSES = EDGE, FAR, DISC = "edges", "far", "discs"
+
+
+def removed(depth: NDArray[np.float32], seed: int) -> dict[str, NDArray[np.bool_]]:
+    """By cause, [H, W] True at the removed pixels, which are half of those with a depth."""
+    import cv2
+
+    valid, rng, kernel = depth > 0, np.random.default_rng(seed), np.ones((9, 9), np.uint8)
+    filled = np.where(valid, depth, np.nan).astype(np.float32)
+    high, low = cv2.dilate(np.nan_to_num(filled, nan=0.0), kernel), cv2.erode(np.nan_to_num(filled, nan=1e6), kernel)
+    contrast = np.where(valid, high / low, 0)
+    edge = valid & (contrast > np.quantile(contrast[valid], 1 - EACH))
+    left = valid & ~edge
+    far = left & (depth > np.quantile(depth[left], 1 - EACH * valid.sum() / left.sum()))
+    left, disc = left & ~far, np.zeros_like(valid)
+    height, width = depth.shape
+    v, u = np.ogrid[:height, :width]
+    while (edge | far | disc).sum() < SHARE * valid.sum():
+        radius, row, column = rng.uniform(*DISCS) * width, rng.uniform(0, height), rng.uniform(0, width)
+        disc |= left & ((v - row) ** 2 + (u - column) ** 2 < radius**2)
+    return {EDGE: edge, FAR: far, DISC: disc}
+
+
+def rest(entry: Entry, seed: int) -> NDArray[np.float32]:
+    """The depth that serves as anchors."""
+    assert entry.load_depth is not None
+    depth = entry.load_depth()
+    return np.where(np.any([*removed(depth, seed).values()], axis=0), np.float32(0), depth)
+
+
+class RemovedHalf(FrameSink):
+    """Figures of the network and of the posterior on the removed half of a sequence's depth."""
+
+    def __init__(self, whole: FrameSequence) -> None:
+        self._whole, self.anchors = whole, list[int]()
+        self.network, self.posterior = ({cause: SequenceMetrics() for cause in ("all", *CAUSES)} for _ in range(2))
+
+    def take(self, result: FrameResult) -> None:
+        """Add a frame."""
+        if UFM not in result.rows:
+            return
+        row, frame = result.rows[UFM], self._whole[result.index]
+        if frame.depth is None or row.posterior_depth is None or row.landmarks is None:
+            return
+        causes = removed(frame.depth, result.index)
+        for cause, gone in {"all": np.any([*causes.values()], axis=0), **causes}.items():
+            hidden = np.where(gone, frame.depth, np.float32(0))
+            truth = truth_at(replace(frame, depth=hidden), row.intrinsics, row.size)
+            assert truth is not None
+            target = torch.from_numpy(truth)
+            self.network[cause].update(row.depth, row.variance, target, row.valid)
+            self.posterior[cause].update(row.posterior_depth, row.posterior_variance, target, row.valid, row.mixture)
+        self.anchors.append(len(row.landmarks.depth))
+
+
+def measure(path: str, weights: str, sensor: str | None, images: bool, frames: int | None) -> RemovedHalf:
+    """Run one kind of anchors on a sequence."""
+    whole = open_sequence(path)
+    if frames is not None:
+        whole = replace(whole, entries=whole.entries[:frames])
+    entries = tuple(
+        replace(entry, load_depth=entry.load_depth and partial(rest, entry, seed), load_image=entry.load_image)
+        for seed, entry in enumerate(whole.entries)
+    )
+    source = NetworkChoice("", "fastdepth", (weights,), None).load(torch.device("cpu"))
+    config = UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig(), on_bad_frame="skip")
+    job = RunJob(
+        replace(whole, entries=entries), range(len(entries)), source, config.within(source.max_depth, False),
+        torch.device("cpu"), {}, landmarks="dense", sensor=sensor,
+    )  # fmt: skip
+    row, judged = job.row(Checkpoint()), RemovedHalf(whole)
+    if not images and row.anchors is not None and row.anchors.tracks is not None:
+        row.anchors.tracks.of = lambda *_: None  # type: ignore[method-assign]
+    FrameStream(job.sequence, job.indices, [row]).drive([judged])
+    return judged
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("weights", help="FastDepth's")
+    parser.add_argument("sequences", nargs="+", metavar="SEQUENCE")
+    parser.add_argument("--frames", type=int, help="first ones alone")
+    parser.add_argument("--sensor", default="stereo")
+    options = parser.parse_args()
+    for path in options.sequences:
+        print(path)
+        kinds = {"sensor": (options.sensor, False), "images": (None, True), "both": (options.sensor, True)}
+        for name, (sensor, images) in kinds.items():
+            judged = measure(path, options.weights, sensor, images, options.frames)
+            if name == "sensor":
+                print("  network      ", figures_of(judged.network["all"]))
+            for cause in ("all", *CAUSES) if name == "both" else ("all",):
+                share = judged.posterior[cause].compute()["rmse"] / judged.network[cause].compute()["rmse"]
+                text = f"RMSE x {share:.3f}, {np.mean(judged.anchors):.0f} anchors"
+                print(f"  {name:6} {cause:6}", figures_of(judged.posterior[cause]), text)
+
+
+def figures_of(metrics: SequenceMetrics) -> dict[str, float]:
+    computed = metrics.compute()
+    return {figure: round(computed[figure], 3) for figure in FIGURES if figure in computed}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,221 @@
+"""Anchors of a depth camera: thinning, edges, variances; ``ufmstar run --anchors sensor`` fills holes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from layouts import write_generic
+from runs import job_of, outputs, read_summary, records
+
+from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStarConfig, cli
+from ufmstar_torch.anchors import Landmarks, sensor_landmarks
+from ufmstar_torch.anchors.sensor import completed
+from ufmstar_torch.camera import resize_intrinsics
+from ufmstar_torch.eval.engine.anchors import sensor_of
+from ufmstar_torch.eval.engine.maps import MapSource
+from ufmstar_torch.eval.run.folder import FolderError
+from ufmstar_torch.eval.run.run import run
+from ufmstar_torch.eval.run.writers import read_frame
+from ufmstar_torch.eval.sequences.frame import in_memory
+from ufmstar_torch.eval.sequences.open import open_sequence
+
+K = np.array([[200.0, 0, 159.5], [0, 200, 119.5], [0, 0, 1]])
+CELL = np.array([320, 240]) / 28
+
+
+def plane(height=240, width=320, z=2.0):
+    return np.full((height, width), z, np.float32)
+
+
+def test_each_cell_has_one_anchor_near_its_centre():
+    found = sensor_landmarks(plane(), K, K)
+    assert len(found.depth) == 28 * 28
+    cell = np.floor((found.pixel + 0.5) / CELL)
+    assert len(np.unique(cell, axis=0)) == 28 * 28
+    assert np.abs((found.pixel + 0.5) / CELL - cell - 0.5).max() < 0.3
+    assert set(found.depth) == {2.0}
+
+
+@pytest.mark.parametrize(("kind", "sigma"), [("stereo", 0.001 + 0.003 * 9), ("tof", 0.01 + 0.01 * 3)])
+def test_the_variance_is_that_of_the_kind_of_sensor(kind, sigma):
+    np.testing.assert_allclose(sensor_landmarks(plane(z=3.0), K, K, kind).variance, sigma**2, rtol=1e-12)
+    with pytest.raises(ValueError, match="kind must be one of stereo, tof, got 'lidar'"):
+        sensor_landmarks(plane(), K, K, "lidar")
+    with pytest.raises(ValueError, match=r"depth must be a map \[H, W\]"):
+        sensor_landmarks(plane()[..., None], K, K)
+
+
+def test_no_anchor_lies_in_a_hole_or_at_an_edge():
+    depth = plane()
+    depth[:, 160:] = 3.0
+    depth[50:130, 20:90] = 0
+    depth[200, 200], depth[201, 250] = np.nan, np.inf
+    pixel = sensor_landmarks(depth, K, K).pixel.astype(int)
+    z = depth[pixel[:, 1], pixel[:, 0]]
+    assert np.isin(z, (2.0, 3.0)).all()
+    assert (np.abs(pixel[:, 0] - 159.5) > 2).all()
+    assert {2.0, 3.0} == set(z.tolist())
+    assert len(sensor_landmarks(0 * plane(), K, K).depth) == 0
+
+
+def test_anchors_of_another_camera_are_at_the_pixels_of_the_image():
+    """A phone's depth of 256x192 for images of 1920x1440; the slanted wall has the depth 2 + .001 u of the image."""
+    size, small = (1440, 1920), (192, 256)
+    K_image = np.array([[1500.0, 0, 950], [0, 1500, 700], [0, 0, 1]])
+    K_depth = resize_intrinsics(torch.from_numpy(K_image), size, small).numpy()
+    u = (np.arange(256) + 0.5) * 7.5 - 0.5
+    depth = np.tile(2 + 0.001 * u, (192, 1)).astype(np.float32)
+    found = sensor_landmarks(depth, K_depth, K_image, "tof")
+    np.testing.assert_allclose(found.depth, 2 + 0.001 * found.pixel[:, 0], rtol=1e-6)
+    assert found.pixel.max(axis=0) == pytest.approx([1900, 1425], abs=30)
+
+
+def test_landmarks_of_the_images_complete_it():
+    """One lies where the sensor measured, one beside it, one in the hole; their common error stays."""
+    covered = np.ones((240, 320), bool)
+    covered[:, 200:] = False
+    pixel = np.array([[50.0, 50], [201, 60], [250, 70]])
+    others = Landmarks(pixel, np.full(3, 4.0), np.full(3, 0.1), 3, shared=0.01, scale=0.02)
+    sensor = sensor_landmarks(np.where(covered, plane(), np.float32(0)), K, K)
+    found = completed(sensor, others, covered)
+    n = len(sensor.depth)
+    np.testing.assert_array_equal(found.pixel[n:], [[250, 70]])
+    assert (found.depth[n:].tolist(), found.variance[n:].tolist()) == ([4.0], [0.1])
+    assert (found.shared, found.scale, found.tracked) == (0.01, 0.02, n + 3)
+    none = replace(others, pixel=np.zeros((0, 2)), depth=np.zeros(0), variance=np.zeros(0), shared=np.inf)
+    assert completed(sensor, none, covered) is sensor, "poses that contradict the images do not concern the sensor"
+
+
+# ---- ufmstar run
+
+TOUR = "tour:5?frames=10&size=120x160"
+CONFIG = UfMStarConfig(on_bad_frame="skip", anchors=AnchorConfig(), posterior=PosteriorConfig())
+
+
+@pytest.fixture(scope="module")
+def tour():
+    """Ten rendered frames, in memory."""
+    return in_memory(open_sequence(TOUR))
+
+
+def with_hole(depth):
+    """The depth without a third of the image."""
+    left = depth.copy()
+    left[:, 50:100] = 0
+    return left
+
+
+def holed(tour):
+    return tour.changed(lambda entry: replace(entry, load_depth=lambda: with_hole(entry.load_depth())))
+
+
+def sensor_job(tour, whole, **options):
+    """A network whose depth is 40 % too far, and too flat."""
+    depths = [frame.depth for frame in whole]
+
+    def too_far(frame):
+        depth = depths[frame.index][::2, ::2]
+        flat = 1.4 * np.sqrt(depth * np.median(depth[depth > 0]))
+        return np.where(depth > 0, flat, 0).astype(np.float32), None, np.diag([0.5, 0.5, 1.0]) @ frame.intrinsics
+
+    source = MapSource(too_far, {"maps": "too far and too flat"})
+    return job_of(tour, source, config=CONFIG, landmarks="dense", sensor="stereo", **options)
+
+
+@pytest.fixture(scope="module")
+def finished(tour, tmp_path_factory):
+    out = tmp_path_factory.mktemp("sensor") / "out"
+    return out, run(sensor_job(holed(tour), tour), out)
+
+
+def test_holes_are_filled_and_every_pixel_has_a_sigma(tour, finished):
+    out, _ = finished
+    squares = np.zeros(2)
+    z_scores = []
+    for frame in tour:
+        stored, truth = read_frame(out / "frames" / f"{frame.name}.npz"), frame.depth[::2, ::2]
+        hole = np.zeros(truth.shape, bool)
+        hole[:, 25:50] = True
+        hole &= (truth > 0) & stored["valid"]
+        assert np.isfinite(stored["posterior_variance"][stored["valid"]]).all()
+        if frame.index == 0:  # without an earlier view, the images show nothing
+            continue
+        error = stored["posterior_depth"][hole] - truth[hole]
+        squares += np.square(error).sum(), np.square(stored["depth"][hole] - truth[hole]).sum()
+        z_scores.append(error / np.sqrt(stored["posterior_variance"][hole]))
+    assert np.sqrt(squares[0] / squares[1]) < 1 / 3
+    z = np.concatenate(z_scores)
+    assert 0.1 < np.sqrt(np.mean(np.square(z))) < 2
+
+
+def test_depth_that_served_as_anchors_is_not_judged(finished):
+    out, summary = finished
+    assert summary["metrics"] is None
+    assert summary["metrics_reason"] == "the recording's depth serves as anchors"
+    assert summary["posterior"]["metrics"] is None
+    assert not any(record["ground_truth"] for record in records(out))
+    assert summary["anchors"]["used_per_frame"] > 300
+    assert summary["source"]["sensor"] == "stereo"
+
+
+def test_a_run_is_continued_with_the_same_results(tour, finished, tmp_path):
+    out, _ = finished
+
+    def stop():
+        return (tmp_path / "out" / "frames.jsonl").read_bytes().count(b"\n") >= 4
+
+    assert run(sensor_job(holed(tour), tour), tmp_path / "out", stop=stop)["state"] == "interrupted"
+    with pytest.raises(FolderError, match="source"):
+        run(replace(sensor_job(holed(tour), tour), sensor="tof"), tmp_path / "out", resume=True)
+    run(sensor_job(holed(tour), tour), tmp_path / "out", resume=True)
+    assert outputs(tmp_path / "out") == outputs(out)
+
+
+def test_frames_without_depth_or_images_have_what_is_there(tour, tmp_path):
+    """The first frame has no depth, the second no image; the third has a depth map that cannot be read."""
+    entries = list(holed(tour).entries[:3])
+    entries[0] = replace(entries[0], load_depth=None)
+    entries[1] = replace(entries[1], load_image=None)
+    sequence = replace(tour, entries=tuple(entries))
+    run(sensor_job(sequence, tour), tmp_path / "out")
+    found = [record["anchors"]["found"] for record in records(tmp_path / "out")]
+    assert found[0] == 0
+    assert min(found[1:]) > 300
+
+
+# ---- the option
+
+
+def test_the_kind_of_sensor_is_that_of_the_layout(tour):
+    assert sensor_of("sensor", tour) == "stereo"
+    assert sensor_of("sensor", replace(tour, layout="stray")) == "tof"
+    assert sensor_of("sensor:tof", tour) == "tof"
+    for other in (True, "corners", "dense", "sensor.csv", False, None):
+        assert sensor_of(other, tour) is None
+    with pytest.raises(ValueError, match="the kind of sensor must be one of stereo, tof"):
+        sensor_of("sensor:lidar", tour)
+    bare = tour.changed(lambda entry: replace(entry, load_depth=None))
+    with pytest.raises(ValueError, match="has no depth maps"):
+        sensor_of("sensor", bare)
+
+
+def test_the_command(tmp_path, capfd):
+    path, truth = write_generic(tmp_path / "data")
+    maps = tmp_path / "maps"
+    maps.mkdir()
+    for i, depth in enumerate(truth.depths):
+        np.save(maps / f"{i + 7}.npy", 1.3 * depth)
+    words = ["run", str(path), "--no-video", "--no-sheet", "--posterior", "--out", str(tmp_path / "out")]
+    assert cli.main([*words, "--depth", str(maps), "--anchors", "sensor"]) == 0
+    summary = read_summary(tmp_path / "out")
+    assert (summary["settings"]["anchors"], summary["metrics"]) == ("sensor", None)
+    depth = read_frame(tmp_path / "out" / "frames" / "12.npz")["posterior_depth"]
+    assert np.median(np.abs(depth / truth.depths[5] - 1)) < 0.02
+    capfd.readouterr()
+    assert cli.main([*words, "--overwrite", "--depth", "self", "--anchors", "sensor"]) == 2
+    assert "--anchors sensor goes with the depth of a network" in capfd.readouterr().err
+    assert cli.main([*words, "--overwrite", "--depth", str(maps), "--anchors", "sensor:x"]) == 2
+    assert "the kind of sensor must be one of" in capfd.readouterr().err

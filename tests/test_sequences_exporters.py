@@ -1,0 +1,484 @@
+"""Recordings as other programs and systems write them: Windows' paths, macOS's sidecars, several models, 16 bits."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import warnings
+from importlib import import_module
+
+import cv2
+import layouts
+import layouts_bag
+import layouts_calibrated as written
+import layouts_more
+import numpy as np
+import pytest
+from imageio_ffmpeg import get_ffmpeg_exe
+from PIL import Image
+
+from ufmstar_torch import cli
+from ufmstar_torch.eval.run.scale import network_scale
+from ufmstar_torch.eval.sequences import FrameError, find_sequences, open_sequence
+from ufmstar_torch.eval.sequences.colmap import read_landmarks
+from ufmstar_torch.eval.sequences.images import full_scale, grey_bytes, read_color, read_depth
+from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
+from ufmstar_torch.eval.sequences.video import Video
+
+RNG = np.random.default_rng(0)
+
+
+def write_grey16(path, values):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(values.astype(np.uint16)).save(path)
+
+
+# ---- 16-bit grey and transparent images
+
+
+@pytest.mark.parametrize(
+    ("highest", "full"), [(0, 255), (255, 255), (256, 1023), (4095, 4095), (4096, 16383), (65535,) * 2]
+)
+def test_the_scale_is_that_of_the_camera_s_bits(highest, full):
+    assert full_scale(np.array([[0, highest]], np.uint16)) == full
+    assert grey_bytes(np.array([0, full // 2, full, 65535]), full).tolist() in ([0, 127, 255, 255], [0, 128, 255, 255])
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif", "pgm"])
+def test_16_bit_grey_is_scaled_by_its_folder(tmp_path, caplog, suffix):
+    """A dark image of a 12-bit camera stays dark, and the scale is logged once."""
+    path, truth = layouts.write_generic(tmp_path)
+    grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in truth.images]
+    for i, values in enumerate(grey):
+        (path / "images" / f"{i + 7}.png").unlink()
+        dark = 0.1 if i == 2 else 1.0
+        write_grey16(path / "images" / f"{i + 7}.{suffix}", np.rint(values * dark * 4095 / 255))
+    brightest = max(values.max() for i, values in enumerate(grey) if i != 2)
+    assert brightest > 64, "the largest value needs 12 bits"
+    sequence = open_sequence(path)
+    for i, frame in enumerate(sequence):
+        expected = grey[i] * (0.1 if i == 2 else 1.0)
+        np.testing.assert_allclose(frame.image, np.repeat(expected[..., None], 3, axis=2), atol=0.6)
+    assert [record.getMessage() for record in caplog.records if "16-bit grey" in record.message] == [
+        f"{path / 'images'}: 16-bit grey images, read as 0 to 4095 and scaled to bytes"
+    ]
+    assert read_color("image", (path / "images" / f"7.{suffix}").read_bytes()).shape == (48, 64, 3)
+
+
+def test_euroc_with_16_bit_images(tmp_path):
+    """TUM-VI."""
+    path, truth = written.write_euroc(tmp_path)
+    files = sorted((path / "mav0" / "cam0" / "data").iterdir())
+    for file, image in zip(files, truth.images, strict=True):
+        write_grey16(file, image[..., 0].astype(np.uint16) * 257)
+    sequence = open_sequence(path)
+    for frame, image in zip(sequence, truth.images, strict=True):
+        np.testing.assert_array_equal(frame.image, np.repeat(image[..., :1], 3, axis=2))
+
+
+def test_transparent_pixels_are_black(tmp_path, caplog):
+    image = RNG.integers(0, 255, (6, 5, 3), dtype=np.uint8)
+    alpha = np.full((6, 5), 255, np.uint8)
+    alpha[:2], alpha[2] = 0, 51
+    for i in range(2):
+        layouts.write_image(tmp_path / f"{i}.png", np.dstack([image, alpha]))
+        found = read_color(tmp_path / f"{i}.png")
+        assert not found[:2].any()
+        np.testing.assert_allclose(found[2], image[2] * 0.2, atol=0.5)
+        np.testing.assert_array_equal(found[3:], image[3:])
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{tmp_path}: images with transparent pixels, which are read as black"
+    ]
+    for value in (0, 255):  # some programs leave alpha 0
+        layouts.write_image(tmp_path / "same.png", np.dstack([image, alpha * 0 + np.uint8(value)]))
+        np.testing.assert_array_equal(read_color(tmp_path / "same.png"), image)
+
+
+def test_a_png_s_unit_of_depth_is_positive(tmp_path):
+    for text in ("nan", "0", "-1", "inf"):
+        layouts.write_depth_png(tmp_path / "d.png", np.ones((2, 3)), 1000, scale_text=text)
+        with pytest.raises(FrameError, match=f"its text depth_scale must be positive metres per unit, got {text}"):
+            read_depth(tmp_path / "d.png")
+
+
+# ---- macOS's sidecars, Windows' paths
+
+
+def write_scan(root):
+    layouts_more.write_sens(root / "scan" / "scene.sens")
+    return root / "scan"
+
+
+def write_drive(root):
+    layouts_more.write_kitti360(root)
+    return root
+
+
+LAYOUTS = {
+    "tum": layouts.write_tum, "7scenes": layouts.write_seven_scenes, "scannet": layouts.write_scannet,
+    "tartanair": layouts.write_tartanair, "generic": layouts.write_generic, "sens": write_scan,
+    "colmap": written.write_colmap, "transforms": written.write_transforms, "euroc": written.write_euroc,
+    "stray": written.write_stray, "arkitscenes": written.write_arkitscenes, "bag": layouts_bag.write_bag,
+    "nyu": layouts_more.write_nyu, "kitti360": write_drive,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_files_that_macos_adds_are_no_frames(tmp_path, layout):
+    path = LAYOUTS[layout](tmp_path)
+    path = path[0] if isinstance(path, tuple) else path
+    before = open_sequence(path)
+    for file in [file for file in tmp_path.rglob("*") if file.is_file()]:
+        (file.parent / f"._{file.name}").write_bytes(b"\x00\x05\x16\x07" + bytes(100))
+    after = open_sequence(path)
+    assert (after.names, after.skipped, after.layout) == (before.names, before.skipped, layout)
+    np.testing.assert_array_equal(after[-1].image, before[-1].image)
+    if after.depth_size is not None:
+        np.testing.assert_array_equal(after[-1].depth, before[-1].depth)
+    assert [found.layout for found in find_sequences(tmp_path)] == [layout]
+
+
+def backslashes(file, old):
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, old.replace("/", "\\" * (2 if file.suffix == ".json" else 1))))
+
+
+@pytest.mark.parametrize("layout", ["transforms", "tum", "colmap"])
+def test_paths_with_backslashes(tmp_path, layout):
+    if layout == "transforms":
+        path, _ = written.write_transforms(tmp_path)
+        backslashes(path / "transforms.json", "images/")
+        backslashes(path / "transforms.json", "depth/")
+    elif layout == "tum":
+        path, _ = layouts.write_tum(tmp_path)
+        backslashes(path / "rgb.txt", "rgb/")
+        backslashes(path / "depth.txt", "depth/")
+    else:
+        path, *_ = written.write_colmap(tmp_path, text=True)
+        for name in ("images", "depth"):
+            (path / name).rename(path / f"{name}0")
+            (path / name).mkdir()
+            (path / f"{name}0").rename(path / name / "left")
+        file = path / "sparse" / "0" / "images.txt"
+        file.write_text(file.read_text().replace(".png", ".png").replace(" 0.png", " left\\0.png"))
+        lines = [line.split(" ") for line in file.read_text().splitlines()]
+        file.write_text(
+            "\n".join(
+                " ".join([*w[:-1], "left\\" + w[-1].removeprefix("left\\")]) if w[-1].endswith("png") else " ".join(w)
+                for w in lines
+            )
+        )
+        shutil.rmtree(path / "depth")
+    sequence = open_sequence(path)
+    assert (sequence.layout, sequence.skipped) == (layout, ())
+    assert all(frame.image is not None for frame in sequence)
+    assert layout == "colmap" or not sequence.without_depth
+
+
+def test_a_missing_image_is_named(tmp_path):
+    path, _ = written.write_transforms(tmp_path)
+    shutil.rmtree(path / "images")
+    with pytest.raises(ValueError, match=r"6 x missing image file; first .*walk/images/0\.png"):
+        open_sequence(path)
+
+
+# ---- transforms.json
+
+
+def change_transforms(path, **values):
+    file = path / "transforms.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **values}))
+
+
+@pytest.mark.parametrize("unit", [float("nan"), 0, -1, float("inf"), 2, "x"])
+def test_the_unit_of_depth_in_transforms_is_checked(tmp_path, unit):
+    path, _ = written.write_transforms(tmp_path)
+    change_transforms(path, depth_unit_scale_factor=unit)
+    with pytest.raises(ValueError, match="depth_unit_scale_factor must be"):
+        open_sequence(path)
+
+
+@pytest.mark.parametrize("key", ["fl_x", "cx", "w", "k1"])
+def test_numbers_of_transforms_that_are_nan_are_named(tmp_path, key):
+    path, _ = written.write_transforms(tmp_path)
+    change_transforms(path, **{key: float("nan")})
+    with pytest.raises(ValueError, match=f"{key} must be a number, got nan"):
+        open_sequence(path)
+
+
+def without_depth(path):
+    content = json.loads((path / "transforms.json").read_text())
+    for frame in content["frames"]:
+        del frame["depth_file_path"]
+    (path / "transforms.json").write_text(json.dumps(content))
+
+
+def test_poses_of_transforms_are_metric_only_with_depth(tmp_path, capfd):
+    path, _ = written.write_transforms(tmp_path)
+    assert open_sequence(path).metric
+    (path / "sparse_pc.ply").write_bytes(b"ply")
+    assert not open_sequence(path).metric
+    (path / "sparse_pc.ply").unlink()
+    without_depth(path)
+    assert not open_sequence(path).metric
+    assert cli.main(["data", "check", str(path)]) == 0
+    assert "the unit of the poses: their file does not state it" in capfd.readouterr().out
+    words = ["run", str(path), "--model", "onnx", "--weights", "no.onnx", "--out", str(tmp_path / "out")]
+    assert cli.main(words) == 2
+    assert "--pose-scale M" in capfd.readouterr().err
+    assert open_sequence(path, pose_scale=1.0).metric
+    assert cli.main(["data", "check", str(path), "--pose-scale", "1"]) == 0
+    assert "the unit of the poses" not in capfd.readouterr().out
+
+
+def test_depth_measures_the_unit_of_the_poses(tmp_path, capfd):
+    """Old nerfstudio files from COLMAP with depth: poses in units of 2.5 m."""
+    path, _ = written.write_transforms(tmp_path)
+    content = json.loads((path / "transforms.json").read_text())
+    for frame in content["frames"]:
+        matrix = np.array(frame["transform_matrix"])
+        matrix[:3, 3] /= 2.5
+        frame["transform_matrix"] = matrix.tolist()
+    (path / "transforms.json").write_text(json.dumps({**content, "aabb_scale": 16}))
+    assert cli.main(["data", "check", str(path)]) == 1
+    (remedy,) = [line for line in capfd.readouterr().out.splitlines() if "--pose-scale " in line and "remedy" in line]
+    assert float(remedy.split()[-1]) == pytest.approx(2.5, rel=0.05)
+
+
+def test_a_folder_with_the_parts_of_nerf_s_scenes(tmp_path, caplog):
+    path, truth = written.write_transforms(tmp_path)
+    (path / "transforms.json").rename(path / "transforms_train.json")
+    shutil.copy(path / "transforms_train.json", path / "transforms_test.json")
+    content = json.loads((path / "transforms_train.json").read_text())
+    for frame in content["frames"]:
+        frame["file_path"] = frame["file_path"].removesuffix(".png")
+    (path / "transforms_train.json").write_text(json.dumps(content))
+    sequence = open_sequence(path)
+    assert (sequence.layout, sequence.name, len(sequence)) == ("transforms", "walk", 6)
+    np.testing.assert_array_equal(sequence[3].image, truth.images[3])
+    assert "transforms_train.json is read, not transforms_test.json" in caplog.text
+    assert open_sequence(path / "transforms_test.json").name == "transforms_test"
+    assert [found.layout for found in find_sequences(tmp_path)] == ["transforms"]
+
+
+def test_an_offset_in_applied_transform_is_undone(tmp_path):
+    path, truth = written.write_transforms(tmp_path)
+    turned = np.array([[1.0, 0, 0, 5], [0, 0, 1, 6], [0, -1, 0, 7]])
+    for matrix, shift in ((np.eye(4)[:3] + np.eye(4)[3] * [[1], [2], [3]], [1, 2, 3]), (turned, [0, 0, 0])):
+        change_transforms(path, applied_transform=matrix.tolist())
+        for frame, T in zip(open_sequence(path), truth.T_world_cam, strict=True):
+            np.testing.assert_allclose(frame.T_world_cam[:3, 3], T[:3, 3] - shift, atol=1e-12)
+    change_transforms(path, applied_transform=[[1, "x"]])
+    with pytest.raises(ValueError, match="applied_transform must be 3x4 finite numbers"):
+        open_sequence(path)
+
+
+# ---- COLMAP
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_the_largest_of_several_models_is_read(tmp_path, caplog, text):
+    path, truth, points = written.write_colmap(tmp_path, text=text, unit=2.0)
+    other, *_ = written.write_colmap(tmp_path / "other", frames=2, text=text)
+    (path / "sparse" / "0").rename(path / "sparse" / "10")
+    (other / "sparse" / "0").rename(path / "sparse" / "0")
+    (path / "sparse" / "unsorted").mkdir()
+    sequence = open_sequence(path)
+    assert len(sequence) == 6
+    assert "the model 10 with 6 images is read, not 0 with 2; --model-index chooses another one" in caplog.text
+    assert len(open_sequence(path, model_index=0)) == 2
+    with pytest.raises(ValueError, match=r"model_index must be one of the models of .* \(0, 10\), got 3"):
+        open_sequence(path, model_index=3)
+    assert len(read_landmarks(path)) == 6
+    assert len(read_landmarks(path, 0)) == 2
+    with pytest.raises(ValueError, match="takes no model_index"):
+        open_sequence(written.write_transforms(tmp_path / "t")[0], model_index=0)
+    from ufmstar_torch.eval.engine.maps import own_depth
+
+    chosen = open_sequence(path, model_index=10)
+    assert network_scale(chosen, own_depth(), range(6), 10).metres == pytest.approx(2.0, rel=5e-3)
+    assert (points.shape, len(truth.images)) == ((72, 3), 6)
+
+
+def test_a_single_model_is_read_without_a_word(tmp_path, caplog):
+    path, *_ = written.write_colmap(tmp_path)
+    (path / "sparse" / "0").rename(path / "sparse" / "3")
+    assert len(open_sequence(path)) == 6
+    assert not caplog.records
+
+
+# ---- videos
+
+
+@pytest.mark.parametrize("suffix", ["mkv", "webm", "mp4", "avi"])
+def test_a_video_of_a_variable_rate_has_its_frames_and_times(tmp_path, suffix):
+    """The number of frames that Matroska states is the duration times a guessed rate."""
+    times = [0, 0.1, 0.133, 0.233, 0.267, 0.4]
+    for i in range(6):
+        layouts.write_image(tmp_path / f"{i}.png", RNG.integers(0, 255, (64, 96, 3), dtype=np.uint8))
+    stamps = "+".join(f"eq(N,{i})*{round(1000 * t)}" for i, t in enumerate(times))
+    codec = {"webm": ["-c:v", "libvpx", "-auto-alt-ref", "0"], "avi": ["-c:v", "mjpeg"]}.get(
+        suffix, ["-c:v", "libx264", "-bf", "0"]
+    )
+    command = [get_ffmpeg_exe(), "-v", "error", "-framerate", "1000", "-i", str(tmp_path / "%d.png")]
+    command += ["-vf", f"settb=1/1000,setpts='{stamps}'", "-fps_mode", "passthrough", "-enc_time_base", "1/1000"]
+    subprocess.run([*command, *codec, "-pix_fmt", "yuv420p", str(tmp_path / f"v.{suffix}")], check=True)
+    video = Video(tmp_path / f"v.{suffix}")
+    assert len(video) == 6
+    np.testing.assert_allclose(video.times(), times, atol=2e-3)
+    assert video.read(5).shape == (64, 96, 3)
+
+
+def test_a_truncated_video_has_the_frames_that_can_be_decoded(tmp_path, capfd):
+    images = [RNG.integers(0, 255, (48, 64, 3), dtype=np.uint8) for _ in range(8)]
+    layouts.write_video(tmp_path / "cut.avi", images)
+    layouts.truncate(tmp_path / "cut.avi", 0.6)
+    video = Video(tmp_path / "cut.avi")
+    assert 2 <= len(video) < 8
+    assert len(video.times()) == len(video)
+    np.testing.assert_array_equal(video.read(len(video) - 2), images[len(video) - 2])
+    capfd.readouterr()  # FFmpeg complains on stderr
+
+
+# ---- KITTI's calib.txt
+
+
+def test_kitti_s_calibration(tmp_path):
+    path, truth = layouts.write_generic(tmp_path)
+    (path / "images").rename(path / "image_2")
+    four = truth.K
+    rows = [np.hstack([four, [[-shift * four[0, 0]], [0], [0]]]).ravel() for shift in (0, 0.54, -0.06, 0.48)]
+    lines = [f"P{i}: {' '.join(f'{x:.12e}' for x in row)}" for i, row in enumerate(rows)] + ["Tr: 1 2 3"]
+    (path / "calib.txt").write_text("\n".join(lines))
+    assert open_sequence(path).image_size == (48, 64), "K.txt comes first"
+    (path / "K.txt").unlink()
+    np.testing.assert_allclose(open_sequence(path).intrinsics, truth.K, rtol=1e-11)
+    (path / "calib.txt").rename(tmp_path / "raw.txt")
+    text = (tmp_path / "raw.txt").read_text().replace("P", "P_rect_0")
+    (tmp_path / "raw.txt").write_text("calib_time: 09-Jan-2012 13:57:47\n" + text)
+    np.testing.assert_allclose(open_sequence(path, intrinsics=str(tmp_path / "raw.txt")).intrinsics, truth.K)
+    (tmp_path / "raw.txt").write_text(
+        text.replace("P_rect_01: 4", "P_rect_01: 5").replace("P_rect_01: 5", "P_rect_01: 9", 1)
+    )
+    with pytest.raises(ValueError, match="the intrinsics of its cameras differ"):
+        read_intrinsics(tmp_path / "raw.txt")
+    (tmp_path / "raw.txt").write_text("P0: 1 2 3")
+    with pytest.raises(ValueError, match=r"raw\.txt:1: expected 12 numbers"):
+        read_intrinsics(tmp_path / "raw.txt")
+
+
+# ---- bags
+
+
+def split(path, root, kind):
+    """Copy a bag into two files without metadata, each with half of the messages."""
+    module = import_module("rosbags.rosbag1" if kind == "ros1" else "rosbags.rosbag2")
+    store = layouts_bag.BagFile(root / "scratch.bag" if kind == "ros1" else root / "scratch", kind)
+    store.writer.close()
+    root.mkdir(parents=True, exist_ok=True)
+    with module.Reader(path) as reader:
+        stored = list(reader.messages())
+        for part in range(2):
+            end = {"ros1": ".bag"}.get(kind, "")
+            name = f"walk_2024-01-02-03-0{part}-05_{part}" if kind == "ros1" else f"walk_{part}"
+            bag = layouts_bag.BagFile(root / f"{name}{end}", kind)
+            for connection, received, raw in stored[part::2] if part else stored[::2]:
+                if connection.topic not in bag.connections:
+                    bag.connections[connection.topic] = bag.writer.add_connection(
+                        connection.topic, connection.msgtype, typestore=bag.store
+                    )
+                bag.writer.write(bag.connections[connection.topic], received, raw)
+            bag.writer.close()
+            if kind != "ros1":
+                (file,) = (root / name).glob(f"*.{kind}")
+                file.rename(root / f"{name}.{kind}")
+                shutil.rmtree(root / name)
+    for scratch in (root / "scratch.bag", root / "scratch"):
+        if scratch.is_dir():
+            shutil.rmtree(scratch)
+        scratch.unlink(missing_ok=True)
+
+
+@pytest.mark.parametrize("kind", ["ros1", "db3", "mcap"])
+def test_a_split_bag_without_metadata(tmp_path, kind):
+    path, _ = layouts_bag.write_bag(tmp_path / "whole", kind)
+    split(path, tmp_path / "parts", kind)
+    whole, parts = open_sequence(path), open_sequence(tmp_path / "parts")
+    assert (parts.layout, parts.name, parts.names) == ("bag", "parts", whole.names)
+    for a, b in zip(whole, parts, strict=True):
+        np.testing.assert_array_equal(a.image, b.image)
+        np.testing.assert_array_equal(a.depth, b.depth)
+        np.testing.assert_array_equal(a.T_world_cam, b.T_world_cam)
+    names = sorted(file.name for file in (tmp_path / "parts").iterdir())
+    (tmp_path / "parts" / names[1]).rename(tmp_path / "parts" / f"other{names[1][4:]}")
+    assert not find_sequences(tmp_path / "parts"), "two recordings"
+
+
+def test_a_bag_of_12_bit_images_and_png_depth(tmp_path, caplog):
+    """Image transport: depth is a CompressedImage, which only its format tells from a colour image."""
+    path, scene = layouts_bag.write_bag(tmp_path / "colour", compressed=True, depth=None)
+    bag_path = tmp_path / "walk"
+    bag = layouts_bag.BagFile(bag_path, "mcap")
+    for i, T in enumerate(scene.T_world_cam):
+        stamp = layouts_bag.START + i * layouts_bag.STEP
+        grey = np.rint(scene.images[i][..., 0] * (0.05 if i == 1 else 1.0) * 4095 / 255).astype(np.uint16)
+        if i % 2:
+            grey_message = bag.image(stamp, "optical", grey, "mono16", pad=6)
+        else:
+            grey_message = bag.image(stamp, "optical", grey, "mono16")
+        bag.write("/infra/image", stamp, grey_message)
+        bag.write("/infra/camera_info", stamp, bag.info(stamp, "optical"))
+        png = cv2.imencode(".png", np.rint(1000 * scene.depths[i]).astype(np.uint16))[1].tobytes()
+        bag.write("/aligned/image/compressed", stamp, bag.compressed(stamp, "optical", png, "16UC1; png compressed "))
+        bag.write("/pose", stamp, bag.pose_stamped(stamp, "map", T))
+    bag.writer.close()
+    sequence = open_sequence(bag_path)
+    for i, frame in enumerate(sequence):
+        expected = scene.images[i][..., :1] * (0.05 if i == 1 else 1.0)
+        np.testing.assert_allclose(frame.image, np.repeat(expected, 3, axis=2), atol=0.6)
+        np.testing.assert_allclose(frame.depth, scene.depths[i], atol=5e-4 + 1e-6)
+    assert "/infra/image: images of 16 bits, read as 0 to 4095 and scaled to bytes" in caplog.text
+    assert open_sequence(path)[0].depth is None
+
+
+def test_a_topic_and_its_transports_are_one(tmp_path):
+    """A recording of all topics has the same images several times."""
+
+    def transports(bag):
+        for i, image in enumerate(scene.images):
+            stamp = layouts_bag.START + i * layouts_bag.STEP
+            png = cv2.imencode(".png", image[..., ::-1])[1].tobytes()
+            bag.write("/camera/image/compressed", stamp, bag.compressed(stamp, "optical", png, "bgr8; png compressed"))
+            png = cv2.imencode(".png", np.rint(1000 * scene.depths[i]).astype(np.uint16))[1].tobytes()
+            for name, head, form in (
+                ("compressed", 0, "png compressed "),
+                ("compressedDepth", 12, "compressedDepth png"),
+            ):
+                message = bag.compressed(stamp, "optical", bytes(head) + png, f"16UC1; {form}")
+                bag.write(f"/aligned/{name}", stamp, message)
+
+    scene = layouts.truth(layouts_bag.K)
+    path, _ = layouts_bag.write_bag(tmp_path, depth=None, change=transports)
+    sequence = open_sequence(path)
+    for frame, image, depth in zip(sequence, scene.images, scene.depths, strict=True):
+        np.testing.assert_array_equal(frame.image, image)
+        np.testing.assert_allclose(frame.depth, depth, atol=5e-4 + 1e-6)
+    for topic in ("/camera/image/compressed", "/aligned/compressed"):
+        assert len(open_sequence(path, topics=[topic])) == 6
+
+
+def test_16_bit_colours_in_png_messages(tmp_path):
+    """A CompressedImage of mono16 is a grey image."""
+    bag = layouts_bag.BagFile(tmp_path / "walk", "mcap")
+    values = np.linspace(0, 65535, 48 * 64).reshape(48, 64).astype(np.uint16)
+    stamp = layouts_bag.START
+    png = cv2.imencode(".png", values)[1].tobytes()
+    bag.write("/camera/image/compressed", stamp, bag.compressed(stamp, "optical", png, "mono16; png compressed "))
+    bag.write("/camera/camera_info", stamp, bag.info(stamp, "optical"))
+    bag.write("/pose", stamp, bag.pose_stamped(stamp, "map", np.eye(4)))
+    bag.writer.close()
+    with warnings.catch_warnings():
+        image = open_sequence(tmp_path / "walk")[0].image
+    np.testing.assert_array_equal(image, np.repeat(grey_bytes(values, 65535)[..., None], 3, axis=2))

@@ -1,0 +1,115 @@
+"""Anchors of a depth camera: its depth, thinned to what the posterior can use, with the variance of its kind of sensor.
+
+The sensor's depth has holes, ends at a range and is wrong at edges. There, landmarks of the images complete it
+(:func:`completed`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.nn.functional import max_pool2d
+
+from ufmstar_torch.anchors.landmarks import Landmarks
+
+# Cells of the image on each side, of which each gives at most one anchor: the nodes of the posterior's grid.
+_CELLS = 28
+# Candidates in a cell on each side; larger maps are subsampled.
+_CANDIDATES = 6
+# Side of the neighbourhood of a candidate [px], in which depths differ at most by this share of the depth and this many
+# standard deviations: at edges, sensors measure the wrong surface or a mean of two.
+_SIDE, _SHARE, _SIGMAS = 5, 0.02, 3.0
+
+
+# Standard deviation of a depth z, sigma = a + b z + c z^2 [m], by kind of sensor. Stereo and structured light measure a
+# disparity: .0019 z^2 for a Kinect (Nguyen, Izadi and Lovell, 2012), .0037 z^2 for a RealSense D435 with a matching
+# error of .08 px. Time of flight: 1 cm and 1 %; Azure Kinect's data sheet states 11 mm + .1 %, and a noise of 17 mm.
+_SIGMA = {"stereo": (0.001, 0.0, 0.003), "tof": (0.01, 0.01, 0.0)}
+SENSORS = tuple(_SIGMA)
+
+
+def sensor_landmarks(
+    depth: NDArray[np.float32],
+    K_depth: NDArray[np.float64],
+    K: NDArray[np.float64],
+    kind: str = "stereo",
+) -> Landmarks:
+    """At most one depth in each of 28 x 28 cells, that nearest to the cell's centre, away from depth edges.
+
+    Args:
+        depth: [H, W] of the sensor, 0 = none [m].
+        K_depth: [3, 3] of the depth map [px].
+        K: [3, 3] of the image, which has the same pose [px].
+        kind: of the sensor: "stereo" (also structured light) or "tof".
+
+    Returns:
+        Landmarks in the pixels of the image.
+
+    Raises:
+        ValueError: ``depth`` is no map, or an unknown kind.
+    """
+    if kind not in SENSORS:
+        raise ValueError(f"kind must be one of {', '.join(SENSORS)}, got {kind!r}")
+    if depth.ndim != 2 or not np.issubdtype(depth.dtype, np.floating):
+        raise ValueError(f"depth must be a map [H, W] of floating-point numbers, got {depth.dtype} {depth.shape}")
+    size = np.array(depth.shape)
+    step = max(1, int(size.min()) // (_CELLS * _CANDIDATES))
+    v, u = (step * index for index in np.nonzero(_away_from_edges(depth, kind)[::step, ::step]))
+    row, column = _CELLS * v // size[0], _CELLS * u // size[1]
+    off_centre = np.hypot(_CELLS * (v + 0.5) / size[0] - row - 0.5, _CELLS * (u + 0.5) / size[1] - column - 0.5)
+    cell = row * _CELLS + column
+    order = np.lexsort((off_centre, cell))
+    chosen = order[np.diff(cell[order], prepend=-1) > 0]
+    v, u = v[chosen], u[chosen]
+    z = depth[v, u].astype(np.float64)
+    mapping = K @ np.linalg.inv(K_depth)
+    pixel = np.stack([u, v, np.ones_like(u)], axis=-1) @ mapping.T
+    return Landmarks(pixel[:, :2], z, np.square(_sigma(z, kind)), len(z), none="no depth of the sensor")
+
+
+def completed(sensor: Landmarks, others: Landmarks, covered: NDArray[np.bool_]) -> Landmarks:
+    """The sensor's landmarks, and those of the images on pixels without the sensor's depth.
+
+    Args:
+        sensor: in the pixels of the image.
+        others: likewise; their figures of poses are those of the result.
+        covered: [H, W] of the image, True where the sensor measured.
+    """
+    if not len(others.depth):
+        return sensor
+    height, width = covered.shape
+    column, row = (
+        np.rint(x).astype(int).clip(0, size - 1) for x, size in zip(others.pixel.T, (width, height), strict=True)
+    )
+    apart = ~(_spread(covered.astype(np.float32)) > 0)[row, column]
+    return replace(
+        others,
+        pixel=np.concatenate([sensor.pixel, others.pixel[apart]]),
+        depth=np.concatenate([sensor.depth, others.depth[apart]]),
+        variance=np.concatenate([sensor.variance, others.variance[apart]]),
+        tracked=sensor.tracked + others.tracked,
+    )
+
+
+def _sigma(z: NDArray[np.float64], kind: str) -> NDArray[np.float64]:
+    """Standard deviations of depths, of the same shape [m]."""
+    a, b, c = _SIGMA[kind]
+    return a + b * z + c * np.square(z)
+
+
+def _away_from_edges(depth: NDArray[np.float32], kind: str) -> NDArray[np.bool_]:
+    """[H, W] True where there is a depth, and those around it are similar."""
+    valid = np.isfinite(depth) & (depth > 0)
+    farthest = _spread(np.where(valid, depth, 0).astype(np.float32))
+    nearest = 1 / _spread(np.where(valid, 1 / np.where(valid, depth, 1), 1e-6).astype(np.float32))
+    z = np.where(valid, depth, 0).astype(np.float64)
+    return valid & (farthest - nearest <= _SHARE * z + _SIGMAS * _sigma(z, kind))
+
+
+def _spread(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[H, W] the largest value within ``_SIDE`` pixels."""
+    largest = max_pool2d(torch.from_numpy(np.ascontiguousarray(values))[None, None], _SIDE, 1, _SIDE // 2)
+    return np.asarray(largest[0, 0].numpy())
