@@ -67,7 +67,7 @@ class Options:
     topics: tuple[str, ...] = ()
     drive: str | int | None = field(default=None, metadata=_WORD)
     scans: int | None = None  # moving things smear
-    plugin: tuple[str, ...] = ()
+    plugin: tuple[str, ...] = field(default=(), metadata={"typed": True})
 
     def __post_init__(self) -> None:
         for name in ("intrinsics", "depth_intrinsics"):
