@@ -1,7 +1,7 @@
 """Output folders: the program that owns a folder, its settings, and the lock of the process that writes there.
 
 A folder belongs to a program once it contains the manifest of that program's :class:`FolderKind`. Files of other
-programs are never touched.
+programs are never touched, and nothing is written or removed through a symbolic link.
 """
 
 from __future__ import annotations
@@ -9,10 +9,9 @@ from __future__ import annotations
 import errno
 import json
 import os
-import shutil
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,7 +41,9 @@ class FolderKind:
     program: str  # as "ufmstar run"; the manifest contains it
     noun: str  # for messages: "run", "evaluation", "training", "demo"
     manifest: str  # path of the manifest below the folder
-    files: tuple[str, ...]  # glob patterns of the files and folders of earlier work, without the manifest
+    files: tuple[str, ...]  # glob patterns of the files of earlier work, without the manifest
+    # By pattern, a function that recognises the program's files by their content where a user may have others.
+    recognise: Mapping[str, Callable[[Path], bool]] = field(default_factory=dict)
     # Format of the manifest and the other files; None = work cannot be resumed, and a summary replaces the manifest at
     # the end.
     format: int | None = None
@@ -93,14 +94,35 @@ class FolderKind:
         return True
 
     def clear(self, out: Path) -> None:
-        """Remove the files of earlier work, by their names. Raises FolderError: a process works on a part of it."""
+        """Remove the files of earlier work, and the folders that are empty then. Raises FolderError: a process works on
+        a part of it."""
         with ExitStack() as locks:
             for path in [path for pattern in self.parts for path in out.glob(pattern)]:
                 if (lock := hold(path)) is None:
                     raise FolderError(f"--out {out}: another process is working there now ({path.name})")
                 locks.callback(lock.release)
-            for path in [path for pattern in self.files for path in out.glob(pattern)]:
-                shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+            folders = set[Path]()
+            for pattern in self.files:
+                ours = self.recognise.get(pattern, lambda _: True)
+                for path in [path for path in out.glob(pattern) if path.is_file() and ours(path)]:
+                    path.unlink()
+                    folders |= set(path.parents[: len(path.relative_to(out).parents) - 1])
+            for folder in sorted(folders, key=lambda path: -len(path.parts)):
+                with suppress(OSError):  # files of others remain in it
+                    folder.rmdir()
+
+    def require_no_links(self, out: Path) -> None:
+        """Raises FolderError: a file or folder below ``out`` to which the program writes is a symbolic link."""
+        for name in (self.manifest, *filter(None, [self.lock]), *self.parts, *self.files):
+            parts = Path(name).parts
+            for pattern in (str(Path(*parts[:length])) for length in range(1, len(parts) + 1)):
+                # glob omits links to nothing where a pattern has no wildcard
+                for path in (out / pattern, *out.glob(pattern)):
+                    if path.is_symlink():
+                        text = (
+                            "is a symbolic link, through which nothing is written: remove it or choose another folder"
+                        )
+                        raise FolderError(f"--out {out}: {path.relative_to(out)} {text}")
 
     def _foreign(self, out: Path) -> list[Path]:
         """Entries other than those of a process that was killed before it wrote the manifest."""
@@ -127,10 +149,11 @@ def output_folder(
 
     Raises:
         FolderError: as :meth:`FolderKind.earlier`; or the earlier work has other values (the message names them), or
-            another process holds the folder's lock.
+            another process holds the folder's lock, or a link is in the way.
         OSError: the folder cannot be made or locked.
     """
     kind.earlier(out, resume=resume, overwrite=overwrite)
+    kind.require_no_links(out)
     (out / kind.manifest).parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as locks:
         if kind.lock is not None:
