@@ -98,7 +98,7 @@ def with_images(frames: Iterator[RunFrame], sequence: FrameSequence) -> Iterator
         yield frame
     if not common:
         raise ValueError(
-            f"--sequence: {sequence.name!r} has none of the run's frames: name the run's recording, with the same options"
+            f"--sequence: {sequence.name!r} has none of the run's frames: open the run's recording as it did"
         )
 
 

@@ -40,7 +40,7 @@ def own_output(path: Path) -> OwnOutput | None:
 
 
 def read_records(content: bytes, file: Path) -> list[dict]:
-    """The lines of frames.jsonl, each with "name" and "state", and "index" and "intrinsics" or "reason"; ``file`` is its
+    """The lines of frames.jsonl, each with "name", "state" and "index", and "intrinsics" or "reason"; ``file`` is its
     name for messages. Raises ValueError: a line has another form; the message names line and field."""
     records = []
     for number, line in enumerate(content.splitlines(), start=1):

@@ -19,6 +19,7 @@ from ufmstar_torch.eval.sequences.frame import FrameError
 from ufmstar_torch.eval.sequences.images import positive, read_color
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.poses import trajectory_of
+from ufmstar_torch.limits import require_pixels
 from ufmstar_torch.trajectory import Trajectory, interpolate_pose
 
 _DEPTHS = {"16UC1": "u2", "32FC1": "f4"}
@@ -86,6 +87,7 @@ def _compressed_depth(data: bytes, form: str, path: Path) -> np.ndarray:
     try:
         _, a, b = struct.unpack_from("<iff", data)
         with Image.open(BytesIO(data[12:])) as image:
+            require_pixels("the map", (image.height, image.width))
             values, mode = np.array(image), image.mode
     except (struct.error, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise FrameError(path, f"compressed depth ({form[:40]!r}) must be PNG: {error}") from error

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ufmstar_torch.eval.sequences.frame import FrameError, Size
+from ufmstar_torch.limits import require_pixels
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 
@@ -34,6 +35,7 @@ class Video:
 
         height, width = capture.get(cv2.CAP_PROP_FRAME_HEIGHT), capture.get(cv2.CAP_PROP_FRAME_WIDTH)
         self.size: Size = int(height), int(width)
+        require_pixels(f"{self.path}: a frame", self.size)
         named = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         self._length = named if named > 0 else len(self._decoded_times())
         if self._length == 0 or 0 in self.size:
