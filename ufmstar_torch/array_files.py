@@ -16,7 +16,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from ufmstar_torch.limits import MOST_BYTES, require_bytes
+from ufmstar_torch.limits import require_bytes
 
 # The errors that NumPy, zipfile and its decompressors raise for damaged files (found by changing every byte).
 _DAMAGED = (
@@ -85,7 +85,8 @@ def _array(file: BinaryIO, size: int) -> NDArray[Any]:
     header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
     shape, _, dtype = header(file)
     stated = prod(shape) * dtype.itemsize
-    if min(shape, default=0) < 0 or not 0 <= stated <= min(MOST_BYTES, size - file.tell()):
+    require_bytes(f"an array {list(shape)} of {dtype}", stated)
+    if min(shape, default=0) < 0 or not 0 <= stated <= size - file.tell():
         raise ValueError(f"its header states {list(shape)} values of {dtype}; it holds {size:,} bytes")
     file.seek(0)
     array: NDArray[Any] = npy.read_array(file, allow_pickle=False)

@@ -24,6 +24,7 @@ from ufmstar_torch.atomic import write_atomic
 from ufmstar_torch.camera import rotation_deviation
 from ufmstar_torch.frame import FRAME_FAULTS, pose_fault
 from ufmstar_torch.pipeline import UncertainDepth, UncertainPrediction
+from ufmstar_torch.stream_clock import JUMP, StreamClock, Verdict
 from ufmstar_torch.stream_warnings import LOGGER
 from ufmstar_torch.trajectory import SAME_TIME, Trajectory, interpolate_pose
 
@@ -31,7 +32,9 @@ from ufmstar_torch.trajectory import SAME_TIME, Trajectory, interpolate_pose
 NEWER, CLOSED = "a newer image was ready", "closed"
 BACKWARDS, LATE, GAP = "its stamp is not after the image before", "no pose in time", "poses too far apart around it"
 LOST = "a pose around it is not finite"
+DOUBTFUL = "its stamp is far from those before it"
 _WAITING = 16  # most images that wait for their poses: half a second at 30 frames/s
+_DOUBTFUL = 64  # most poses with doubtful stamps that wait for others
 _POSES = 4096  # most poses in the buffer: 4 s of an inertial filter at 1 kHz
 
 
@@ -59,6 +62,7 @@ class LiveStatistics:
 
     images: int  # pushed
     poses: int  # pushed
+    dropped_poses: int  # those with a stamp far from the ones before
     results: int  # delivered
     dropped: Mapping[str, int]  # by reason: usable images
     skipped: Mapping[str, int]  # by reason: unusable images
@@ -82,7 +86,9 @@ class LiveDepth:
     ``push_image`` and ``push_pose`` may be called from any thread and return at once. Poses may be late: an image waits
     for the first pose after it, at most ``max_wait``, and gets the pose interpolated at its stamp. There is no queue:
     when the model is free, it processes the newest image with a pose, and all older images are dropped. ``statistics``
-    counts drops and skips by reason. Stamps of images and poses must come from one clock, in seconds.
+    counts drops and skips by reason. Stamps of images and poses must come from one clock, in seconds. A single stamp
+    that is over two seconds away from those before it is dropped and counted; the third in sequence is a jump of the
+    clock, which is logged and followed.
 
     Args:
         model: an :class:`UncertainDepth` on one stream; from now on, only this object may call it. Call
@@ -135,6 +141,8 @@ class LiveDepth:
         self._times: list[float] = []  # of the poses, increasing
         self._poses: list[np.ndarray] = []
         self._last_image = -math.inf
+        self._image_clock, self._pose_clock = StreamClock(), StreamClock()
+        self._doubtful: list[tuple[float, np.ndarray]] = []  # poses whose stamps nothing has confirmed
         self._busy = self._ending = self._ended = self._resetting = False
         self._counts, self._dropped, self._skipped = Counter[str](), Counter[str](), Counter[str]()
         self._error: BaseException | None = None
@@ -165,9 +173,14 @@ class LiveDepth:
             self._counts["images"] += 1
             if self._ending:
                 self._dropped[CLOSED] += 1
-            elif stamp <= self._last_image:
+            elif (verdict := self._image_clock.judge(stamp, received)) == Verdict.WAIT:
+                self._skip(DOUBTFUL, stamp)
+            elif verdict == Verdict.USE and stamp <= self._last_image:
                 self._skip(BACKWARDS, stamp)
             else:
+                if verdict == Verdict.JUMPED:
+                    LOGGER.warning("the images' clock jumped from %.3f s to %.3f s", self._last_image, stamp)
+                    self._drop_waiting(len(self._waiting), NEWER)
                 self._last_image = stamp
                 if len(self._waiting) == _WAITING:  # drop the newest: older images get their poses first
                     self._waiting.pop()
@@ -176,8 +189,8 @@ class LiveDepth:
                 self._changed.notify_all()
 
     def push_pose(self, stamp: float, T: CameraLike) -> None:
-        """Submit the camera's pose at a time; poses may come late and in any order. A pose replaces an earlier one with
-        the same stamp.
+        """Submit the camera's pose at a time; poses may come late, and in any order within two seconds. A pose replaces
+        an earlier one with the same stamp.
 
         Args:
             stamp: [s].
@@ -191,29 +204,56 @@ class LiveDepth:
         stamp, pose = _seconds(stamp), _pose(T, self.model.ufm.config.rotation_tolerance)
         with self._changed:
             self._counts["poses"] += 1
-            index = bisect_left(self._times, stamp)
-            if index < len(self._times) and self._times[index] == stamp:
-                self._poses[index] = pose
-            else:
-                self._times.insert(index, stamp)
-                self._poses.insert(index, pose)
-            del self._times[:-_POSES], self._poses[:-_POSES]
+            if not self._replaced(stamp, pose):
+                self._insert(stamp, pose)
             self._changed.notify_all()
+
+    def _replaced(self, stamp: float, pose: np.ndarray) -> bool:
+        """Replace the pose in the buffer that has the same stamp; False if there is none."""
+        index = bisect_left(self._times, stamp)
+        if index == len(self._times) or self._times[index] != stamp:
+            return False
+        self._poses[index] = pose
+        return True
+
+    def _insert(self, stamp: float, pose: np.ndarray) -> None:
+        """Insert a pose with a new stamp; after a jump of the clock, instead of all others."""
+        before = self._pose_clock.latest
+        verdict = self._pose_clock.judge(stamp, perf_counter(), self._image_clock.newest)
+        if verdict == Verdict.WAIT:
+            self._doubtful.append((stamp, pose))
+            self._counts["dropped_poses"] += max(len(self._doubtful) - _DOUBTFUL, 0)
+            del self._doubtful[:-_DOUBTFUL]
+            return
+        new = [(stamp, pose)]
+        if verdict == Verdict.JUMPED:
+            LOGGER.warning("the poses' clock jumped from %.3f s to %.3f s", before, stamp)
+            new = [one for one in self._doubtful if abs(one[0] - stamp) <= JUMP] + new
+            self._times, self._poses = [], []
+        self._counts["dropped_poses"] += len(self._doubtful) - (len(new) - 1)
+        self._doubtful = []
+        for time, T in new:
+            index = bisect_left(self._times, time)
+            self._times.insert(index, time)
+            self._poses.insert(index, T)
+        del self._times[:-_POSES], self._poses[:-_POSES]
 
     @property
     def statistics(self) -> LiveStatistics:
         """Counts so far."""
         with self._changed:
-            counts = {name: self._counts[name] for name in ("images", "poses", "results", "saved", "restarts")}
+            names = ("images", "poses", "dropped_poses", "results", "saved", "restarts")
+            counts = {name: self._counts[name] for name in names}
             return LiveStatistics(**counts, dropped=dict(self._dropped), skipped=dict(self._skipped))
 
     def reset(self) -> None:
         """Drop poses and waiting images, and reset the model before its next image. Call this after a loop closure that
-        moved old poses, or after a jump of the clock."""
+        moved old poses."""
         self._raise()
         with self._changed:
             self._drop_waiting(len(self._waiting), NEWER)
             self._times, self._poses, self._last_image, self._resetting = [], [], -math.inf, True
+            self._image_clock, self._pose_clock, self._doubtful = StreamClock(), StreamClock(), []
 
     def wait_idle(self, timeout: float | None = None) -> bool:
         """Wait at most ``timeout`` [s] until no image waits or is processed (not in ``on_result``). Returns False after

@@ -181,7 +181,7 @@ def _run(
                     if not warm:  # the first inference takes seconds; a recording's clock starts after it
                         height, width = event.image.shape[:2]
                         model.warm_up((height, width))
-                        warm = True
+                        deadline, warm = monotonic() + options.seconds, True
                     live.push_image(event.stamp, event.image, event.intrinsics)
             live.wait_idle()
     except (OSError, RuntimeError, TypeError, ValueError) as error:
