@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
-from itertools import takewhile
 from pathlib import Path
 from time import monotonic
 from typing import Any, ClassVar
@@ -174,7 +173,9 @@ def _run(
     live = LiveDepth(model, on_result, K, state=options.state, save_every=options.save_every, **how)
     try:
         with _interrupted_by_sigterm(), live, suppress(KeyboardInterrupt):
-            for event in takewhile(lambda _: monotonic() < deadline, events):
+            for event in events:
+                if monotonic() >= deadline:
+                    break
                 if event.T_world_cam is not None:
                     live.push_pose(event.stamp, event.T_world_cam)
                 if event.image is not None:
