@@ -31,8 +31,8 @@ class PinholeCamera(Protocol):
 
 
 def as_tensor(name: str, value: object) -> Tensor:
-    """Convert the argument ``name``, a tensor or a NumPy array of numbers, to a tensor. Masked entries of a masked array
-    become NaN, which is not valid, or False.
+    """Convert the argument ``name``, a tensor or a NumPy array of numbers, to a tensor. Masked entries become NaN (not
+    valid) or False.
 
     Raises:
         TypeError: ``value`` is neither, or a masked array of whole numbers.

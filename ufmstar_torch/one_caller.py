@@ -7,6 +7,8 @@ from collections.abc import Callable
 from functools import wraps
 from typing import Any, TypeVar
 
+import torch
+
 Class = TypeVar("Class")
 
 
@@ -63,6 +65,11 @@ def _guarded(method: Callable[..., Any]) -> Callable[..., Any]:
         finally:
             self._caller.leave()
 
+    # As torch.compiler.disable, which imports the compiler (6 s): torch.compile runs the method as it is.
+    frames = torch._C._dynamo.eval_frame
+    skip = frames._FrameAction.SKIP
+    frames.set_code_exec_strategy(guarded.__code__, frames._FrameExecStrategy(skip, skip))
+    guarded._torchdynamo_disable = True
     return guarded
 
 

@@ -57,8 +57,7 @@ class UfMStar(StatefulModule):
 
         ufm = UfMStar()
         for image, T_world_cam in video:
-            out = ufm(network(image), T_world_cam, K)   # depth [B, H, W]
-            trust = out.std  # [m]
+            out = ufm(network(image), T_world_cam, K)   # depth [B, H, W]; out.std is how far to trust it [m]
     """
 
     STATE = NAMES
@@ -103,9 +102,9 @@ class UfMStar(StatefulModule):
 
         Args:
             depth: [B, H, W] or [B, 1, H, W] metric depth along the optical axis [m], any floating dtype; all arguments
-                are tensors or NumPy arrays; masked entries are not valid. The accepted range is [1e-6 m, 1e6 m], and at most
+                are tensors or NumPy arrays. The accepted range is [1e-6 m, 1e6 m], and at most
                 ``config.segment.max_depth``: set it to the network's largest depth. Pixels beyond it
-                (``statistics.beyond``) or otherwise outside (``out_of_range``), NaN and infinity are not valid.
+                (``statistics.beyond``) or otherwise outside (``out_of_range``), NaN, infinity and masked are not valid.
             pose: [B, 4, 4] or [4, 4] camera-to-world (T_world_cam) [m], or without its last row; coordinates up to
                 1e9 m. Rotations within ``config.rotation_tolerance`` are projected onto SO(3).
             intrinsics: [B, 3, 3] or [3, 3], or fx, fy, cx, cy, in pixels of this depth map (not of the image:
@@ -270,9 +269,8 @@ class UfMStar(StatefulModule):
             self._extensions.require_state(state)
 
     def _checked(self, depth: Tensor, pose: CameraLike, intrinsics: CameraLike, *optional: Array | None) -> FrameInput:
-        aleatoric, epistemic, valid, features = optional
         return check_frame(
-            depth, pose, intrinsics, aleatoric, epistemic, valid, features,
+            depth, pose, intrinsics, *optional,
             feature_count=self.config.features, aleatoric_in_h=self.config.aleatoric_in_h,
             rotation_tolerance=self.config.rotation_tolerance, max_depth=self.config.segment.depth_limit,
             kernel=self._kernels(depth.device.type)[1],
