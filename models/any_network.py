@@ -17,6 +17,7 @@ from ufmstar_torch.models.hugging_face import from_hugging_face, of_transformers
 from ufmstar_torch.models.network import DeclaredNetwork, DepthNetwork
 from ufmstar_torch.models.outputs import METRIC, OutputSpec, PlainSpec, ProgramSpec, Spread
 from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.networks_in_turn import require_switchable
 from ufmstar_torch.prediction import DepthPrediction, infer
 from ufmstar_torch.prediction import takes_intrinsics as declares_intrinsics
 from ufmstar_torch.stream_warnings import LOGGER
@@ -137,11 +138,14 @@ def wrap_network(
 
     Raises:
         ValueError: ``inverse``, a value out of range, MiDaS, or a relative model of ``transformers``.
-        TypeError: ``network`` cannot be called, or does not estimate depth; ``preprocess`` has another type.
+        TypeError: ``network`` cannot be called, does not estimate depth, or has a ``train`` that is not PyTorch's;
+            ``preprocess`` has another type.
     """
     if isinstance(network, type) or not callable(network):
         raise TypeError(f"network must be an nn.Module or a function, got {_described(network)}")
     refuse_relative(network)
+    if isinstance(network, nn.Module):
+        require_switchable(network)
     _warn_of_training(network)
     if of_transformers(network):
         if (

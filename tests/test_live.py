@@ -232,6 +232,37 @@ def test_a_slow_stream_and_a_pause_are_no_jump(monkeypatch):
     assert clock.judge(3872.0, now + 3600.0) == Verdict.USE
 
 
+def test_a_second_process_may_not_write_the_same_state(model, tmp_path):
+    """Temporary files of a killed one are removed at the start, other files stay."""
+    file = tmp_path / "s.pt"
+    left, other = tmp_path / ".s.pt.0123456789ab.tmp", tmp_path / ".other.pt.0123456789ab.tmp"
+    left.write_text("half a state")
+    other.write_text("of another program")
+    code = f"""
+import sys, torch
+from ufmstar_torch import DepthPrediction, LiveDepth, UncertainDepth
+class Network(torch.nn.Module):
+    def forward(self, x): return DepthPrediction(torch.full((1, 8, 8), 2.0))
+with LiveDepth(UncertainDepth(Network()), print, state={str(file)!r}):
+    print("holds it", flush=True)
+    sys.stdin.read()
+"""
+    words = [sys.executable, "-P", "-c", code]
+    first = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        assert first.stdout.readline() == "holds it\n"
+        assert (left.exists(), other.exists()) == (False, True)
+        with pytest.raises(ValueError, match=r"state: another process is writing .*s\.pt"):
+            LiveDepth(model, print, K, state=file)
+    finally:
+        first.kill()
+        first.communicate()
+    with LiveDepth(model, print, K, state=file):
+        (tmp_path / "link.pt").symlink_to(file)
+        with pytest.raises(ValueError, match="another process is writing"):
+            LiveDepth(model, print, K, state=tmp_path / "link.pt")
+
+
 def test_a_reset_forgets_views_and_times(model):
     results = []
     with LiveDepth(model, results.append, K, max_wait=0.02) as live:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import sys
 from bisect import bisect_left
 from collections import Counter
@@ -12,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from threading import Condition, Thread, current_thread
 from time import perf_counter
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import torch
@@ -20,13 +21,17 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.landmarks import OtherCameraError
 from ufmstar_torch.arguments import CameraLike, ImageLike, as_image, as_intrinsics, as_pose
-from ufmstar_torch.atomic import write_atomic
+from ufmstar_torch.atomic import remove_temporaries, write_atomic
 from ufmstar_torch.camera import rotation_deviation
+from ufmstar_torch.file_lock import hold
 from ufmstar_torch.frame import FRAME_FAULTS, pose_fault
 from ufmstar_torch.pipeline import UncertainDepth, UncertainPrediction
 from ufmstar_torch.stream_clock import JUMP, StreamClock, Verdict
 from ufmstar_torch.stream_warnings import LOGGER
 from ufmstar_torch.trajectory import SAME_TIME, Trajectory, interpolate_pose
+
+if TYPE_CHECKING:
+    from filelock import BaseFileLock
 
 # Reasons for which an image is dropped (NEWER, CLOSED) or skipped (the others).
 NEWER, CLOSED = "a newer image was ready", "closed"
@@ -102,7 +107,7 @@ class LiveDepth:
         save_every: see ``state``.
 
     Raises:
-        TypeError, ValueError: an argument is invalid.
+        TypeError, ValueError: an argument is invalid, or another process writes ``state``.
         FileNotFoundError: the folder of ``state`` does not exist.
 
     An image of another size or camera resets the evidence of the model's anchors. An error in the model, in
@@ -133,6 +138,7 @@ class LiveDepth:
             raise FileNotFoundError(f"state: no such folder: {self._state.parent}")
         if self._state is not None and self._state.is_dir():
             raise IsADirectoryError(f"state must be a file, got the folder {self._state}")
+        self._lock = None if self._state is None else self._locked(self._state)
         self.model, self._on_result = model, on_result
         self._intrinsics = None if intrinsics is None else as_intrinsics(intrinsics)
         self._max_wait, self._max_gap, self._save_every = max_wait, max_gap, save_every
@@ -148,6 +154,17 @@ class LiveDepth:
         self._error: BaseException | None = None
         self._worker = Thread(target=self._run, name="ufmstar live", daemon=True)
         self._worker.start()
+
+    @staticmethod
+    def _locked(state: Path) -> BaseFileLock:
+        """Lock the file of the state, and remove temporary files of a killed process. Raises ValueError: another
+        process writes it."""
+        file = Path(os.path.realpath(state))
+        lock = hold(file.with_name(f".{file.name}.lock"))
+        if lock is None:
+            raise ValueError(f"state: another process is writing {state}: each needs a file of its own")
+        remove_temporaries(path for path in file.parent.iterdir() if path.name.startswith(f".{file.name}."))
+        return lock
 
     def push_image(self, stamp: float, rgb: ImageLike, intrinsics: CameraLike | None = None) -> None:
         """Submit an image.
@@ -293,6 +310,8 @@ class LiveDepth:
         with ExitStack() as stack:
             stack.push(self._keep_error)
             self._work()
+        if self._lock is not None:
+            self._lock.release()
         with self._changed:
             self._busy, self._ended = False, True
             self._changed.notify_all()

@@ -39,7 +39,14 @@ _VIEWS, _ANGLE, _MOST_ERROR, _LEAST_ERROR = 3, np.radians(1.5), 2.0, 0.5
 
 _KEYFRAMES = "images/*.jpg"
 _MADE = (_KEYFRAMES, "sparse/[0-9]*/*.bin", "sparse/unsorted/[0-9]*/*.bin", "rgb.txt", "landmarks.npz", "database.db")
-POSES = FolderKind("ufmstar poses", "reconstruction", SCALE_FILE, _MADE, recognise={_KEYFRAMES: is_keyframe})
+POSES = FolderKind(
+    "ufmstar poses",
+    "reconstruction",
+    SCALE_FILE,
+    _MADE,
+    recognise={_KEYFRAMES: is_keyframe},
+    temporary=(".*.tmp", "images/.*.tmp"),
+)
 
 
 def require_pycolmap() -> Any:

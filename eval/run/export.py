@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.conventions import CONVENTIONS
 from ufmstar_torch.eval.run.colours import known_where
-from ufmstar_torch.eval.run.files import write_bytes_atomic, write_json_atomic
+from ufmstar_torch.eval.run.files import remove_temporaries, write_bytes_atomic, write_json_atomic
 from ufmstar_torch.eval.run.gaussians import vertex_table, write_ply
 from ufmstar_torch.eval.run.writers import encode_length_png, fitting_unit, frame_file, read_frame
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
@@ -219,6 +219,7 @@ def export_folder(out: Path, *names: str) -> Path:
     for folder in (out.joinpath("export", *names[:length]) for length in range(len(names) + 1)):
         linked = [folder] if folder.is_symlink() else []
         folder.mkdir(exist_ok=True)
+        remove_temporaries(folder.iterdir())
         if linked := linked or [path for path in folder.iterdir() if path.is_symlink()]:
             raise ValueError(f"{linked[0]} is a symbolic link, through which nothing is written: remove it")
     return folder

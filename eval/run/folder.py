@@ -6,26 +6,19 @@ programs are never touched, and nothing is written or removed through a symbolic
 
 from __future__ import annotations
 
-import errno
 import json
-import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ufmstar_torch.eval.run.files import remove_temporaries, to_json, write_json_atomic
+from ufmstar_torch.file_lock import hold as hold
 from ufmstar_torch.stateful import flat
 
-if TYPE_CHECKING:
-    from filelock import BaseFileLock
-
 _SHOWN = 5  # number of differences in a message
-_POLL_SECONDS = 0.02
 _UNFINISHED = "not finished"
-# Error codes of a file system without locks.
-_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 Manifest = Mapping[str, Any]
 
@@ -179,25 +172,6 @@ def output_folder(
         if not resumed or manifest != earlier:
             write_json_atomic(out / kind.manifest, manifest)
         yield resumed
-
-
-def hold(path: Path, *, wait: float = 0.0) -> BaseFileLock | None:
-    """Lock a file until the lock is released or the process ends in any way. None if another process, or an earlier
-    call, holds it for more than ``wait`` [s]. Raises OSError: the file cannot be opened or locked."""
-    from filelock import FileLock, Timeout
-
-    lock = FileLock(path, thread_local=False, fallback_to_soft=False)
-    try:
-        lock.acquire(timeout=wait, poll_interval=_POLL_SECONDS)
-    except Timeout:
-        return None
-    except (NotImplementedError, OSError) as error:
-        code = error.errno if isinstance(error, OSError) else errno.ENOSYS  # filelock's form of it
-        if code not in _NO_LOCKS:
-            raise
-        text = f"the file system does not support locks ({os.strerror(code)}), choose a folder on another one"
-        raise OSError(code, text, str(path)) from error
-    return lock
 
 
 def differences(old: Manifest, new: Manifest) -> str:

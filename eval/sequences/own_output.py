@@ -64,7 +64,7 @@ def _wrong_field(record: Any) -> str | None:
     fine = {
         "name": isinstance(name, str) and name != "" and not name.startswith(".") and not set(name) & set("/\\\0"),
         "state": state in ("done", "skipped"),
-        "index": type(index) is int and index >= 0,
+        "index": not done or (type(index) is int and index >= 0),
         "timestamp": "timestamp" not in record or _is_number(record["timestamp"]),
         "intrinsics": not done or (isinstance(K, list) and len(K) == 4 and all(map(_is_number, K)) and min(K[:2]) > 0),
         "reason": done or isinstance(record.get("reason"), str),
