@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import functools
 import inspect
-import io
-import json
-import re
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
-from zipfile import ZIP_STORED, BadZipFile, ZipFile
+from zipfile import BadZipFile
 
 import torch
 from torch import Tensor, nn
@@ -20,14 +17,16 @@ from ufmstar_torch.models.hugging_face import from_hugging_face, of_transformers
 from ufmstar_torch.models.network import DeclaredNetwork, DepthNetwork
 from ufmstar_torch.models.outputs import METRIC, OutputSpec, PlainSpec, ProgramSpec, Spread
 from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.networks_in_turn import require_switchable
 from ufmstar_torch.prediction import DepthPrediction, infer
 from ufmstar_torch.prediction import takes_intrinsics as declares_intrinsics
 from ufmstar_torch.stream_warnings import LOGGER
-from ufmstar_torch.tensor_files import read_tensors
 
-# Files of a torch.export archive: short texts, and tensors as raw bytes.
-_TEXTS = ("archive_format", "archive_version", "byteorder", "version", "serialization_id")
-_RAW = re.compile(r"[^/]+/data/(weights/weight|constants/tensor)_\d+")
+# Programs in files, by name of the network (``load_network``), and what their format can do.
+PROGRAMS = {
+    "exported": "a torch.export file (.pt2) holds pickled objects, which run any code when they are loaded",
+    "torchscript": "a TorchScript file is a program, which can write any file when it runs",
+}
 
 
 class WrappedNetwork(DeclaredNetwork):
@@ -139,11 +138,14 @@ def wrap_network(
 
     Raises:
         ValueError: ``inverse``, a value out of range, MiDaS, or a relative model of ``transformers``.
-        TypeError: ``network`` cannot be called, or does not estimate depth; ``preprocess`` has another type.
+        TypeError: ``network`` cannot be called, does not estimate depth, or has a ``train`` that is not PyTorch's;
+            ``preprocess`` has another type.
     """
     if isinstance(network, type) or not callable(network):
         raise TypeError(f"network must be an nn.Module or a function, got {_described(network)}")
     refuse_relative(network)
+    if isinstance(network, nn.Module):
+        require_switchable(network)
     _warn_of_training(network)
     if of_transformers(network):
         if (
@@ -177,25 +179,39 @@ def _described(value: object) -> str:
     return type(value).__name__ + several
 
 
-def load_torchscript(path: str | Path, spec: ProgramSpec | PlainSpec | None = None) -> WrappedNetwork:
-    """Load a TorchScript file (``torch.jit.save``) as a network, on the CPU; ``spec``: a :class:`ProgramSpec`, its
-    plain values or a JSON file. The file is a program: load only files that you trust. Raises FileNotFoundError: there
-    is no such file; ValueError: it is not a TorchScript file, or the spec is missing or invalid."""
+def load_torchscript(
+    path: str | Path, spec: ProgramSpec | PlainSpec | None = None, *, trust_code: bool = False
+) -> WrappedNetwork:
+    """Load a TorchScript file (``torch.jit.save``) as a network, on the CPU.
+
+    Args:
+        path: the file.
+        spec: a :class:`ProgramSpec`, its plain values or a JSON file.
+        trust_code: True allows the file to run its code. Set it only for a file whose origin you trust.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: ``trust_code`` is not set, it is not a TorchScript file, or the spec is missing or invalid.
+    """
     declared = ProgramSpec.required(spec)
+    program_file = _trusted("torchscript", path, trust_code)
     try:
-        program = torch.jit.load(_existing(path), map_location="cpu")
+        program = torch.jit.load(program_file, map_location="cpu")
     except RuntimeError as error:
         raise ValueError(f"{path} is not a readable TorchScript file: {error}") from error
     return _wrapped(program.eval(), declared, path)
 
 
-def load_exported(path: str | Path, spec: ProgramSpec | PlainSpec | None = None) -> WrappedNetwork:
-    """Load a ``torch.export`` file (``torch.export.save``, .pt2) as a network; arguments, trust and errors as
-    :func:`load_torchscript`. ``torch.export.load`` would unpickle any object in the archive, so an archive with other
-    content than tensors and the graph raises."""
+def load_exported(
+    path: str | Path, spec: ProgramSpec | PlainSpec | None = None, *, trust_code: bool = False
+) -> WrappedNetwork:
+    """Load a ``torch.export`` file (``torch.export.save``, .pt2) as a network; arguments and errors as
+    :func:`load_torchscript`."""
     declared = ProgramSpec.required(spec)
+    program_file = _trusted("exported", path, trust_code)
     try:
-        program = torch.export.load(_checked_copy(_existing(path))).module()
+        with open(program_file, "rb") as file:  # a name would have to end in .pt2
+            program = torch.export.load(file).module()
     except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, BadZipFile) as error:
         raise ValueError(
             f"{path} is not a readable torch.export file: {error}; expected a file of torch.export.save from a "
@@ -204,43 +220,21 @@ def load_exported(path: str | Path, spec: ProgramSpec | PlainSpec | None = None)
     return _wrapped(_Exported(program), declared, path)
 
 
+def _trusted(kind: str, path: str | Path, trust_code: bool) -> str:
+    """The file of a program. Raises FileNotFoundError: there is no such file; ValueError: the caller does not trust
+    it."""
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"no network file {path}")
+    if trust_code is not True:
+        raise ValueError(
+            f"{path} is not loaded: {PROGRAMS[kind]}. If you trust its origin, pass --trust-code (in Python "
+            "trust_code=True); files of ONNX and safetensors cannot run code and need no trust"
+        )
+    return str(path)
+
+
 def _wrapped(program: nn.Module, spec: ProgramSpec, path: str | Path) -> WrappedNetwork:
     return WrappedNetwork(program, spec.outputs, spec.preprocess or Preprocess(), spec.takes_intrinsics, str(path))
-
-
-def _checked_copy(path: str) -> io.BytesIO:
-    """Copy an archive into memory after checking its members: JSON, short texts, tensors and plain values. The copy is
-    necessary because a file can have two directories, one seen by Python's reader and one by torch's. Raises ValueError
-    (CheckpointError): other content."""
-    copied = io.BytesIO()
-    with ZipFile(path) as archive, ZipFile(copied, "w") as copy:
-        names = archive.namelist()
-        if any(entry.compress_type != ZIP_STORED for entry in archive.infolist()):
-            raise ValueError(
-                "it has compressed files, which may expand without limit; torch.export.save does not compress"
-            )
-        if len({name.casefold() for name in names}) != len(names):
-            raise ValueError("it has two files with the same name")
-        configs = [name for name in names if name.endswith("_config.json")]
-        payloads = [p for name in configs for p in json.loads(archive.read(name))["config"].values()]
-        pickled = {payload["path_name"] for payload in payloads if payload["use_pickle"]}
-        for name in names:
-            last, content = PurePosixPath(name).name, archive.read(name)
-            raw = _RAW.fullmatch(name) and last not in pickled
-            if last not in _TEXTS and not raw and not _is_json(content):
-                read_tensors(io.BytesIO(content), name)
-            copy.writestr(name, content)
-    copied.seek(0)
-    return copied
-
-
-def _is_json(content: bytes) -> bool:
-    """True if the content is empty or JSON, which cannot be a pickle."""
-    try:
-        json.loads(content or b"0")
-    except (ValueError, RecursionError):
-        return False
-    return True
 
 
 class _Exported(nn.Module):
@@ -256,9 +250,3 @@ class _Exported(nn.Module):
 
     def train(self, mode: bool = True) -> _Exported:
         return self
-
-
-def _existing(path: str | Path) -> str:
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"no network file {path}")
-    return str(path)

@@ -68,20 +68,29 @@ def channels_of(state: Mapping[str, Tensor], keys: Sequence[str], network: str, 
 def fill(module: nn.Module, state: Mapping[str, Tensor], source: str) -> None:
     """Fill a module from tensors, in place; all keys and shapes must match. Raises CheckpointError as
     :func:`load_weights`; the message names their ``source``."""
-    expected = module.state_dict()
-    shapes = {key: (tuple(state[key].shape), tuple(expected[key].shape)) for key in expected if key in state}
+    broken = [key for key in sorted(state) if not torch.isfinite(state[key]).all()]
+    require_shapes(module, {key: tuple(value.shape) for key, value in state.items()}, source, broken)
+    module.load_state_dict(state, strict=True)
+
+
+def require_shapes(
+    module: nn.Module, shapes: Mapping[str, tuple[int, ...]], source: str, broken: Sequence[str] = ()
+) -> None:
+    """Compare the shapes of weights, by key, with those of a module, which may be on the device "meta" and then takes
+    no memory. Raises CheckpointError: as :func:`fill`, also if there is a key of non-finite values in ``broken``."""
+    expected = {key: tuple(value.shape) for key, value in module.state_dict().items()}
+    both = [(key, shapes[key], expected[key]) for key in expected if key in shapes]
     faults = {
-        "missing": sorted(set(expected) - set(state)),
-        "unexpected": sorted(set(state) - set(expected)),
+        "missing": sorted(set(expected) - set(shapes)),
+        "unexpected": sorted(set(shapes) - set(expected)),
         "of another shape": [
-            f"{key} is {actual}, expected {wanted}" for key, (actual, wanted) in shapes.items() if actual != wanted
+            f"{key} is {actual}, expected {wanted}" for key, actual, wanted in both if actual != wanted
         ],
-        "with NaN or infinity": [key for key in sorted(state) if not torch.isfinite(state[key]).all()],
+        "with NaN or infinity": list(broken),
     }
     if texts := [f"{len(keys)} {what}: {some(keys)}" for what, keys in faults.items() if keys]:
         fit = f"{source} does not fit {type(module).__name__} ({len(expected)} keys)"
         raise CheckpointError(f"{fit}: {'; '.join(texts)}")
-    module.load_state_dict(state, strict=True)
 
 
 def read_safetensors(path: str | Path, prefix: str | None = "") -> tuple[dict[str, Tensor], Any]:
@@ -99,6 +108,20 @@ def read_safetensors(path: str | Path, prefix: str | None = "") -> tuple[dict[st
             tensors = {key[len(prefix or "") :]: file.get_tensor(key) for key in keys}
             return tensors, json.loads((file.metadata() or {}).get("metadata", "null"))
     except (safetensors.SafetensorError, json.JSONDecodeError, RecursionError) as error:
+        raise CheckpointError(f"{path} is not a readable safetensors file: {error}") from error
+
+
+def safetensors_shapes(path: str | Path, prefix: str = "") -> dict[str, tuple[int, ...]]:
+    """The shapes of the tensors of a .safetensors file, from its header; arguments, keys and errors as
+    :func:`read_safetensors`."""
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"no file of weights {path}")
+    safetensors = _safetensors("safetensors")
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            keys = [name for name in file.keys() if name.startswith(prefix)]  # noqa: SIM118 (the file is no mapping)
+            return {key[len(prefix) :]: tuple(file.get_slice(key).get_shape()) for key in keys}
+    except safetensors.SafetensorError as error:
         raise CheckpointError(f"{path} is not a readable safetensors file: {error}") from error
 
 

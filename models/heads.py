@@ -139,7 +139,11 @@ class UncertaintyNetwork(DepthNetwork):
 
 def with_head(backbone: Backbone, method: str, scales: int = 1) -> UncertaintyNetwork:
     """A backbone with the head of a method: "depth" (none), "aleatoric" or "evidential"; ``scales`` as in
-    :class:`UncertaintyNetwork`. Raises ValueError: another method, or more scales than the backbone has."""
+    :class:`UncertaintyNetwork`. Raises TypeError: ``backbone`` is no :class:`Backbone`; ValueError: another method, or
+    more scales than the backbone has."""
+    if not isinstance(backbone, Backbone):
+        remedy = "train_module(NETWORK, ...) of ufmstar_torch.train puts a head on any network"
+        raise TypeError(f"backbone must be a Backbone such as FastDepth, got {type(backbone).__name__}: {remedy}")
     if method not in HEADS:
         raise ValueError(f"method must be one of {list(HEADS)}, got {method!r}")
     return UncertaintyNetwork(backbone, HEADS[method], scales)

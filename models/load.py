@@ -49,7 +49,8 @@ def load_network(name: str, weights: str | Path | None = None, **options: Any) -
             depth_anything: ``spec`` with "size", "keep_aspect" and, for a relative checkpoint, "alignment" (a dict or
                 a JSON file). ``weights``: a directory or hub name of ``transformers``.
             huggingface: ``spec`` with "kind" and other fields of ``HuggingFaceSpec``. ``weights`` as above.
-            torchscript, exported: ``spec`` with "outputs" and, if needed, "preprocess" (a dict or a JSON file).
+            torchscript, exported: ``spec`` with "outputs" and, if needed, "preprocess" (a dict or a JSON file), and
+                ``trust_code=True``, since these files run code.
 
     Raises:
         ValueError: an unknown name, no weights, or a file or declaration that does not match.

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.networks_in_turn import require_switchable
 from ufmstar_torch.prediction import DepthPrediction, stated_range, states_confidence, takes_intrinsics
 
 if TYPE_CHECKING:
@@ -144,7 +145,9 @@ class DeclaredNetwork(DepthNetwork):
 
 @contextmanager
 def in_eval_mode(network: nn.Module) -> Iterator[None]:
-    """Disable gradients and set eval mode; restore the mode of each submodule afterwards."""
+    """Disable gradients and set eval mode; restore the mode of each submodule afterwards. Raises TypeError: as
+    ``require_switchable``."""
+    require_switchable(network)
     modes = {part: part.training for part in network.modules()}
     network.eval()
     try:

@@ -23,6 +23,7 @@ from torch import Tensor
 from ufmstar_torch.arguments import CameraLike, ImageLike, as_image, as_intrinsics
 from ufmstar_torch.camera import crop_intrinsics, resize_intrinsics
 from ufmstar_torch.checked import Checked, number
+from ufmstar_torch.limits import require_pixels
 
 # [1] Tolerance of the range [0, 1] of float images, for overshooting filters and noise; excludes a range of 0..255.
 _RANGE_SLACK = 0.5
@@ -82,6 +83,8 @@ class Preprocess(Checked):
             value = getattr(self, name)
             if value is not None and (len(value) != 2 or min(value) < 1 or any(v != int(v) for v in value)):
                 raise ValueError(f"Preprocess.{name} must be (height, width) in pixels, got {value}")
+            require_pixels(f"Preprocess.{name}", value or (0, 0))
+        require_pixels("Preprocess.resize_height", (self.resize_height or 0,) * 2)
         multiple = self.aspect_multiple
         if multiple is not None and (multiple != int(multiple) or self.size is None):
             raise ValueError(f"Preprocess.aspect_multiple must be whole pixels and needs a size, got {multiple}")
@@ -117,6 +120,7 @@ class Preprocess(Checked):
             scale = max(self.resize_height / height, ch / height, cw / width)
             # Rounded down, as in Pillow-based loaders; the 1e-6 keeps 250/480*480 at 250.
             resized = (max(ch, 1, int(scale * height + 1e-6)), max(cw, 1, int(scale * width + 1e-6)))
+        require_pixels("the resized image", resized)
         if ch > resized[0] or cw > resized[1]:
             raise ValueError(
                 f"Preprocess.crop {self.crop} must fit into the image, which has {resized[0]} x {resized[1]} px; "

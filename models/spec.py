@@ -8,12 +8,14 @@ from typing import Any
 from torch import nn
 
 from ufmstar_torch.checked import Checked, choice, number, section
+from ufmstar_torch.limits import require_pixels
 from ufmstar_torch.models.batch_ensemble import INIT_STD, BatchEnsemble
 from ufmstar_torch.models.heads import HEADS, UncertaintyNetwork, with_head
 from ufmstar_torch.models.module_backbone import ModuleBackbone, ModuleSpec
 from ufmstar_torch.models.network import MULTIPLE, Backbone, fits
 from ufmstar_torch.models.preprocess import Preprocess
 
+MOST_MEMBERS = 1000  # of an ensemble
 _SMALLEST = {"fastdepth": 32, "monodepth2": 64}  # [px]
 # Fields of one architecture; the others require their defaults, so that specs of the same network are equal.
 _ONLY = {"widths": "fastdepth", "norm": "fastdepth", "positive": "fastdepth"}
@@ -59,7 +61,7 @@ class NetworkSpec(Checked):
     dropout: float = number(0.0, "p", "1", 0.0, 1.0, open_high=True)
     dropout_both: bool = False
     head_scales: int = choice(1, 4)
-    members: int = number(1, "N", "networks", 1)
+    members: int = number(1, "N", "networks", 1, MOST_MEMBERS)
     size: tuple[int, int] = (224, 224)
     preprocess: str = choice("nyu", "resize")
     module: ModuleSpec | None = section(ModuleSpec, optional=True)
@@ -83,6 +85,7 @@ class NetworkSpec(Checked):
         if not whole or not fits(*size, 1 if is_module else MULTIPLE, smallest):
             expected = f"multiples of {MULTIPLE} px from {smallest} px on"
             raise ValueError(f"NetworkSpec.size must be (height, width) in {expected}, got {size!r}")
+        require_pixels("NetworkSpec.size", size)
         for f in fields(self):
             if _ONLY.get(f.name, self.architecture) != self.architecture and getattr(self, f.name) != f.default:
                 raise ValueError(f"NetworkSpec.{f.name} is of {_ONLY[f.name]!r} only, not of {self.architecture!r}")

@@ -18,12 +18,19 @@ import torch
 from torch import Tensor, nn
 
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble
-from ufmstar_torch.models.checkpoints import CheckpointError, fill, read_safetensors, save_checkpoint
+from ufmstar_torch.models.checkpoints import (
+    CheckpointError,
+    fill,
+    read_safetensors,
+    require_shapes,
+    safetensors_shapes,
+    save_checkpoint,
+)
 from ufmstar_torch.models.dropout import MonteCarloDropout
 from ufmstar_torch.models.ensemble import Ensemble, LazyMember
 from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.models.spec import NetworkSpec, build_backbone, build_network
+from ufmstar_torch.models.spec import MOST_MEMBERS, NetworkSpec, build_backbone, build_network
 
 FORMAT = "ufmstar_torch trained networks"
 VERSION = 1
@@ -176,8 +183,13 @@ class _TrainedFile:
 
     def read(self, index: int) -> UncertaintyNetwork | BatchEnsemble:
         """The network stored under an index, in eval mode. Raises CheckpointError: as :meth:`member`."""
+        prefix, source = f"member.{index}.", f"{self.path}, member {index},"
+        # Compare shapes without memory first: the file's spec may state any size.
+        with torch.device("meta"):
+            shapes = safetensors_shapes(self.path, prefix)
+            require_shapes(_new(self.info.spec, self.backbone), shapes, source)
         network = _new(self.info.spec, self.backbone)
-        fill(network, read_safetensors(self.path, f"member.{index}.")[0], f"{self.path}, member {index},")
+        fill(network, read_safetensors(self.path, prefix)[0], source)
         return network.eval()
 
 
@@ -191,7 +203,7 @@ def _parse(path: Path, metadata: Any) -> TrainedInfo:
         advice = "written by a newer release of this package: update it" if newer else "which does not exist"
         raise CheckpointError(f"{path} is of version {version!r}, {advice} (this one reads {VERSION})")
     count, info = metadata.get("networks"), metadata.get("info")
-    if set(metadata) != _KEYS or type(count) is not int or count < 1 or not isinstance(info, dict):
+    if set(metadata) != _KEYS or type(count) is not int or not 1 <= count <= MOST_MEMBERS or not isinstance(info, dict):
         raise CheckpointError(f"{path} has damaged metadata: {sorted(metadata)}, networks {count!r}")
     try:
         spec = NetworkSpec.from_dict(metadata["spec"])

@@ -5,10 +5,9 @@ from __future__ import annotations
 import io
 import json
 import os
-import pickle
-import struct
 import zipfile
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -173,16 +172,20 @@ def test_a_wrapped_module_stays_a_module(image: Tensor) -> None:
 def test_torchscript(tmp_path: Path, image: Tensor) -> None:
     torch.jit.save(torch.jit.trace(Sum(), image), str(tmp_path / "n.ts"))
     expected = Sum()(image)[:, 0]
-    torch.testing.assert_close(load_torchscript(tmp_path / "n.ts", METRIC)(image).depth, expected)
-    network = load_network("torchscript", tmp_path / "n.ts", spec={"outputs": {"kind": "metric", "scale": 2}})
+    torch.testing.assert_close(load_torchscript(tmp_path / "n.ts", METRIC, trust_code=True)(image).depth, expected)
+    network = load_network(
+        "torchscript", tmp_path / "n.ts", spec={"outputs": {"kind": "metric", "scale": 2}}, trust_code=True
+    )
     torch.testing.assert_close(network(image).depth, 2 * expected)
     K = cameras((500, 500), (2000, 2000)).float()
     torch.jit.save(torch.jit.trace(Metric(), (image, K)), str(tmp_path / "k.ts"))
-    network = load_network("torchscript", tmp_path / "k.ts", spec={**METRIC.to_dict(), "takes_intrinsics": True})
+    network = load_network(
+        "torchscript", tmp_path / "k.ts", spec={**METRIC.to_dict(), "takes_intrinsics": True}, trust_code=True
+    )
     torch.testing.assert_close(network(image, K).depth, Metric()(image, K))
     (tmp_path / "broken.ts").write_bytes((tmp_path / "n.ts").read_bytes()[:200])
     with pytest.raises(ValueError, match=r"broken.ts is not a readable TorchScript file"):
-        load_torchscript(tmp_path / "broken.ts", METRIC)
+        load_torchscript(tmp_path / "broken.ts", METRIC, trust_code=True)
     with pytest.raises(FileNotFoundError, match="none"):
         load_torchscript(tmp_path / "none", METRIC)
 
@@ -190,16 +193,16 @@ def test_torchscript(tmp_path: Path, image: Tensor) -> None:
 def test_exported_program(tmp_path: Path, image: Tensor) -> None:
     program = torch.export.export(nn.Sequential(Sum(), nn.Dropout(0.5)).eval(), (image,))
     torch.export.save(program, str(tmp_path / "n.pt2"))
-    network = load_exported(tmp_path / "n.pt2", METRIC)
+    network = load_exported(tmp_path / "n.pt2", METRIC, trust_code=True)
     torch.testing.assert_close(network.eval()(image).depth, Sum()(image)[:, 0])
     torch.testing.assert_close(network.train()(image).depth, Sum()(image)[:, 0])  # exported without dropout
     spec = tmp_path / "spec.json"
     spec.write_text(json.dumps({"outputs": {"kind": "metric"}, "preprocess": {"size": [6, 8]}}))
-    loaded = load_network("exported", tmp_path / "n.pt2", spec=spec)
+    loaded = load_network("exported", tmp_path / "n.pt2", spec=spec, trust_code=True)
     assert loaded.preprocess == Preprocess(size=(6, 8))
     (tmp_path / "broken.pt2").write_bytes((tmp_path / "n.pt2").read_bytes()[:200])
     with pytest.raises(ValueError, match=r"broken.pt2 is not a readable torch.export file"):
-        load_exported(tmp_path / "broken.pt2", METRIC)
+        load_exported(tmp_path / "broken.pt2", METRIC, trust_code=True)
 
 
 DEFECTS: dict[str, tuple[Any, str]] = {
@@ -249,7 +252,7 @@ def test_a_program_with_a_defect_is_named(tmp_path: Path, image: Tensor, kind: s
         torch.export.save(torch.export.export(Program(function).eval(), inputs), path)
     else:
         torch.jit.save(torch.jit.trace(Program(function), inputs), str(path))
-    network = load_network(kind, path, spec=METRIC)
+    network = load_network(kind, path, spec=METRIC, trust_code=True)
     with pytest.raises(ValueError, match=f"(?s)n.graph:? .*({message})"):
         network(torch.rand(1, 3, 8, 8) if defect == "another size" else one)
 
@@ -264,102 +267,44 @@ class Malice:
         return os.mkdir, (self.trap,)
 
 
-@pytest.mark.parametrize("attack", ["weight", "constant", "sample input", "object", "legacy", "old format"])
-def test_an_archive_that_would_be_unpickled_is_refused(tmp_path: Path, image: Tensor, attack: str) -> None:
-    """``torch.export.load`` by itself unpickles any object in these members."""
-    torch.export.save(torch.export.export(Sum().eval(), (image,)), tmp_path / "n.pt2")
-    trap = tmp_path / "trap"
-    evil, bad = io.BytesIO(), tmp_path / "bad.pt2"
-    torch.save((Malice(trap), {}), evil)
-    folder = "constants" if attack in ("constant", "object") else "weights"
-    names = {"object": "opaque_obj_0", "constant": "tensor_0", "weight": "weight_0"}
-    name = names.get(attack, "model.pt")
-    with zipfile.ZipFile(tmp_path / "n.pt2") as source, zipfile.ZipFile(bad, "w") as target:
-        root = source.namelist()[0].split("/")[0]
-        for entry in source.namelist():
-            content = source.read(entry)
-            if attack in (*names, "legacy") and entry.endswith(f"model_{folder}_config.json"):
-                payload = {
-                    "tensor_meta": None,
-                    "path_name": name,
-                    "is_param": False,
-                    "use_pickle": attack in ("weight", "constant"),
-                }
-                content = json.dumps({"config": {"factor": payload}}).encode()
-            if attack == "sample input" and "sample_inputs" in entry:
-                content = evil.getvalue()
-            if not (attack == "weight" and entry.endswith("weight_0")):
-                target.writestr(entry, content)
-        if attack == "old format":
-            target.writestr("serialized_state_dict.pt", evil.getvalue())
-        elif attack != "sample input":
-            plain = pickle.dumps(Malice(trap)) if attack == "object" else evil.getvalue()
-            target.writestr(f"{root}/data/{folder}/{name}", plain)
-    with pytest.raises(ValueError, match=r"bad.pt2 is not a readable torch.export file: .* (holds pickled|begins)"):
-        load_exported(bad, METRIC)
-    assert not trap.exists()
-
-
-def two_directories(seen: bytes, hidden: bytes) -> bytes:
-    """Two archives with the same member names in one file: Python's reader uses the directory before the end record,
-    torch's reader the directory at the offset in the record."""
-    parts = []
-    for content in (hidden, seen):
-        size, offset = struct.unpack("<LL", content[-10:-2])
-        parts.append((content[:offset], bytearray(content[offset : offset + size])))
-    (hidden_files, hidden_list), (seen_files, seen_list) = parts
-    assert len(hidden_list) == len(seen_list)
-    hidden_files = hidden_files.ljust(len(seen_files), b"\0")
-    at = 0
-    while at < len(seen_list):
-        name, extra, comment = struct.unpack("<HHH", seen_list[at + 28 : at + 34])
-        # Python adds the gap between the two directories to every offset.
-        (stated,) = struct.unpack("<L", seen_list[at + 42 : at + 46])
-        gap = len(hidden_list) + len(seen_files)
-        moved = stated + len(hidden_files) + len(hidden_list) - gap
-        seen_list[at + 42 : at + 46] = struct.pack("<L", moved)
-        at += 46 + name + extra + comment
-    end = struct.pack("<LL", len(hidden_list), len(hidden_files))
-    before = b"".join((hidden_files, bytes(hidden_list), seen_files, bytes(seen_list)))
-    return before + seen[-22:-10] + end + b"\0\0"
-
-
-def test_a_file_with_two_directories_runs_nothing(tmp_path: Path, image: Tensor) -> None:
-    """The loaded archive is the checked one. torch's reader by itself would unpickle the other archive."""
-    torch.export.save(torch.export.export(Sum().eval(), (image,)), tmp_path / "n.pt2")
-    trap, evil = tmp_path / "trap", io.BytesIO()
-    torch.save((Malice(trap), {}), evil)
-    archives = []
-    for hidden in (False, True):
-        archive = io.BytesIO()
-        with zipfile.ZipFile(tmp_path / "n.pt2") as source, zipfile.ZipFile(archive, "w") as target:
+@pytest.mark.filterwarnings("ignore:`torch.jit:FutureWarning", "ignore:`torch.jit:DeprecationWarning")
+@pytest.mark.parametrize("kind", ["exported", "torchscript"])
+def test_a_program_in_a_file_runs_only_if_it_is_trusted(tmp_path: Path, image: Tensor, kind: str) -> None:
+    """Both files run code when they are trusted, so the refusal of the others protects."""
+    trap, path = tmp_path / "trap", tmp_path / "n.graph"
+    if kind == "exported":
+        torch.export.save(torch.export.export(Sum().eval(), (image,)), tmp_path / "n.pt2")
+        evil = io.BytesIO()
+        torch.save(Malice(trap), evil)
+        with zipfile.ZipFile(tmp_path / "n.pt2") as source, zipfile.ZipFile(path, "w") as target:
             for entry in source.namelist():
-                content = source.read(entry)
-                if hidden and entry.endswith("model_weights_config.json"):
-                    content = content.replace(b'"use_pickle": false', b'"use_pickle": true')
-                target.writestr(entry, evil.getvalue() if hidden and entry.endswith("weight_0") else content)
-        archives.append(archive.getvalue())
-    both = tmp_path / "both.pt2"
-    both.write_bytes(two_directories(*archives))
-    with zipfile.ZipFile(both) as seen, zipfile.ZipFile(tmp_path / "n.pt2") as good:
-        assert all(seen.read(entry) == good.read(entry) for entry in good.namelist())
-    reader = torch._C.PyTorchFileReader(str(both))
-    assert 'use_pickle": true' in reader.get_record("data/weights/model_weights_config.json").decode()
-    network, expected = load_exported(both, METRIC), load_exported(tmp_path / "n.pt2", METRIC)
-    assert torch.equal(network(image).depth, expected(image).depth)
-    assert not trap.exists()
+                content = source.read(entry).replace(b'"use_pickle": false', b'"use_pickle": true')
+                target.writestr(entry, evil.getvalue() if entry.endswith("weight_0") else content)
+    else:
+        torch.jit.save(torch.jit.trace(Writer(str(trap)), image), str(path))
+        trap.unlink()  # tracing has written it
+
+    def load(**trust: Any) -> None:
+        load_network(kind, path, spec=METRIC, **trust)(image)
+
+    for trust in ({}, {"trust_code": False}, {"trust_code": "yes"}):
+        with pytest.raises(ValueError, match=r"n.graph is not loaded: .*pass --trust-code .*ONNX and safetensors"):
+            load(**trust)
+        assert not trap.exists()
+    with suppress(Exception):  # the unpickled object is no weight
+        load(trust_code=True)
+    assert trap.exists()
 
 
-def test_compressed_archives_are_refused(tmp_path: Path, image: Tensor) -> None:
-    torch.export.save(torch.export.export(Sum().eval(), (image,)), tmp_path / "n.pt2")
-    with (
-        zipfile.ZipFile(tmp_path / "n.pt2") as source,
-        zipfile.ZipFile(tmp_path / "small.pt2", "w", zipfile.ZIP_DEFLATED) as target,
-    ):
-        for entry in source.namelist():
-            target.writestr(entry, source.read(entry))
-    with pytest.raises(ValueError, match=r"small.pt2 is not a readable torch.export file: it has compressed files"):
-        load_exported(tmp_path / "small.pt2", METRIC)
+class Writer(nn.Module):
+    """A network that writes a file."""
+
+    def __init__(self, file: str) -> None:
+        super().__init__()
+        self.file = file
+
+    def forward(self, image: Tensor) -> Tensor:
+        return image.sum(1) + torch.from_file(self.file, True, 5).fill_(1).sum()
 
 
 @pytest.mark.parametrize("suffix", ["pth", "safetensors"])

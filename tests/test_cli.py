@@ -93,7 +93,10 @@ MISTAKES = {
     "frames": ("ufmstar run /nowhere --depth self --out {out} --frames 3", "START:STOP"),
     "no frames": ("--depth self --frames 9:", "selects none of the 6"),
     "size": ("--depth self --size 24", "--size must be HxW"),
-    "size beyond memory": ("--depth self --size 99999999x99999999", "--size must be at most 134 million pixels"),
+    "size beyond memory": (
+        "--depth self --size 99999999x99999999",
+        "--size would have 99999999 x 99999999 pixels, more than the limit of 89,478,485 pixels",
+    ),
     "intrinsics": ("ufmstar run /nowhere --depth self --out {out} --intrinsics 1 2", "fx fy cx cy"),
     "layout": ("--depth self --layout tum", "looked for rgb.txt"),
     "no poses": ("ufmstar run {path}/images --depth self --layout generic --out {out}", "pass trajectory"),

@@ -237,7 +237,7 @@ def test_the_commands_pass_it(tmp_path, capsys):
     (tmp_path / "spec.json").write_text(json.dumps(spec))
     both = torch.jit.trace(Tuple(), torch.rand(1, 3, 48, 64))
     torch.jit.save(both, str(tmp_path / "n.ts"))
-    tour, words = "tour:3?frames=4&size=96x128", ["--spec", str(tmp_path / "spec.json")]
+    tour, words = "tour:3?frames=4&size=96x128", ["--trust-code", "--spec", str(tmp_path / "spec.json")]
     run = ["run", tour, "--model", "torchscript", "--weights", str(tmp_path / "n.ts"), "--anchors", "corners", *words]
     assert cli.main([*run, "--no-video", "--no-sheet", "--out", str(tmp_path / "run")]) == 0
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -36,8 +37,6 @@ def finished(tmp_path_factory):
         maps["variance"] = np.square(0.02 * maps["depth"])
         maps["variance"][:20] = 1
         np.savez(file, **maps)
-    summary = json.loads((out / "summary.json").read_text())
-    (out / "summary.json").write_text(json.dumps({**summary, "settings": {"sequence": str(path), "layout": "auto"}}))
     return out, path, truth
 
 
@@ -72,8 +71,19 @@ def test_the_trajectory(finished):
 
 
 def test_the_cloud_lies_on_the_surfaces(finished):
-    out, _, truth = finished
-    words = ["export", str(out), "--to", "cloud", "--max-relative-sigma", "0.021", "--voxel", "0.05"]
+    out, path, truth = finished
+    words = [
+        "export",
+        str(out),
+        "--sequence",
+        str(path),
+        "--to",
+        "cloud",
+        "--max-relative-sigma",
+        "0.021",
+        "--voxel",
+        "0.05",
+    ]
     assert cli.main(words) == 0
     cloud = read_ply(out / "export" / "cloud.ply")
     points = np.stack([cloud[name] for name in "xyz"], -1).astype(float)
@@ -94,6 +104,98 @@ def test_the_cloud_lies_on_the_surfaces(finished):
     assert np.median(np.abs(colours - image)) < 12  # the colour darkens with the distance from each camera
 
 
+@pytest.mark.parametrize("to", ["cloud", "transforms", "mcap", "rrd"])
+def test_nothing_in_the_folder_names_code_or_a_recording(finished, tmp_path, to, capfd):
+    """The summary names a plug-in, a huge tour and another folder; only the command line names the recording."""
+    out, trap = tmp_path / "out", tmp_path / "trap"
+    shutil.copytree(finished[0], out)
+    (out / "evil.py").write_text(f"import os; os.mkdir({str(trap)!r})\nREADERS = {{}}\n")
+    summary = json.loads((out / "summary.json").read_text())
+    for sequence in ("tour:1?frames=1000000000", str(finished[1])):
+        settings = {
+            "sequence": sequence,
+            "plugin": [str(out / "evil.py")],
+            "images": "/etc",
+            "trajectory": "/etc/passwd",
+        }
+        (out / "summary.json").write_text(json.dumps({**summary, "settings": settings}))
+        code = cli.main(["export", str(out), "--to", to])
+        said = "".join(capfd.readouterr())
+        assert "--sequence SEQUENCE" in said or "rerun-sdk" in said
+        assert code == 2 if to == "transforms" else code in (0, 1)
+    assert not trap.exists()
+    if to == "cloud":
+        assert "red" not in read_ply(out / "export" / "cloud.ply").dtype.names
+
+
+def test_another_recording_is_named(finished, capfd):
+    words = ["export", str(finished[0]), "--to", "cloud"]
+    assert cli.main([*words, "--sequence", "tour:1?frames=3&size=48x64"]) == 2
+    assert "has none of the run's frames" in capfd.readouterr().err
+    assert cli.main([*words, "--fps", "3"]) == 2
+    assert "--fps goes with --sequence" in capfd.readouterr().err
+
+
+DAMAGE = {
+    "name": ({"name": 5}, "(its name)"),
+    "name that is a path": ({"name": "../../x"}, "(its name)"),
+    "state": ({"state": "begun"}, "(its state)"),
+    "index": ({"index": -1}, "(its index)"),
+    "a large index": ({"index": 1e300}, "(its index)"),
+    "timestamp": ({"timestamp": [1]}, "(its timestamp)"),
+    "intrinsics": ({"intrinsics": [1, 2, 3, None]}, "(its intrinsics)"),
+    "reason": ({"state": "skipped", "reason": None}, "(its reason)"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_record_is_named_by_line_and_field(finished, tmp_path, damage, capfd):
+    changes, said = DAMAGE[damage]
+    shutil.copytree(finished[0], tmp_path / "out")
+    file = tmp_path / "out" / "frames.jsonl"
+    first, second, *rest = file.read_text().splitlines()
+    file.write_text("\n".join([first, json.dumps({**json.loads(second), **changes}), *rest]))
+    for to in ("depth", "cloud", "tum"):
+        assert cli.main(["export", str(tmp_path / "out"), "--to", to]) == 2
+        assert f"frames.jsonl, line 2 is not the record of a frame {said}" in capfd.readouterr().err
+
+
+ARRAYS = {
+    "none": ({"variance": None}, "it has no array variance"),
+    "half a posterior": ({"posterior_depth": np.ones((48, 64), np.float32)}, "it has no array posterior_variance"),
+    "another size": ({"variance": np.ones((3, 3), np.float32)}, r"array variance is float32 [3, 3]"),
+    "a pose": ({"T_world_cam": np.eye(3)}, "array T_world_cam is float64 [3, 3]"),
+    "NaN": ({"T_world_cam": np.full((4, 4), np.nan)}, "its pose or intrinsics are not finite"),
+    "a mask": ({"valid": np.ones((48, 64), np.float32)}, "array valid is float32"),
+    "anchors": ({"anchors": np.ones((5, 3), np.float32)}, "array anchors is float32 [5, 3]"),
+}
+
+
+@pytest.mark.parametrize("damage", ARRAYS)
+def test_a_damaged_frame_is_named_by_file_and_array(finished, tmp_path, damage, capfd):
+    changes, said = ARRAYS[damage]
+    shutil.copytree(finished[0], tmp_path / "out")
+    file = tmp_path / "out" / "frames" / "9.npz"
+    arrays = {name: value for name, value in {**read_frame(file), **changes}.items() if value is not None}
+    np.savez(file, **arrays)
+    assert cli.main(["export", str(tmp_path / "out"), "--to", "depth"]) == 2
+    assert f"9.npz is no frame of `ufmstar run`: {said}" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("link", ["export", "export/depth", "export/depth/9.png"])
+def test_nothing_is_exported_through_a_link(finished, tmp_path, link, capfd):
+    """A folder from an archive may contain links to the user's files."""
+    out, victim = tmp_path / "out", tmp_path / "victim"
+    shutil.copytree(finished[0], out, ignore=shutil.ignore_patterns("export"))
+    victim.mkdir()
+    (victim / "9.png").write_text("precious")
+    (out / link).parent.mkdir(parents=True, exist_ok=True)
+    (out / link).symlink_to(victim / "9.png" if link.endswith("png") else victim)
+    assert cli.main(["export", str(out), "--to", "depth"]) == 2
+    assert "is a symbolic link, through which nothing is written" in capfd.readouterr().err
+    assert [(path.name, path.read_text()) for path in victim.iterdir()] == [("9.png", "precious")]
+
+
 def test_merging_weighs_by_the_inverse_variance(tmp_path):
     from ufmstar_torch.eval.run.export import RunFrame, export_cloud
 
@@ -110,8 +212,9 @@ def test_merging_weighs_by_the_inverse_variance(tmp_path):
 
 
 def test_transforms_are_read_back(finished):
-    out, _, truth = finished
-    assert cli.main(["export", str(out), "--to", "transforms", "--max-sigma", "0.9"]) == 0
+    out, path, truth = finished
+    words = ["--sequence", str(path), "--max-sigma", "0.9"]
+    assert cli.main(["export", str(out), "--to", "transforms", *words]) == 0
     again = open_sequence(out / "export" / "transforms")
     assert (again.layout, len(again), again.metric) == ("transforms", 6, True)
     for i, frame in enumerate(again):
@@ -189,9 +292,10 @@ def test_the_size_of_a_voxel_is_positive(finished, capfd):
 
 
 def test_a_bag_is_read_back(finished):
-    out, _, truth = finished
+    out, path, truth = finished
+    words = ["--sequence", str(path), "--max-sigma", "0.9"]
     for _ in range(2):  # the second replaces the first
-        assert cli.main(["export", str(out), "--to", "mcap", "--max-sigma", "0.9"]) == 0
+        assert cli.main(["export", str(out), "--to", "mcap", *words]) == 0
     assert open_sequence(out / "export" / "bag")[0].depth is None  # a prediction is no ground truth
     again = open_sequence(out / "export" / "bag", topics=["/camera/depth"])
     assert (again.layout, len(again), again.skipped) == ("bag", 6, ())
@@ -245,15 +349,19 @@ def test_a_bag_that_cannot_be_written_leaves_the_one_before(finished, tmp_path):
     (tmp_path / "linked").mkdir()
     (tmp_path / "linked" / "export").mkdir()
     (tmp_path / "linked" / "export" / "bag").symlink_to(folder)
-    with pytest.raises(ValueError, match="is no folder of an earlier export"):
+    with pytest.raises(ValueError, match="bag is a symbolic link, through which nothing is written"):
         export_bag(iter(frames), tmp_path / "linked")
+    (folder / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match="is no folder of an earlier export, or holds other files"):
+        export_bag(iter(frames), tmp_path)
+    assert (folder / "notes.txt").read_text() == "mine"
 
 
 def test_a_rerun_recording(finished):
     """rerun's reader opens it: every entity of a frame exists six times, the Gaussians and the blueprint once."""
     pytest.importorskip("rerun")
-    out, _, _ = finished
-    assert cli.main(["export", str(out), "--to", "rrd", "--max-sigma", "0.9"]) == 0
+    out, path, _ = finished
+    assert cli.main(["export", str(out), "--sequence", str(path), "--to", "rrd", "--max-sigma", "0.9"]) == 0
     file = out / "export" / "run.rrd"
     text = printed(file)
     for entity in ("camera/image/rgb", "camera/maps/depth", "camera/maps/sigma", "camera/points", "gaussians"):

@@ -14,7 +14,8 @@ import pytest
 import torch
 
 from ufmstar_torch import AnchorConfig, DepthPrediction, LiveDepth, UfMStarConfig, UncertainDepth
-from ufmstar_torch.live import BACKWARDS, CLOSED, GAP, LATE, LOST, NEWER
+from ufmstar_torch.live import BACKWARDS, CLOSED, DOUBTFUL, GAP, LATE, LOST, NEWER
+from ufmstar_torch.stream_clock import StreamClock, Verdict
 
 K = (50.0, 50.0, 31.5, 23.5)
 PICTURE = np.zeros((48, 64, 3), np.uint8)
@@ -161,6 +162,105 @@ def test_why_images_are_skipped(model, caplog):
     assert require_all_counted(live).skipped == {LATE: 1, GAP: 2, LOST: 2, BACKWARDS: 2}
     assert "image at 0.500 s skipped: no pose in time (poses: none" in caplog.text
     assert caplog.text.count(BACKWARDS) == 1
+
+
+@pytest.mark.parametrize("wrong", [1e6, 30.0, -1e6])
+@pytest.mark.parametrize("what", ["pose", "image"])
+def test_a_single_wrong_stamp_is_dropped_and_counted(model, what, wrong, caplog):
+    results = []
+    with LiveDepth(model, results.append, K, max_wait=20) as live:
+        for n in range(6):
+            if n in (0, 3):  # also before the first pose or image
+                live.push_pose(wrong, at(9)) if what == "pose" else live.push_image(wrong, PICTURE)
+            live.push_pose(n / 30, at(n / 100))
+            live.push_image(n / 30, PICTURE)
+            if n > 2:
+                assert live.wait_idle(20)
+        counts = require_all_counted(live)
+    assert [round(stamp * 30) for stamp in stamps(results) if stamp != wrong][-3:] == [3, 4, 5]
+    assert (counts.dropped_poses, counts.skipped.get(DOUBTFUL, 0)) >= ((1, 0) if what == "pose" else (0, 1))
+    assert all(result.T_world_cam[0, 3] < 1 for result in results if result.stamp != wrong)
+    assert caplog.text.count("clock jumped") == 1, "only after the wrong first stamp"
+
+
+@pytest.mark.parametrize("jump", [1e6, 10.0, -10.0, -1e6])
+def test_a_clock_that_jumps_is_named_and_followed_after_three_frames(model, jump, caplog):
+    results = []
+    with LiveDepth(model, results.append, K, max_wait=20) as live:
+        for n in range(5):
+            show(live, 2e6 + n / 30, x=n / 100)
+        for n in range(8):
+            live.push_pose(2e6 + jump + n / 30, at(n / 100))
+            live.push_image(2e6 + jump + n / 30, PICTURE)
+            if n > 1:
+                assert live.wait_idle(20)
+        counts = require_all_counted(live)
+    assert stamps(results)[-6:] == [2e6 + jump + n / 30 for n in range(2, 8)]
+    assert counts.skipped == {DOUBTFUL: 2}
+    assert counts.dropped_poses == 0, "the poses before the third one are of the new clock"
+    assert "the images' clock jumped from 2000000.133 s" in caplog.text
+    assert "the poses' clock jumped from 2000000.133 s" in caplog.text
+
+
+def test_poses_that_are_sent_again_replace_the_earlier_ones(model, caplog):
+    """As after a loop closure; poses that are older than the buffer do not count as another clock."""
+    results = []
+    with LiveDepth(model, results.append, K, max_wait=20) as live:
+        for n in range(200):
+            live.push_pose(n / 20, at(0))
+        live.push_image(9.9, PICTURE)
+        for n in range(-100, 200):
+            live.push_pose(n / 20, at(1))
+        live.push_image(9.925, PICTURE)
+        assert live.wait_idle(20)
+    assert stamps(results)[-1] == 9.925
+    assert results[-1].T_world_cam[0, 3] == 1
+    assert "jumped" not in caplog.text
+
+
+def test_a_slow_stream_and_a_pause_are_no_jump(monkeypatch):
+    now = 0.0
+    clock = StreamClock()
+    assert clock.judge(0.0, now) == Verdict.USE
+    for n in range(1, 10):  # a frame every 30 s, replayed at once
+        expected = {1: Verdict.WAIT, 2: Verdict.WAIT, 3: Verdict.JUMPED}.get(n, Verdict.USE)
+        assert clock.judge(30.0 * n, now) == expected
+    assert clock.judge(270.0 + 3600.0, now + 3600.0) == Verdict.USE  # an hour without frames
+    assert clock.judge(3871.0, now + 3600.0) == Verdict.USE
+    for stamp in (1e9, 5e8, 7e8, 1e5):  # damaged stamps that do not agree
+        assert clock.judge(stamp, now + 3600.0) == Verdict.WAIT
+    assert clock.judge(3872.0, now + 3600.0) == Verdict.USE
+
+
+def test_a_second_process_may_not_write_the_same_state(model, tmp_path):
+    """Temporary files of a killed one are removed at the start, other files stay."""
+    file = tmp_path / "s.pt"
+    left, other = tmp_path / ".s.pt.0123456789ab.tmp", tmp_path / ".other.pt.0123456789ab.tmp"
+    left.write_text("half a state")
+    other.write_text("of another program")
+    code = f"""
+import sys, torch
+from ufmstar_torch import DepthPrediction, LiveDepth, UncertainDepth
+class Network(torch.nn.Module):
+    def forward(self, x): return DepthPrediction(torch.full((1, 8, 8), 2.0))
+with LiveDepth(UncertainDepth(Network()), print, state={str(file)!r}):
+    print("holds it", flush=True)
+    sys.stdin.read()
+"""
+    words = [sys.executable, "-P", "-c", code]
+    first = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        assert first.stdout.readline() == "holds it\n"
+        assert (left.exists(), other.exists()) == (False, True)
+        with pytest.raises(ValueError, match=r"state: another process is writing .*s\.pt"):
+            LiveDepth(model, print, K, state=file)
+    finally:
+        first.kill()
+        first.communicate()
+    with LiveDepth(model, print, K, state=file):
+        (tmp_path / "link.pt").symlink_to(file)
+        with pytest.raises(ValueError, match="another process is writing"):
+            LiveDepth(model, print, K, state=tmp_path / "link.pt")
 
 
 def test_a_reset_forgets_views_and_times(model):

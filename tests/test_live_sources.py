@@ -101,6 +101,37 @@ def test_poses_are_read_as_their_lines_are_completed(tmp_path):
             list(poses.new())
 
 
+def test_a_file_of_poses_that_is_written_anew_is_read_from_its_start(tmp_path, caplog):
+    """Longer and shorter, with the same inode and with another one. A copy that continues it is not read again."""
+    file = tmp_path / "poses.txt"
+    poses = PoseFile(file)
+
+    def write(stamps, *, replaced=False, x=0):
+        target = tmp_path / "new.txt" if replaced else file
+        target.write_text("".join(f"{stamp} {x} 0 0 0 0 0 1\n" for stamp in stamps))
+        target.replace(file)
+        return [event.stamp for event in poses.new()]
+
+    assert write(range(100)) == list(range(100))
+    for replaced in (False, True):
+        assert write(range(200, 250), replaced=replaced) == list(range(200, 250))  # a shorter file
+        assert write(range(300, 500), replaced=replaced) == list(range(300, 500))  # a longer one
+        assert write(range(300, 500), replaced=replaced, x=1) == list(range(300, 500))  # of the same length
+    assert caplog.text.count("was written anew") == 6
+    assert write(range(300, 600), replaced=True, x=1) == list(range(500, 600))
+    assert list(poses.new()) == []
+    assert caplog.text.count("was written anew") == 6
+
+
+def test_an_image_that_replaces_an_earlier_one_is_new(tmp_path):
+    """A camera that starts again writes the same names."""
+    file = tmp_path / "0.png"
+    file.write_bytes(content(np.full((8, 8, 3), 7, np.uint8)))
+    events = growing_folder(tmp_path, PoseFile(tmp_path / "none"), idle=60)
+    threading.Timer(0.2, lambda: file.write_bytes(content(np.full((8, 8, 3), 9, np.uint8)))).start()
+    assert next(events).image[0, 0, 0] == 9
+
+
 def test_a_folder_that_grows(tmp_path):
     folder, image = tmp_path / "images", np.full((8, 8, 3), 7, np.uint8)
     folder.mkdir()
@@ -179,7 +210,7 @@ def test_a_line_that_is_none_is_named(tmp_path, line, text):
 def test_a_recording_live(ufmstar, tmp_path):
     words = ("--state", tmp_path / "state.pt", "--out", tmp_path / "out", "--json", "--speed", "0.2")
     code, out, err = ufmstar(TOUR, *words)
-    assert code == 0, err
+    assert code == 0, err + out
     lines = [json.loads(line) for line in out.splitlines()]
     summary = json.loads((tmp_path / "out" / "realtime.json").read_text())
     assert summary["images"] == 5
@@ -195,7 +226,7 @@ def test_a_recording_live(ufmstar, tmp_path):
     images = int(torch.load(tmp_path / "state.pt")["image_index"])
     assert images == summary["results"]
     code, _, err = ufmstar(TOUR, "--state", tmp_path / "state.pt", "--speed", "0.2")
-    assert code == 0, err
+    assert code == 0, err + out
     assert int(torch.load(tmp_path / "state.pt")["image_index"]) > images  # the run continued
     before = sorted((tmp_path / "out").iterdir())
     code, _, err = ufmstar(TOUR, "--out", tmp_path / "out")
@@ -225,7 +256,7 @@ def test_a_recording_waits_for_a_network_that_starts_slowly(ufmstar, monkeypatch
 
     monkeypatch.setattr(UncertainDepth, "member", slow_at_first)
     code, out, err = ufmstar(TOUR, "--speed", "0.25", "--json")
-    assert code == 0, err
+    assert code == 0, err + out
     assert len(out.splitlines()) >= 3  # 2 without the wait: the first image and the last
 
 
@@ -238,7 +269,7 @@ def test_lines_on_standard_input_live(ufmstar, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join(lines)))
     K = sequence.intrinsics
     code, out, err = ufmstar("-", "--intrinsics", K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-    assert code == 0, err
+    assert code == 0, err + out
     assert "of 5 images" in out
     monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join([*lines, "no JSON"])))
     intrinsics = ("--intrinsics", K[0, 0], K[1, 1], K[0, 2], K[1, 2])
@@ -277,7 +308,7 @@ def test_a_folder_that_grows_live(ufmstar, tmp_path):
     code, out, err = ufmstar(folder, "--follow", "--seconds", "1", *words)
     ended.set()
     writer.join()
-    assert code == 0, err
+    assert code == 0, err + out
     assert "UfM*'s share" in out
 
 
@@ -308,7 +339,7 @@ def test_a_viewer_shows_the_results_on_this_computer_alone(ufmstar, stand_in, mo
         assert code == 2
         assert "rerun's viewer does not start: is there a display?" in err
         return
-    assert code == 0, err
+    assert code == 0, err + out
     (address,) = [words[0] for name, words, _ in stand_in.calls if name == "connect_grpc"]
     assert address.startswith("rerun+http://127.0.0.1:")
     (count,) = re.findall(r"(\d) of 5 images", out)

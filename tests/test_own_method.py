@@ -72,7 +72,8 @@ def test_the_reader_is_everywhere(walk, tmp_path):
     words = ["run", str(path), "--plugin", PLUGIN, "--depth", "self", "--no-video", "--no-sheet", "--out", str(out)]
     assert cli.main(words) == 0
     assert "own.within_2_sigma" in json.loads((out / "summary.json").read_text())["metrics"]
-    assert cli.main(["export", str(out), "--to", "transforms"]) == 0
+    words = ["--sequence", str(path), "--plugin", PLUGIN]
+    assert cli.main(["export", str(out), "--to", "transforms", *words]) == 0
     assert len(open_sequence(out / "export" / "transforms")) == 6
     with pytest.raises(ValueError, match="has no known layout"):
         open_sequence(path)

@@ -14,6 +14,7 @@ import pytest
 import torch
 from forked import start
 from layouts import truncate, write_depth_png, write_generic
+from PIL import Image
 from runs import CONFIG, Brightness, network_job, outputs, own_depth_job, read_summary, records
 
 from ufmstar_torch import UncertainDepth
@@ -345,6 +346,48 @@ def test_an_earlier_run_is_replaced_only_when_asked(path, tmp_path, uninterrupte
     assert (out / "notes.txt").read_text() == "mine"
     (out / "notes.txt").unlink()
     assert outputs(out) == uninterrupted
+
+
+def test_overwriting_removes_what_the_run_wrote_and_nothing_else(path, tmp_path, uninterrupted):
+    """Files of a user, in every folder and with every ending of the run's files."""
+    out = tmp_path / "out"
+    run(network_job(path, frames=slice(0, 6)), out)
+    mine = [
+        out / "depth" / "photo.png",
+        out / "frames" / "mine.npz",
+        out / "sigma" / "notes.txt",
+        out / "resume" / "a.pt",
+    ]
+    Image.fromarray(np.full((5, 5, 3), 9, np.uint8)).save(mine[0])
+    np.savez(mine[1], depth=np.ones((3, 3)))
+    for file in mine[2:]:
+        file.write_text("mine")
+    before = [file.read_bytes() for file in mine]
+    (out / "frames" / "orphan.npz").write_bytes((out / "frames" / "7.npz").read_bytes())  # of a killed run
+    run(network_job(path, *pair()), out, overwrite=True)
+    assert [file.read_bytes() for file in mine] == before
+    for file in mine:
+        file.unlink()
+    assert outputs(out) == uninterrupted
+
+
+@pytest.mark.parametrize("options", [{"overwrite": True}, {"resume": True}])
+@pytest.mark.parametrize("link", ["depth", "frames", "resume", "frames/7.npz", "summary.json", "preview.mp4"])
+def test_nothing_is_written_through_a_link(path, tmp_path, link, options):
+    out, victim = tmp_path / "out", tmp_path / "victim"
+    run(network_job(path, frames=slice(0, 2)), out)
+    if link == "preview.mp4":
+        (out / link).symlink_to(tmp_path / "nothing")
+    else:
+        (out / link).rename(victim)
+        (out / link).symlink_to(victim)
+    before = outputs(victim) if victim.is_dir() else None
+    with pytest.raises(FolderError, match=rf"{link} is a symbolic link, through which nothing is written"):
+        run(network_job(path, frames=slice(0, 2)), out, **options)
+    assert (outputs(victim) if victim.is_dir() else None) == before
+    (tmp_path / "elsewhere").symlink_to(tmp_path / "new")
+    (tmp_path / "new").mkdir()
+    run(network_job(path, frames=slice(0, 2)), tmp_path / "elsewhere")  # a folder that the user named
 
 
 @pytest.mark.parametrize("options", [{}, {"overwrite": True}, {"resume": True}])

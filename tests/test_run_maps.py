@@ -103,7 +103,7 @@ def test_a_run_reads_back_what_another_left_and_skips_what_it_skipped(path, tmp_
     with pytest.raises(ValueError, match="no map for 2 of 5 frames"):
         folder_source(sequence, tmp_path / "first")
     (tmp_path / "first" / "frames.jsonl").write_text("{}\n")
-    with pytest.raises(ValueError, match=r"frames.jsonl, line 1 is not the record of a frame: \{\}"):
+    with pytest.raises(ValueError, match=r"frames.jsonl, line 1 is not the record of a frame \(its name\): \{\}"):
         folder_source(sequence, tmp_path / "first")
 
 

@@ -14,7 +14,7 @@ import pytest
 from layouts import truncate, write_depth_png, write_image
 from PIL import Image
 
-from ufmstar_torch import array_files
+from ufmstar_torch import limits
 from ufmstar_torch.eval.sequences import images
 from ufmstar_torch.eval.sequences.frame import FrameError
 from ufmstar_torch.eval.sequences.images import image_size, list_files, read_color, read_depth
@@ -172,7 +172,7 @@ def test_an_array_that_expands_has_a_bound(tmp_path, monkeypatch):
     """Reads at most a member's stated size, and allocates at most the limit."""
     file = tmp_path / "a.npz"
     np.savez_compressed(file, depth=np.zeros((2000, 5000), np.float32))
-    monkeypatch.setattr(array_files, "LARGEST", 1_000_000)
+    monkeypatch.setattr(limits, "MOST_BYTES", 1_000_000)
     tracemalloc.start()
     with pytest.raises(FrameError, match=r"a\.npz"):
         read_depth(file)

@@ -18,10 +18,12 @@ from dataclasses import asdict
 from typing import Any
 
 from ufmstar_torch.eval.run.folder import FolderKind, output_folder
-from ufmstar_torch.train.member import WEIGHTS
+from ufmstar_torch.train.checkpoints import NAME as CHECKPOINT
+from ufmstar_torch.train.member import RESULT, WEIGHTS
 from ufmstar_torch.train.settings import Job
 
 SUMMARY = "summary.json"
+_SETTINGS = "version_*/hparams.yaml"  # of Lightning's loggers
 # Fields of the data's configuration that change only the speed.
 _SPEED = ("workers", "render_workers", "cache")
 
@@ -54,7 +56,12 @@ TRAINING = FolderKind(
     manifest="training.json",
     format=1,
     lock="lock",
-    files=("member_[0-9]", "member_[0-9][0-9]", "member_[0-9][0-9][0-9]", "tensorboard", WEIGHTS, SUMMARY),
+    files=(
+        *(f"member_[0-9]*/{name}" for name in (CHECKPOINT, WEIGHTS, RESULT, "version_*/metrics.csv", _SETTINGS)),
+        *(f"tensorboard/member_*/{name}" for name in ("events.out.tfevents.*", "hparams.yaml")),
+        WEIGHTS,
+        SUMMARY,
+    ),
     temporary=(".*.tmp", "member_*/.*.tmp"),
     identity=_fixed,
 )

@@ -31,18 +31,28 @@ class PinholeCamera(Protocol):
 
 
 def as_tensor(name: str, value: object) -> Tensor:
-    """Convert the argument ``name``, a tensor or a NumPy array of numbers, to a tensor.
+    """Convert the argument ``name``, a tensor or a NumPy array of numbers, to a tensor. Masked entries become NaN (not
+    valid) or False.
 
     Raises:
-        TypeError: ``value`` is neither.
+        TypeError: ``value`` is neither, or a masked array of whole numbers.
     """
     if isinstance(value, Tensor):
         return value
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "bfiu":
         kind = f"an array of {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__
         raise TypeError(f"{name} must be a torch.Tensor or a NumPy array of numbers, got {kind}")
+    if isinstance(value, np.ma.MaskedArray):
+        value = _unmasked(name, value)
     native = value.astype(value.dtype.newbyteorder("="), copy=not value.flags.writeable)
     return torch.from_numpy(np.ascontiguousarray(native))
+
+
+def _unmasked(name: str, value: np.ma.MaskedArray[Any, Any]) -> NDArray[Any]:
+    """The values of a masked array, NaN or False where they are masked."""
+    if value.dtype.kind in "iu" and np.ma.is_masked(value):
+        raise TypeError(f"{name} must not be masked, since {value.dtype} has no value that is not valid: pass floats")
+    return np.asarray(value.filled(np.nan if value.dtype.kind == "f" else False))
 
 
 def as_image(image: ImageLike) -> Tensor:

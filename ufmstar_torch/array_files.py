@@ -16,7 +16,8 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-LARGEST = 2**30  # [bytes] of an array; a float64 depth map of 8192 x 8192 takes half of it
+from ufmstar_torch.limits import require_bytes
+
 # The errors that NumPy, zipfile and its decompressors raise for damaged files (found by changing every byte).
 _DAMAGED = (
     *(OSError, EOFError, ValueError, TypeError, LookupError, ArithmeticError, RuntimeError, SyntaxError, MemoryError),
@@ -33,7 +34,7 @@ def read_npy(path: str | Path, *, mapped: bool = False) -> NDArray[Any]:
 
     Raises:
         OSError: the file cannot be opened.
-        ValueError: the file is damaged, or its header states more data than the file holds or than ``LARGEST`` bytes;
+        ValueError: the file is damaged, or its header states more data than the file holds or than ``MOST_BYTES``;
             the message names the file.
     """
     with Path(path).open("rb") as file:
@@ -53,7 +54,7 @@ def read_npz(path: str | Path, names: Sequence[str], *, or_single: bool = False)
 
 
 def read_npz_whole(path: str | Path) -> dict[str, NDArray[Any]]:
-    """Read all arrays of a .npz file by name, together at most ``LARGEST`` bytes. Errors as :func:`read_npy`."""
+    """Read all arrays of a .npz file by name, together at most ``MOST_BYTES``. Errors as :func:`read_npy`."""
     with Path(path).open("rb") as file:
         return _arrays(file, path)
 
@@ -68,8 +69,7 @@ def _arrays(
                 names = list(members)
             if missing := [name for name in names if name not in members]:
                 raise ValueError(f"expected the arrays {', '.join(missing)}, got {', '.join(sorted(members))}")
-            if (total := sum(members[name].file_size for name in names)) > LARGEST + 2**20:
-                raise ValueError(f"its arrays would take {total:,} bytes")
+            require_bytes("its arrays", sum(members[name].file_size for name in names))
             arrays = {}
             for name in names:
                 with archive.open(members[name]) as member:  # reads at most file_size decompressed bytes
@@ -85,7 +85,8 @@ def _array(file: BinaryIO, size: int) -> NDArray[Any]:
     header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
     shape, _, dtype = header(file)
     stated = prod(shape) * dtype.itemsize
-    if min(shape, default=0) < 0 or not 0 <= stated <= min(LARGEST, size - file.tell()):
+    require_bytes(f"an array {list(shape)} of {dtype}", stated)
+    if min(shape, default=0) < 0 or not 0 <= stated <= size - file.tell():
         raise ValueError(f"its header states {list(shape)} values of {dtype}; it holds {size:,} bytes")
     file.seek(0)
     array: NDArray[Any] = npy.read_array(file, allow_pickle=False)

@@ -8,7 +8,10 @@ from types import MappingProxyType
 from typing import Any
 
 from ufmstar_torch.checked import Checked, choice, number, section
+from ufmstar_torch.limits import require_bytes
 from ufmstar_torch.posterior.config import PosteriorConfig as PosteriorConfig
+
+_SLOT = 64  # [bytes] of a component's state without features
 
 # [m] Largest depth of a network that states none; SPGF's own.
 UNSTATED_RANGE = 20.0
@@ -177,8 +180,8 @@ class ConfidenceConfig(Checked):
         half_life: age after which a frame's verdict on the confidence counts half
     """
 
-    anchors: int = number(1024, "N", "1", 64)
-    each: int = number(64, "n", "1", 1)
+    anchors: int = number(1024, "N", "1", 64, 2**20)
+    each: int = number(64, "n", "1", 1, 2**20)
     bins: int = number(16, "K", "1", 2, 64)
     shrinkage: float = number(16.0, "kappa", "anchors", 0.0, open_low=True)
     least: float = number(0.1, "h_min", "1", 0.0, 1.0, open_low=True)
@@ -300,6 +303,7 @@ class UfMStarConfig(Checked):
                 "UfMStarConfig.aleatoric_in_h goes with add_aleatoric=True and without anchors (posterior=False; "
                 "--plain), got another setting"
             )
+        require_bytes("UfMStarConfig.initial_capacity", self.initial_capacity * (_SLOT + 4 * self.entries))
         if self.far_radius < self.near_radius:
             raise ValueError(
                 f"UfMStarConfig.far_radius must be at least near_radius = {self.near_radius}, got {self.far_radius}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import sys
 from bisect import bisect_left
 from collections import Counter
@@ -12,26 +13,33 @@ from dataclasses import dataclass
 from pathlib import Path
 from threading import Condition, Thread, current_thread
 from time import perf_counter
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ufmstar_torch.arguments import CameraLike, ImageLike, as_image, as_intrinsics, as_pose
-from ufmstar_torch.atomic import write_atomic
+from ufmstar_torch.atomic import remove_temporaries, write_atomic
 from ufmstar_torch.camera import rotation_deviation
+from ufmstar_torch.file_lock import hold
 from ufmstar_torch.frame import FRAME_FAULTS, pose_fault
 from ufmstar_torch.pipeline import UncertainDepth, UncertainPrediction
+from ufmstar_torch.stream_clock import JUMP, StreamClock, Verdict
 from ufmstar_torch.stream_warnings import LOGGER
 from ufmstar_torch.tensor_files import read_tensors
 from ufmstar_torch.trajectory import SAME_TIME, Trajectory, interpolate_pose
+
+if TYPE_CHECKING:
+    from filelock import BaseFileLock
 
 # Reasons for which an image is dropped (NEWER, CLOSED) or skipped (the others).
 NEWER, CLOSED = "a newer image was ready", "closed"
 BACKWARDS, LATE, GAP = "its stamp is not after the image before", "no pose in time", "poses too far apart around it"
 LOST = "a pose around it is not finite"
+DOUBTFUL = "its stamp is far from those before it"
 _WAITING = 16  # most images that wait for their poses: half a second at 30 frames/s
+_DOUBTFUL = 64  # most poses with doubtful stamps that wait for others
 _POSES = 4096  # most poses in the buffer: 4 s of an inertial filter at 1 kHz
 
 
@@ -59,6 +67,7 @@ class LiveStatistics:
 
     images: int  # pushed
     poses: int  # pushed
+    dropped_poses: int  # those with a stamp far from the ones before
     results: int  # delivered
     dropped: Mapping[str, int]  # by reason: usable images
     skipped: Mapping[str, int]  # by reason: unusable images
@@ -82,7 +91,9 @@ class LiveDepth:
     ``push_image`` and ``push_pose`` may be called from any thread and return at once. Poses may be late: an image waits
     for the first pose after it, at most ``max_wait``, and gets the pose interpolated at its stamp. There is no queue:
     when the model is free, it processes the newest image with a pose, and all older images are dropped. ``statistics``
-    counts drops and skips by reason. Stamps of images and poses must come from one clock, in seconds.
+    counts drops and skips by reason. Stamps of images and poses must come from one clock, in seconds. A single stamp
+    that is over two seconds away from those before it is dropped and counted; the third in sequence is a jump of the
+    clock, which is logged and followed.
 
     Args:
         model: an :class:`UncertainDepth` on one stream; from now on, only this object may call it. Call
@@ -97,8 +108,8 @@ class LiveDepth:
         save_every: see ``state``.
 
     Raises:
-        TypeError, ValueError: an argument is invalid, or the model cannot continue from the state in the file; the file
-            stays as it is.
+        TypeError, ValueError: an argument is invalid, another process writes ``state``, or the model cannot continue
+            from the state in the file, which stays as it is.
         FileNotFoundError: the folder of ``state`` does not exist.
 
     An image of another size or camera resets the evidence of the model's anchors. An error in the model, in
@@ -129,8 +140,13 @@ class LiveDepth:
             raise FileNotFoundError(f"state: no such folder: {self._state.parent}")
         if self._state is not None and self._state.is_dir():
             raise IsADirectoryError(f"state must be a file, got the folder {self._state}")
-        if self._state is not None and self._state.exists():
-            load_state(model, self._state)
+        self._lock = None if self._state is None else self._locked(self._state)
+        if self._state is not None and self._lock is not None and self._state.exists():
+            try:
+                load_state(model, self._state)
+            except ValueError:
+                self._lock.release()
+                raise
         self.model, self._on_result = model, on_result
         self._intrinsics = None if intrinsics is None else as_intrinsics(intrinsics)
         self._max_wait, self._max_gap, self._save_every = max_wait, max_gap, save_every
@@ -139,11 +155,24 @@ class LiveDepth:
         self._times: list[float] = []  # of the poses, increasing
         self._poses: list[np.ndarray] = []
         self._last_image = -math.inf
+        self._image_clock, self._pose_clock = StreamClock(), StreamClock()
+        self._doubtful: list[tuple[float, np.ndarray]] = []  # poses whose stamps nothing has confirmed
         self._busy = self._ending = self._ended = self._resetting = False
         self._counts, self._dropped, self._skipped = Counter[str](), Counter[str](), Counter[str]()
         self._error: BaseException | None = None
         self._worker = Thread(target=self._run, name="ufmstar live", daemon=True)
         self._worker.start()
+
+    @staticmethod
+    def _locked(state: Path) -> BaseFileLock:
+        """Lock the file of the state, and remove temporary files of a killed process. Raises ValueError: another
+        process writes it."""
+        file = Path(os.path.realpath(state))
+        lock = hold(file.with_name(f".{file.name}.lock"))
+        if lock is None:
+            raise ValueError(f"state: another process is writing {state}: each needs a file of its own")
+        remove_temporaries(path for path in file.parent.iterdir() if path.name.startswith(f".{file.name}."))
+        return lock
 
     def push_image(self, stamp: float, rgb: ImageLike, intrinsics: CameraLike | None = None) -> None:
         """Submit an image.
@@ -169,9 +198,14 @@ class LiveDepth:
             self._counts["images"] += 1
             if self._ending:
                 self._dropped[CLOSED] += 1
-            elif stamp <= self._last_image:
+            elif (verdict := self._image_clock.judge(stamp, received)) == Verdict.WAIT:
+                self._skip(DOUBTFUL, stamp)
+            elif verdict == Verdict.USE and stamp <= self._last_image:
                 self._skip(BACKWARDS, stamp)
             else:
+                if verdict == Verdict.JUMPED:
+                    LOGGER.warning("the images' clock jumped from %.3f s to %.3f s", self._last_image, stamp)
+                    self._drop_waiting(len(self._waiting), NEWER)
                 self._last_image = stamp
                 if len(self._waiting) == _WAITING:  # drop the newest: older images get their poses first
                     self._waiting.pop()
@@ -180,8 +214,8 @@ class LiveDepth:
                 self._changed.notify_all()
 
     def push_pose(self, stamp: float, T: CameraLike) -> None:
-        """Submit the camera's pose at a time; poses may come late and in any order. A pose replaces an earlier one with
-        the same stamp.
+        """Submit the camera's pose at a time; poses may come late, and in any order within two seconds. A pose replaces
+        an earlier one with the same stamp.
 
         Args:
             stamp: [s].
@@ -195,30 +229,57 @@ class LiveDepth:
         stamp, pose = _seconds(stamp), _pose(T, self.model.ufm.config.rotation_tolerance)
         with self._changed:
             self._counts["poses"] += 1
-            index = bisect_left(self._times, stamp)
-            if index < len(self._times) and self._times[index] == stamp:
-                self._poses[index] = pose
-            else:
-                self._times.insert(index, stamp)
-                self._poses.insert(index, pose)
-            del self._times[:-_POSES], self._poses[:-_POSES]
+            if not self._replaced(stamp, pose):
+                self._insert(stamp, pose)
             self._changed.notify_all()
+
+    def _replaced(self, stamp: float, pose: np.ndarray) -> bool:
+        """Replace the pose in the buffer that has the same stamp; False if there is none."""
+        index = bisect_left(self._times, stamp)
+        if index == len(self._times) or self._times[index] != stamp:
+            return False
+        self._poses[index] = pose
+        return True
+
+    def _insert(self, stamp: float, pose: np.ndarray) -> None:
+        """Insert a pose with a new stamp; after a jump of the clock, instead of all others."""
+        before = self._pose_clock.latest
+        verdict = self._pose_clock.judge(stamp, perf_counter(), self._image_clock.newest)
+        if verdict == Verdict.WAIT:
+            self._doubtful.append((stamp, pose))
+            self._counts["dropped_poses"] += max(len(self._doubtful) - _DOUBTFUL, 0)
+            del self._doubtful[:-_DOUBTFUL]
+            return
+        new = [(stamp, pose)]
+        if verdict == Verdict.JUMPED:
+            LOGGER.warning("the poses' clock jumped from %.3f s to %.3f s", before, stamp)
+            new = [one for one in self._doubtful if abs(one[0] - stamp) <= JUMP] + new
+            self._times, self._poses = [], []
+        self._counts["dropped_poses"] += len(self._doubtful) - (len(new) - 1)
+        self._doubtful = []
+        for time, T in new:
+            index = bisect_left(self._times, time)
+            self._times.insert(index, time)
+            self._poses.insert(index, T)
+        del self._times[:-_POSES], self._poses[:-_POSES]
 
     @property
     def statistics(self) -> LiveStatistics:
         """Counts so far."""
         with self._changed:
-            counts = {name: self._counts[name] for name in ("images", "poses", "results", "saved")}
+            names = ("images", "poses", "dropped_poses", "results", "saved")
+            counts = {name: self._counts[name] for name in names}
             restarts = 0 if self.model.landmarks is None else self.model.landmarks.restarts
             return LiveStatistics(**counts, restarts=restarts, dropped=dict(self._dropped), skipped=dict(self._skipped))
 
     def reset(self) -> None:
         """Drop poses and waiting images, and reset the model before its next image. Call this after a loop closure that
-        moved old poses, or after a jump of the clock."""
+        moved old poses."""
         self._raise()
         with self._changed:
             self._drop_waiting(len(self._waiting), NEWER)
             self._times, self._poses, self._last_image, self._resetting = [], [], -math.inf, True
+            self._image_clock, self._pose_clock, self._doubtful = StreamClock(), StreamClock(), []
 
     def wait_idle(self, timeout: float | None = None) -> bool:
         """Wait at most ``timeout`` [s] until no image waits or is processed (not in ``on_result``). Returns False after
@@ -258,6 +319,8 @@ class LiveDepth:
         with ExitStack() as stack:
             stack.push(self._keep_error)
             self._work()
+        if self._lock is not None:
+            self._lock.release()
         with self._changed:
             self._busy, self._ended = False, True
             self._changed.notify_all()

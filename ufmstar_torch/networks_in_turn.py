@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from inspect import signature
 from pathlib import Path
 from typing import Any, Self
 from zlib import crc32
@@ -39,7 +40,7 @@ class NetworksInTurn(nn.Module):
         preprocess: maps image and intrinsics to the networks' input; None = no preprocessing.
 
     Raises:
-        TypeError: a network is no ``nn.Module``.
+        TypeError: a network is no ``nn.Module``, or its ``train`` is not PyTorch's (``require_switchable``).
         ValueError: no network, or ``samples`` with several networks.
     """
 
@@ -142,7 +143,27 @@ def modules_of(networks: object) -> list[nn.Module]:
             f"networks must be an nn.Module or a sequence of them, got a {type(wrong[0]).__name__}; wrap other "
             "networks with ufmstar_torch.models.wrap_network(network)"
         )
-    return [member for member in members if isinstance(member, nn.Module)]
+    modules = [member for member in members if isinstance(member, nn.Module)]
+    for module in modules:
+        require_switchable(module)
+    return modules
+
+
+def require_switchable(network: nn.Module) -> None:
+    """Raise a TypeError unless ``train`` of a network and of its parts has PyTorch's form ``train(mode)``, which
+    ``eval()`` calls; in other libraries a method of this name starts a training."""
+    for name, part in network.named_modules():
+        if type(part).train is nn.Module.train and "train" not in vars(part):
+            continue
+        first = next(iter(signature(part.train).parameters), None)
+        if first != "mode":
+            where = f"{name}, a {type(part).__name__}," if name else f"a {type(part).__name__}"
+            inner = isinstance(getattr(part, "model", None), nn.Module)
+            remedy = "pass its module, NETWORK.model" if inner else "pass the nn.Module that it runs"
+            raise TypeError(
+                f"network is {where} whose train({first or ''}) is not PyTorch's train(mode): eval() would start it; "
+                f"{remedy}, wrapped by ufmstar_torch.models.wrap_network"
+            )
 
 
 def shared_preprocess(networks: Sequence[nn.Module]) -> Preprocess:

@@ -28,6 +28,7 @@ from ufmstar_torch.networks_in_turn import (
     shared_preprocess,
     weights_mark,
 )
+from ufmstar_torch.one_caller import OneCaller, one_caller
 from ufmstar_torch.output import FrameStatistics, MeanUncertainty, UfMStarOutput
 from ufmstar_torch.prediction import DepthPrediction
 from ufmstar_torch.recalibrate import Recalibration
@@ -105,6 +106,17 @@ class _Predicted:
     ready: torch.cuda.Event | None
 
 
+@one_caller(
+    "forward",
+    "update",
+    "mean_uncertainty",
+    "_predicted",
+    "_fused",
+    "reset",
+    "load_state_dict",
+    "_save_to_state_dict",
+    "_apply",
+)
 class UncertainDepth(NetworksInTurn):
     """Depth and variance from any pretrained network(s), for images with pose and intrinsics.
 
@@ -141,7 +153,8 @@ class UncertainDepth(NetworksInTurn):
             faster for one camera with the networks on a GPU. :meth:`stream` runs both devices at the same time.
 
     The constructor puts the networks into eval mode; they run without gradients. A stochastic network must sample in
-    eval mode, as decoder dropout at test time does.
+    eval mode, as decoder dropout at test time does. A second thread that calls the module while another one is inside
+    gets a RuntimeError.
 
     Raises:
         TypeError: an argument is no network.
@@ -183,6 +196,7 @@ class UncertainDepth(NetworksInTurn):
         if len({id(member) for member in members}) < len(members):
             raise ValueError("networks must differ, got one of them twice: for passes of a stochastic one set samples")
         super().__init__(members or None, samples=samples, preprocess=preprocess)
+        self._caller = OneCaller()
         config = UfMStarConfig() if config is None else config
         for name, value, kind in (("config", config, UfMStarConfig), ("recalibration", recalibration, Recalibration)):
             if value is not None and not isinstance(value, kind):

@@ -13,13 +13,16 @@ import torch
 from torch import Tensor, nn
 
 from ufmstar_torch.checked import Checked
+from ufmstar_torch.one_caller import OneCaller, one_caller
 
 
+@one_caller("_save_to_state_dict", "_load_from_state_dict", "_apply")
 class StatefulModule(nn.Module):
     """A module whose state is a fixed set of buffers.
 
     Buffers stay float32 or float64, even after ``.half()``. Loading a saved state changes the buffers' shapes (streams,
-    components, image size). A saved state contains the module's config.
+    components, image size). A saved state contains the module's config. A second thread that calls a method while
+    another one is inside gets a RuntimeError.
 
     Attributes:
         STATE: the buffers' names.
@@ -31,6 +34,10 @@ class StatefulModule(nn.Module):
     STATE: tuple[str, ...]
     ALWAYS_FLOAT64: tuple[str, ...] = ("T_world_first",)
     config: Checked
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._caller = OneCaller()
 
     if TYPE_CHECKING:
 

@@ -21,6 +21,7 @@ from ufmstar_torch.frame import CheckKernel, FrameInput, check_frame, raise_faul
 from ufmstar_torch.kernels.select import LateStep, select_check, select_step
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.network_variance import NetworkVariance
+from ufmstar_torch.one_caller import one_caller
 from ufmstar_torch.output import MeanUncertainty, StepOutput, UfMStarOutput
 from ufmstar_torch.regress import Regression, regress
 from ufmstar_torch.sample import mean_uncertainty, sample_pixels, sample_size
@@ -32,14 +33,15 @@ from ufmstar_torch.stream_warnings import StreamWarnings
 from ufmstar_torch.warm_up import warm_up
 
 
+@one_caller("forward", "mean_uncertainty", "query", "reset", "state", "__getstate__")
 class UfMStar(StatefulModule):
     """Uncertainty from Motion*: computes a variance per pixel from one predicted depth map per image.
 
     The state (the mixture of every stream) consists of buffers: ``.to()``, ``deepcopy`` and ``state_dict`` include it,
     and a run continued from a saved state equals an uninterrupted one to the last bit. The state is float32 or float64,
     also after ``.half()``; poses and the fusion are float64, also under autocast. A frame that raises does not change
-    the state. There are no learnable parameters: gradients flow from ``variance`` to ``aleatoric`` and ``epistemic``
-    only.
+    the state. A second thread that calls the module while another one is inside gets a RuntimeError. There are no
+    learnable parameters: gradients flow from ``variance`` to ``aleatoric`` and ``epistemic`` only.
 
     Args:
         config: None = ``UfMStarConfig()``, which differs from the paper's settings as listed in
@@ -100,7 +102,7 @@ class UfMStar(StatefulModule):
             depth: [B, H, W] or [B, 1, H, W] metric depth along the optical axis [m], any floating dtype; all arguments
                 are tensors or NumPy arrays. The accepted range is [1e-6 m, 1e6 m], and at most
                 ``config.segment.max_depth``: set it to the network's largest depth. Pixels beyond it
-                (``statistics.beyond``) or otherwise outside (``out_of_range``), NaN and infinity are not valid.
+                (``statistics.beyond``) or otherwise outside (``out_of_range``), NaN, infinity and masked are not valid.
             pose: [B, 4, 4] or [4, 4] camera-to-world (T_world_cam) [m], or without its last row; coordinates up to
                 1e9 m. Rotations within ``config.rotation_tolerance`` are projected onto SO(3).
             intrinsics: [B, 3, 3] or [3, 3], or fx, fy, cx, cy, in pixels of this depth map (not of the image:

@@ -47,6 +47,7 @@ class BenchSettings:
         model: kind of network, as in `ufmstar run`; without --weights fastdepth or monodepth2
         weights: file or directory of the network's weights
         spec: JSON file that declares what the weights do not contain, as in `ufmstar run`
+        trust_code: exported, torchscript: let the file run its code; only for files whose origin you trust
         runtime: auto: ONNX Runtime for weights in ONNX files, torch for the rest; or one of the two
         sizes: sides of the square images without --weights [px], multiples of 32
         backends: implementations of the step that are timed
@@ -62,6 +63,7 @@ class BenchSettings:
     model: str = "fastdepth"
     weights: Path | None = None
     spec: Path | None = None
+    trust_code: bool = field(default=False, metadata={"typed": True})
     runtime: str = field(default="auto", metadata={"choices": ("auto", "torch", "onnx")})
     sizes: tuple[int, ...] = (224, 512)
     backends: tuple[str, ...] = field(default=("auto",), metadata={"choices": ("auto", "numba", "triton", "torch")})
@@ -154,9 +156,8 @@ def _random(options: BenchSettings, side: int, device: torch.device) -> TimedNet
 def _loaded(options: BenchSettings, threads: int, device: torch.device) -> TimedNetwork:
     """The network of the options, loaded as by ``ufmstar run``."""
     inference = Inference(runtime=options.runtime, threads=threads)
-    choice = NetworkChoice(
-        "", options.model, (str(options.weights),), None if options.spec is None else str(options.spec)
-    )
+    spec = None if options.spec is None else str(options.spec)
+    choice = NetworkChoice("", options.model, (str(options.weights),), spec, options.trust_code)
     members = [member.to(device) for member in choice.members(device, inference=inference)]
     return TimedNetwork("ensemble" if len(members) > 1 else "depth_only", members, options.model)
 

@@ -16,6 +16,7 @@ from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.setting import DEFAULTS, PAPER, started
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_size
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
+from ufmstar_torch.models.any_network import PROGRAMS
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.recalibrate import Recalibration, recalibration_path
 from ufmstar_torch.stateful import flat
@@ -39,6 +40,7 @@ class NetworkOptions:
         samples: passes per image of an mc_dropout network in mode full; default: 10
         offload: trained: keep the weights in host memory, only the member in turn on the device
         spec: JSON file that declares what the weights do not say: inputs, outputs, an alignment
+        trust_code: exported, torchscript: let the file run its code; only for files whose origin you trust
         runtime: auto: ONNX Runtime for weights in ONNX files, torch for the rest; or one of the two
         precision: of the networks; bf16: torch's autocast
     """
@@ -49,6 +51,7 @@ class NetworkOptions:
     samples: int | None = option(None, least=2)
     offload: bool = False
     spec: str | None = None
+    trust_code: bool = option(False, typed=True)
     runtime: str = option("auto", choices=("auto", "torch", "onnx"))
     precision: str = option("float32", choices=("float32", "bf16"))
 
@@ -61,6 +64,8 @@ class NetworkOptions:
         for name in ("samples", "offload"):
             if getattr(self, name) and self.model != "trained":
                 raise ValueError(f"--{name} goes with --model trained only")
+        if self.trust_code and self.model not in PROGRAMS:
+            raise ValueError(f"--trust-code goes with --model {' or '.join(PROGRAMS)} only")
         if self.mode == "full" and len(self.weights) < 2 and self.model != "trained":
             raise ValueError("--mode full needs several --weights")
         if self.samples is not None and self.mode != "full":
@@ -68,7 +73,7 @@ class NetworkOptions:
 
     def load(self, machine: MachineOptions) -> DepthSource:
         """Load the networks onto a device; errors as ``NetworkChoice.load``."""
-        choice = NetworkChoice("", str(self.model), self.weights, self.spec)
+        choice = NetworkChoice("", str(self.model), self.weights, self.spec, self.trust_code)
         inference = Inference(self.runtime, self.precision, machine.threads)
         how: dict[str, Any] = {"mode": self.mode, "samples": self.samples, "offload": self.offload}
         return choice.load(torch.device(machine.device), **how, inference=inference)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -40,6 +40,7 @@ class SuiteOptions:
             is its spec. With paper-table-1, -2 and -4 a base may have a second one, whose time, energy and memory are
             measured as well
         spec: JSON file that declares what the weights of the networks without one do not say, as of ufmstar run
+        trust_code: let files of exported and torchscript run their code; only for files whose origin you trust
         samples: passes of MC-Dropout of a row that needs all of them; default: 10
         runtime: auto: ONNX Runtime for weights in ONNX files, torch for the rest; or one of the two
         precision: of the networks; bf16: torch's autocast
@@ -53,6 +54,7 @@ class SuiteOptions:
     ufm_preset: str | None = option(None, choices=(PAPER, DEFAULTS))
     network: tuple[str, ...] = option((), repeat=True)
     spec: str | None = None
+    trust_code: bool = option(False, typed=True)
     samples: int | None = option(None, least=2)
     runtime: str = option("auto", choices=("auto", "torch", "onnx"))
     precision: str = option("float32", choices=("float32", "bf16"))
@@ -169,7 +171,7 @@ def job_from(options: EvalOptions) -> EvalJob:
     require_methods(suite, options.opening.plugin)
     architectures: list[dict[str, NetworkChoice]] = [{}]
     for text in what.network:  # a base's n-th network belongs to the n-th architecture
-        choice = NetworkChoice.parse(text).with_spec(what.spec)
+        choice = replace(NetworkChoice.parse(text).with_spec(what.spec), trust_code=what.trust_code)
         number = sum(choice.base in architecture for architecture in architectures)
         architectures += [{}] if number == len(architectures) else []
         architectures[number][choice.base] = choice

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
-from itertools import takewhile
+from functools import partial
 from pathlib import Path
 from time import monotonic
 from typing import Any, ClassVar
@@ -30,6 +30,7 @@ from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderKind, output_folder
 from ufmstar_torch.eval.run.machine import share_threads
 from ufmstar_torch.eval.run.rerun_log import RerunLog, open_viewer
+from ufmstar_torch.eval.run.writers import is_frame
 from ufmstar_torch.eval.sequences import live as sources
 from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
 from ufmstar_torch.eval.sequences.live import LiveEvent
@@ -40,6 +41,7 @@ from ufmstar_torch.pipeline import UncertainDepth
 from ufmstar_torch.stream_warnings import LOGGER
 
 _STANDARD_INPUT, _SUMMARY = "-", "realtime.json"
+_ARRAYS = ("depth", "variance", "disagreement", "T_world_cam", "intrinsics")  # of an image's file
 # Options for opening that are also valid for a source that is no recording.
 _OF_LIVE = ("intrinsics", "trajectory", "poses", "pose_scale", "max_pose_gap")
 
@@ -119,7 +121,8 @@ def main(options: LiveOptions) -> int:
 
     if options.threads is None:
         share_threads()
-    kind = FolderKind("ufmstar live", "live run", _SUMMARY, ("*.npz",), lock=".lock")
+    ours = {"*.npz": partial(is_frame, names=_ARRAYS)}
+    kind = FolderKind("ufmstar live", "live run", _SUMMARY, ("*.npz",), recognise=ours, lock=".lock")
     started = {"state": "started"}  # a later run may replace finished results only
     with ExitStack() as stack:
         with usage_errors(ImportError, OSError, ValueError):
@@ -171,14 +174,16 @@ def _run(
     live = LiveDepth(model, on_result, K, state=options.state, save_every=options.save_every, **how)
     try:
         with _interrupted_by_sigterm(), live, suppress(KeyboardInterrupt):
-            for event in takewhile(lambda _: monotonic() < deadline, events):
+            for event in events:
+                if monotonic() >= deadline:
+                    break
                 if event.T_world_cam is not None:
                     live.push_pose(event.stamp, event.T_world_cam)
                 if event.image is not None:
                     if not warm:  # the first inference takes seconds; a recording's clock starts after it
                         height, width = event.image.shape[:2]
                         model.warm_up((height, width))
-                        warm = True
+                        deadline, warm = monotonic() + options.seconds, True
                     live.push_image(event.stamp, event.image, event.intrinsics)
             live.wait_idle()
     except (OSError, RuntimeError, TypeError, ValueError) as error:

@@ -71,7 +71,7 @@ def option(default: Any = MISSING, **how: Any) -> Any:
     """A field whose option needs more than its type; without a default, the option is required. ``how`` has
     ``choices``: the allowed values; ``least``: the smallest one; ``positive``: True for numbers above 0; ``const``: the
     value of the option without a word after it; ``repeat``: True if repeated options add words instead of replacing
-    the earlier ones."""
+    the earlier ones; ``typed``: True if a configuration file must not set the option, since it allows code to run."""
     return field(default=default, metadata=how)
 
 
@@ -139,11 +139,15 @@ def parser_of(options: type, prog: str, *, full: bool = False) -> ArgumentParser
     from jsonargparse import ActionConfigFile, ArgumentParser, DefaultHelpFormatter
 
     class BoundedConfigFile(ActionConfigFile):
-        """Check the size and nesting of a configuration before it is parsed."""
+        """Check the size and nesting of a configuration before it is parsed, and the options that it sets."""
 
         def __call__(self, parser: Any, cfg: Any, values: Any, option_string: Any = None) -> None:
             _require_bounded(values)
+            before = {name: cfg.get(name) for name in typed}
             super().__call__(parser, cfg, values, option_string)
+            if changed := [name for name in typed if cfg.get(name) != before[name]]:
+                name = f"--{changed[0].replace('_', '-')}"
+                raise ValueError(f"{name} allows code to run: type it on the command line, not in a --config file")
 
     class Formatter(DefaultHelpFormatter):
         """Omits the default of a flag, which is the field's value (--no-video: True), and the default None."""
@@ -154,6 +158,7 @@ def parser_of(options: type, prog: str, *, full: bool = False) -> ArgumentParser
             return re.sub(r", default: %\(default\)s| \(default: %\(default\)s\)", "", text) if unknown else text
 
     description, _ = _documentation(options)
+    typed = _typed(options)
     usage = getattr(options, "USAGE", None)
     parser = ArgumentParser(
         prog=prog, usage=usage, description=description, exit_on_error=False, formatter_class=Formatter
@@ -163,6 +168,14 @@ def parser_of(options: type, prog: str, *, full: bool = False) -> ArgumentParser
     parser.add_argument(_HELP_ALL, action="store_true", help="show every option, those of all settings included")
     _add_options(parser, parser, options, full)
     return parser
+
+
+def _typed(options: type) -> list[str]:
+    """The names of the options that a configuration file must not set, those of groups included."""
+    hints = get_type_hints(options)
+    names = [f.name for f in fields(options) if f.metadata.get("typed")]
+    groups = [f for f in fields(options) if is_dataclass(hints[f.name]) and "fields_of" not in f.metadata]
+    return names + [name for f in groups for name in _typed(f.metadata.get("type", hints[f.name]))]
 
 
 def _require_bounded(config: str) -> None:

@@ -144,7 +144,7 @@ def _reconstruct(options: PosesOptions, images: list[Any], size: tuple[int, int]
     if unknown := sorted(named - {_plain(name) for name in always}):
         raise ValueError(f"--length: there is no image {', '.join(unknown)}; they are {images[0].name}, ...")
     out = options.out
-    (out / "images").mkdir()
+    (out / "images").mkdir(exist_ok=True)
     with Bars() as bars, stop_signals(bars.say) as stop:
         how: dict[str, Any] = {"progress": lambda done: bars.show(Progress("frames", done, len(images))), "stop": stop}
         chosen, broken = write_keyframes(images, out / "images", always=always, **how)
@@ -158,7 +158,7 @@ def _reconstruct(options: PosesOptions, images: list[Any], size: tuple[int, int]
     opening = Options(fps=options.fps, max_pose_gap=options.max_pose_gap)
     scale = scale_model(models[0], images, length=options.known_length, trajectory=trajectory, options=opening)
     for number, model in enumerate(models):
-        (out / "sparse" / str(number)).mkdir()
+        (out / "sparse" / str(number)).mkdir(exist_ok=True)
         model.write(out / "sparse" / str(number))
     points, sigma = landmarks(models[0])
     write_atomic(out / "landmarks.npz", lambda file: np.savez(file, points=points, sigma=sigma))

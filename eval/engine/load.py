@@ -17,6 +17,7 @@ from ufmstar_torch.eval.engine.networks import NetworkSource, stochastic
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.method import BASES
 from ufmstar_torch.eval.sequences.frame import Size, parse_size
+from ufmstar_torch.models.any_network import PROGRAMS
 from ufmstar_torch.models.dropout import SAMPLES
 from ufmstar_torch.models.inference import Inference, runtime_of
 from ufmstar_torch.models.load import DIRECTORIES, load_network, network_names
@@ -44,6 +45,7 @@ class NetworkChoice:
     # directory is a network of ``transformers``; for "ground-truth" empty, or "HxW".
     weights: tuple[str, ...] = ()
     spec: str | None = None  # file that declares what an ONNX file or saved program does not contain
+    trust_code: bool = False  # True allows the files of "exported" and "torchscript" to run code
 
     def __post_init__(self) -> None:
         if not self.base:
@@ -162,7 +164,8 @@ class NetworkChoice:
             if not path.is_file() and not (self.model == "monodepth2" and path.is_dir()):
                 raise FileNotFoundError(f"no such file: {path}")
         members: list[DepthNetwork] = []
-        how = {} if self.spec is None else {"spec": self.spec}
+        how: dict[str, Any] = {} if self.spec is None else {"spec": self.spec}
+        how |= {"trust_code": self.trust_code} if self.model in PROGRAMS else {}
         for path, member in named:
             if self.model == "trained" and not how:
                 loaded = load_trained([path], offload=offload)

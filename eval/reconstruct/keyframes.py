@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ufmstar_torch.eval.run.files import write_bytes_atomic
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError
 
 # An image is a keyframe if the median corner has moved by this share of the image's width since the last keyframe, or
@@ -15,6 +16,8 @@ _MOTION, _LEFT = 0.03, 0.5
 _WIDTH = 320  # [px] to which images are reduced for tracking
 _CORNERS, _FEWEST = 300, 20  # largest number of corners in an image, and smallest number in a keyframe
 _JPEG_QUALITY = 95
+_TEXT = b"ufmstar poses"
+_COMMENT = b"\xff\xfe" + (2 + len(_TEXT)).to_bytes(2) + _TEXT  # a JPEG's comment, the first segment
 
 
 def write_keyframes(
@@ -41,12 +44,17 @@ def write_keyframes(
             broken += 1
             continue
         if motion.is_keyframe(image, required=entry.name in always):
-            how = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-            if not cv2.imwrite(str(folder / f"{entry.name}.jpg"), image[..., ::-1], how):
-                raise OSError(f"{folder / entry.name}.jpg cannot be written")
+            jpeg = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+            write_bytes_atomic(folder / f"{entry.name}.jpg", jpeg[:2] + _COMMENT + jpeg[2:])
             chosen.append(index)
         progress(index + 1)
     return chosen, broken
+
+
+def is_keyframe(path: Path) -> bool:
+    """True if a file is an image of :func:`write_keyframes`, by its comment."""
+    with path.open("rb") as file:
+        return file.read(2 + len(_COMMENT))[2:] == _COMMENT
 
 
 class _Motion:

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from ufmstar_torch.eval.reconstruct.keyframes import is_keyframe
 from ufmstar_torch.eval.run.folder import FolderKind
 from ufmstar_torch.eval.sequences.attach import attach
 from ufmstar_torch.eval.sequences.colmap import SCALE_FILE
@@ -36,8 +37,16 @@ _FEATURES, _LARGEST_IMAGE = 4096, 1600  # largest number of features of an image
 _VIEWS, _ANGLE, _MOST_ERROR, _LEAST_ERROR = 3, np.radians(1.5), 2.0, 0.5
 
 
-_MADE = ("images", "sparse", "rgb.txt", "landmarks.npz", "database.db")
-POSES = FolderKind("ufmstar poses", "reconstruction", SCALE_FILE, _MADE)
+_KEYFRAMES = "images/*.jpg"
+_MADE = (_KEYFRAMES, "sparse/[0-9]*/*.bin", "sparse/unsorted/[0-9]*/*.bin", "rgb.txt", "landmarks.npz", "database.db")
+POSES = FolderKind(
+    "ufmstar poses",
+    "reconstruction",
+    SCALE_FILE,
+    _MADE,
+    recognise={_KEYFRAMES: is_keyframe},
+    temporary=(".*.tmp", "images/.*.tmp"),
+)
 
 
 def require_pycolmap() -> Any:
@@ -89,7 +98,7 @@ def reconstruct(
     adjustment.refine_focal_length = adjustment.refine_extra_params = K is None
     (out / "sparse").mkdir(exist_ok=True)
     scratch = out / "sparse" / "unsorted"
-    scratch.mkdir()
+    scratch.mkdir(exist_ok=True)
     found = pycolmap.global_mapping(database, out / "images", scratch, options).values()
     shutil.rmtree(scratch)
     database.unlink()

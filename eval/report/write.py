@@ -15,6 +15,7 @@ from ufmstar_torch.eval.report.pictures import Picture, pictures_of
 from ufmstar_torch.eval.report.style import save_figure
 from ufmstar_torch.eval.report.tables import all_tables, write_tables, write_tidy
 from ufmstar_torch.eval.run.files import remove_temporaries
+from ufmstar_torch.eval.suite.folder import EVALUATION
 
 # Errors of drawing, after which a report continues without the picture.
 _DRAWING_ERRORS = (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError)
@@ -35,10 +36,12 @@ def write_report(out: Path, *, figures: bool = True) -> Report:
 
     Raises:
         ResultsError: the folder is no evaluation, or its records are inconsistent.
+        FolderError: a file to write is a symbolic link.
         ValueError: an example's file cannot be read.
         ImportError: matplotlib, Pillow or Jinja2 is missing.
     """
     results = load_results(out, with_sums=figures)
+    EVALUATION.require_no_links(out)
     # Temporary files of a killed report; those of eval.json and the records belong to `ufmstar eval`.
     for pattern in ("tables/.*.tmp", "figures/.*.tmp", ".results.*.tmp", ".table.*.tmp", ".report.*.tmp"):
         remove_temporaries(out.glob(pattern))

@@ -6,7 +6,6 @@ valid, or whose sigma exceeds a limit, are left out.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.conventions import CONVENTIONS
 from ufmstar_torch.eval.run.colours import known_where
-from ufmstar_torch.eval.run.files import write_bytes_atomic, write_json_atomic
+from ufmstar_torch.eval.run.files import remove_temporaries, write_bytes_atomic, write_json_atomic
 from ufmstar_torch.eval.run.gaussians import vertex_table, write_ply
 from ufmstar_torch.eval.run.offset import world_offset
 from ufmstar_torch.eval.run.writers import encode_length_png, fitting_unit, frame_file, read_frame
@@ -87,13 +86,20 @@ def _gated(out: Path, record: Mapping[str, Any], max_sigma: float, max_relative_
 
 
 def with_images(frames: Iterator[RunFrame], sequence: FrameSequence) -> Iterator[RunFrame]:
-    """The frames with the images of their recording, if these can be read."""
+    """The frames with the images of their recording, if these can be read. Raises ValueError, after the last frame: the
+    recording has none of the frames."""
+    common = 0
     for frame in frames:
         if frame.index < len(sequence) and sequence.names[frame.index] == frame.name:
+            common += 1
             with suppress(FrameError):
                 recorded = sequence[frame.index]
                 frame = replace(frame, image=recorded.image, image_intrinsics=recorded.intrinsics)
         yield frame
+    if not common:
+        raise ValueError(
+            f"--sequence: {sequence.name!r} has none of the run's frames: open the run's recording as it did"
+        )
 
 
 def export_depth(frames: Iterator[RunFrame], out: Path) -> str:
@@ -199,14 +205,6 @@ def export_transforms(frames: Iterator[RunFrame], out: Path) -> str:
     return f"{folder / 'transforms.json'}: {len(listed)} frames"
 
 
-def run_settings(out: Path) -> dict[str, Any]:
-    """The options of a run, by name. Raises ValueError: its summary cannot be read."""
-    try:
-        return dict(json.loads((out / "summary.json").read_text(encoding="utf-8"))["settings"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(f"{out}/summary.json is not that of a run: {error}") from error
-
-
 def points_of(u: NDArray[Any], v: NDArray[Any], depth: NDArray[Any], K: NDArray[np.float64]) -> NDArray[np.float64]:
     """[P, 3] points in the camera's axes [m] of pixels u, v [px] with a depth [m]."""
     z, y = depth.astype(np.float64), (v - K[1, 2]) / K[1, 1]
@@ -246,6 +244,12 @@ def _merged(
 
 
 def export_folder(out: Path, *names: str) -> Path:
-    folder = out.joinpath("export", *names)
-    folder.mkdir(parents=True, exist_ok=True)
+    """OUT/export and folders below it, created if missing. Raises ValueError: one of them, or a file in it, is a
+    symbolic link, through which nothing is written."""
+    for folder in (out.joinpath("export", *names[:length]) for length in range(len(names) + 1)):
+        linked = [folder] if folder.is_symlink() else []
+        folder.mkdir(exist_ok=True)
+        remove_temporaries(folder.iterdir())
+        if linked := linked or [path for path in folder.iterdir() if path.is_symlink()]:
+            raise ValueError(f"{linked[0]} is a symbolic link, through which nothing is written: remove it")
     return folder

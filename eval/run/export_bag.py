@@ -22,6 +22,7 @@ WORLD, CAMERA = "world", "camera"
 IMAGE, INFO, DEPTH, SIGMA = "/camera/image", "/camera/camera_info", "/camera/depth", "/camera/sigma"
 CLOUD, TF = "/camera/points", "/tf"
 _FIELDS = ("x", "y", "z", "variance")
+_FILES = {"bag.mcap", "metadata.yaml"}
 _LATEST = 2.0**31 - 1  # [s], of builtin_interfaces/Time
 
 
@@ -33,8 +34,9 @@ def export_bag(frames: Iterator[RunFrame], out: Path) -> str:
     how = ("ROS bags need rosbags", "'ufmstar-torch[recordings]'")
     rosbag2, stores = optional("rosbags.rosbag2", *how), optional("rosbags.typesys", *how)
     folder = export_folder(out) / "bag"
-    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-        raise ValueError(f"{folder} is no folder of an earlier export: move it away")
+    foreign = folder.is_symlink() or (folder.exists() and not folder.is_dir())
+    if foreign or (folder.exists() and not {path.name for path in folder.iterdir()} <= _FILES):
+        raise ValueError(f"{folder} is no folder of an earlier export, or holds other files: move it away")
     store = stores.get_typestore(stores.Stores.ROS2_HUMBLE)
     with TemporaryDirectory(dir=folder.parent, prefix=".bag") as new:
         count = _write_bag(rosbag2, store, Path(new) / "bag", frames)

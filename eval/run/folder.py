@@ -1,32 +1,24 @@
 """Output folders: the program that owns a folder, its settings, and the lock of the process that writes there.
 
 A folder belongs to a program once it contains the manifest of that program's :class:`FolderKind`. Files of other
-programs are never touched.
+programs are never touched, and nothing is written or removed through a symbolic link.
 """
 
 from __future__ import annotations
 
-import errno
 import json
-import os
-import shutil
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ufmstar_torch.eval.run.files import remove_temporaries, to_json, write_json_atomic
+from ufmstar_torch.file_lock import hold as hold
 from ufmstar_torch.stateful import flat
 
-if TYPE_CHECKING:
-    from filelock import BaseFileLock
-
 _SHOWN = 5  # number of differences in a message
-_POLL_SECONDS = 0.02
 _UNFINISHED = "not finished"
-# Error codes of a file system without locks.
-_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 Manifest = Mapping[str, Any]
 
@@ -42,7 +34,9 @@ class FolderKind:
     program: str  # as "ufmstar run"; the manifest contains it
     noun: str  # for messages: "run", "evaluation", "training", "demo"
     manifest: str  # path of the manifest below the folder
-    files: tuple[str, ...]  # glob patterns of the files and folders of earlier work, without the manifest
+    files: tuple[str, ...]  # glob patterns of the files of earlier work, without the manifest
+    # By pattern, a function that recognises the program's files by their content where a user may have others.
+    recognise: Mapping[str, Callable[[Path], bool]] = field(default_factory=dict)
     # Format of the manifest and the other files; None = work cannot be resumed, and a summary replaces the manifest at
     # the end.
     format: int | None = None
@@ -93,14 +87,35 @@ class FolderKind:
         return True
 
     def clear(self, out: Path) -> None:
-        """Remove the files of earlier work, by their names. Raises FolderError: a process works on a part of it."""
+        """Remove the files of earlier work, and the folders that are empty then. Raises FolderError: a process works on
+        a part of it."""
         with ExitStack() as locks:
             for path in [path for pattern in self.parts for path in out.glob(pattern)]:
                 if (lock := hold(path)) is None:
                     raise FolderError(f"--out {out}: another process is working there now ({path.name})")
                 locks.callback(lock.release)
-            for path in [path for pattern in self.files for path in out.glob(pattern)]:
-                shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+            folders = set[Path]()
+            for pattern in self.files:
+                ours = self.recognise.get(pattern, lambda _: True)
+                for path in [path for path in out.glob(pattern) if path.is_file() and ours(path)]:
+                    path.unlink()
+                    folders |= set(path.parents[: len(path.relative_to(out).parents) - 1])
+            for folder in sorted(folders, key=lambda path: -len(path.parts)):
+                with suppress(OSError):  # files of others remain in it
+                    folder.rmdir()
+
+    def require_no_links(self, out: Path) -> None:
+        """Raises FolderError: a file or folder below ``out`` to which the program writes is a symbolic link."""
+        for name in (self.manifest, *filter(None, [self.lock]), *self.parts, *self.files):
+            parts = Path(name).parts
+            for pattern in (str(Path(*parts[:length])) for length in range(1, len(parts) + 1)):
+                # glob omits links to nothing where a pattern has no wildcard
+                for path in (out / pattern, *out.glob(pattern)):
+                    if path.is_symlink():
+                        text = (
+                            "is a symbolic link, through which nothing is written: remove it or choose another folder"
+                        )
+                        raise FolderError(f"--out {out}: {path.relative_to(out)} {text}")
 
     def _foreign(self, out: Path) -> list[Path]:
         """Entries other than those of a process that was killed before it wrote the manifest."""
@@ -127,10 +142,11 @@ def output_folder(
 
     Raises:
         FolderError: as :meth:`FolderKind.earlier`; or the earlier work has other values (the message names them), or
-            another process holds the folder's lock.
+            another process holds the folder's lock, or a link is in the way.
         OSError: the folder cannot be made or locked.
     """
     kind.earlier(out, resume=resume, overwrite=overwrite)
+    kind.require_no_links(out)
     (out / kind.manifest).parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as locks:
         if kind.lock is not None:
@@ -156,25 +172,6 @@ def output_folder(
         if not resumed or manifest != earlier:
             write_json_atomic(out / kind.manifest, manifest)
         yield resumed
-
-
-def hold(path: Path, *, wait: float = 0.0) -> BaseFileLock | None:
-    """Lock a file until the lock is released or the process ends in any way. None if another process, or an earlier
-    call, holds it for more than ``wait`` [s]. Raises OSError: the file cannot be opened or locked."""
-    from filelock import FileLock, Timeout
-
-    lock = FileLock(path, thread_local=False, fallback_to_soft=False)
-    try:
-        lock.acquire(timeout=wait, poll_interval=_POLL_SECONDS)
-    except Timeout:
-        return None
-    except (NotImplementedError, OSError) as error:
-        code = error.errno if isinstance(error, OSError) else errno.ENOSYS  # filelock's form of it
-        if code not in _NO_LOCKS:
-            raise
-        text = f"the file system does not support locks ({os.strerror(code)}), choose a folder on another one"
-        raise OSError(code, text, str(path)) from error
-    return lock
 
 
 def differences(old: Manifest, new: Manifest) -> str:

@@ -27,7 +27,15 @@ from ufmstar_torch.eval.run.files import to_json, write_atomic, write_bytes_atom
 from ufmstar_torch.eval.run.folder import FolderError, FolderKind
 from ufmstar_torch.eval.run.frame_record import frame_arrays, frame_record
 from ufmstar_torch.eval.run.job import Checkpoint, RunJob
-from ufmstar_torch.eval.run.writers import FRAMES, PNGS, frame_file, write_frame, write_pngs
+from ufmstar_torch.eval.run.writers import (
+    FRAMES,
+    PNGS,
+    frame_file,
+    is_frame,
+    is_length_png,
+    write_frame,
+    write_pngs,
+)
 from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
 from ufmstar_torch.tensor_files import read_tensors
 
@@ -41,6 +49,7 @@ RUN = FolderKind(
     format=6,
     lock="resume/lock",
     files=(f"{FRAMES}/*.npz", *(f"{f}/*.png" for f in PNGS), "summary.json", RECORDS, "resume/state.pt", *_MADE_AT_END),
+    recognise={f"{FRAMES}/*.npz": is_frame, **{f"{folder}/*.png": is_length_png for folder in PNGS}},
     temporary=(".*.tmp", "*/.*.tmp"),
 )
 

@@ -17,9 +17,10 @@ are network_depth and the root of ufm_variance.
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,9 @@ FRAMES = "frames"
 _RESULT = ("depth", "sigma"), ("depth", "variance")
 _BEFORE = ("network_depth", "ufm_sigma"), ("network_depth", "ufm_variance")
 PNGS = (*_RESULT[0], *_BEFORE[0])
+# Arrays of every frame, and the texts of every PNG.
+_NEEDED = ("depth", "variance", "disagreement", "valid", "T_world_cam", "intrinsics")
+_TEXTS = {"depth_scale", "unit", "quantity", "invalid", "saturated"}
 
 
 def frame_file(out: Path, name: str) -> Path:
@@ -66,8 +70,48 @@ def write_pngs(out: Path, name: str, maps: Mapping[str, NDArray[Any]], unit: flo
 
 
 def read_frame(path: str | Path) -> dict[str, NDArray[Any]]:
-    """The arrays of a frame's file. Errors as ``read_npz_whole``."""
-    return read_npz_whole(path)
+    """The arrays of a frame's file. Errors as ``read_npz_whole``; also ValueError: an array is missing, or has another
+    form; the message names file and array."""
+    arrays = read_npz_whole(path)
+    posterior = (
+        ("posterior_depth", "posterior_variance") if any(name.startswith("posterior_") for name in arrays) else ()
+    )
+    if missing := [name for name in (*_NEEDED, *posterior) if name not in arrays]:
+        raise ValueError(f"{path} is no frame of `ufmstar run`: it has no array {missing[0]}")
+    size = arrays["depth"].shape
+    for name, values in arrays.items():
+        shape: tuple[int | None, ...] = {"T_world_cam": (4, 4), "intrinsics": (3, 3), "anchors": (None, 4)}.get(
+            name, size
+        )
+        fits = len(values.shape) == len(shape) and all(b in (None, a) for a, b in zip(values.shape, shape, strict=True))
+        numbers = values.dtype.kind == ("b" if name == "valid" else "f")
+        if not (fits and numbers and len(size) == 2):
+            raise ValueError(
+                f"{path} is no frame of `ufmstar run`: array {name} is {values.dtype} {list(values.shape)}"
+            )
+    if not (np.isfinite(arrays["T_world_cam"]).all() and np.isfinite(arrays["intrinsics"]).all()):
+        raise ValueError(f"{path} is no frame of `ufmstar run`: its pose or intrinsics are not finite")
+    return arrays
+
+
+def is_frame(path: Path, names: Collection[str] = _NEEDED) -> bool:
+    """True if a file is an npz with the arrays ``names``, by default those of every frame."""
+    try:
+        with ZipFile(path) as archive:
+            return {f"{name}.npy" for name in names} <= set(archive.namelist())
+    except (OSError, BadZipFile, ValueError):
+        return False
+
+
+def is_length_png(path: Path) -> bool:
+    """True if a file is a PNG of :func:`encode_length_png`, by its texts."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            return set(image.info) >= _TEXTS
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        return False
 
 
 # Metres per count, finest first, with ranges of 65.5 m, 256 m (KITTI's), 655 m and 6.6 km.

@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from ufmstar_torch.frame import CENTRE_RANGE
+from ufmstar_torch.limits import require_pixels
 
 Loader = Callable[[], np.ndarray]
 Size = tuple[int, int]
 
 # Largest image; its map takes 1 GiB in double precision.
-_MAX_PIXELS = 2**27
 
 
 def parse_size(text: str | None, option: str = "--size") -> Size | None:
@@ -28,10 +28,9 @@ def parse_size(text: str | None, option: str = "--size") -> Size | None:
     if text is None:
         return None
     height, _, width = text.lower().partition("x")
-    if not (height.isdigit() and width.isdigit() and int(height) and int(width)):
+    if not (height.isdecimal() and width.isdecimal() and int(height) and int(width)):
         raise ValueError(f"{option} must be HxW in pixels, 240x320 say, got {text!r}")
-    if int(height) * int(width) > _MAX_PIXELS:
-        raise ValueError(f"{option} must be at most {_MAX_PIXELS / 1e6:.0f} million pixels, got {text!r}")
+    require_pixels(option, (int(height), int(width)))
     return int(height), int(width)
 
 

@@ -21,6 +21,7 @@ from PIL import Image
 
 from ufmstar_torch.array_files import read_npy, read_npz
 from ufmstar_torch.eval.sequences.frame import Entry, Frame, FrameError, Loader, Size, Skipped
+from ufmstar_torch.limits import MOST_PIXELS, require_pixels
 from ufmstar_torch.optional import optional
 from ufmstar_torch.stream_warnings import LOGGER
 
@@ -50,6 +51,7 @@ def read_color(path: str | Path, content: bytes | None = None) -> np.ndarray:
         return plain
     try:
         with Image.open(path if content is None else BytesIO(content)) as image:
+            require_pixels("the image", (image.height, image.width))
             if image.mode[0] in "IF":  # Pillow would silently clip these at 255
                 values = _grey_values(path, image)
                 full = (
@@ -132,6 +134,7 @@ def image_size(path: str | Path) -> Size:
     """(H, W) from an image's header. Raises FrameError: the header cannot be read."""
     try:
         with Image.open(path) as image:
+            require_pixels("the image", (image.height, image.width))
             return image.height, image.width
     except _BROKEN_IMAGE as error:
         raise FrameError(path, f"cannot be decoded: {error}") from error
@@ -207,7 +210,7 @@ def _plain_png(path: Path) -> np.ndarray | None:
     with path.open("rb") as file:
         header = file.read(29)
     width, height = int.from_bytes(header[16:20]), int.from_bytes(header[20:24])
-    if header[:8] != _SIGNATURE or header[24:] != _RGB or width * height > (Image.MAX_IMAGE_PIXELS or 0):
+    if header[:8] != _SIGNATURE or header[24:] != _RGB or width * height > MOST_PIXELS:
         return None
     from kornia_rs import io
 
@@ -258,6 +261,7 @@ def _log_transparency(folder: Path) -> None:
 
 def _from_image(path: Path) -> tuple[np.ndarray, float | None]:
     with Image.open(path) as image:
+        require_pixels("the map", (image.height, image.width))
         image.load()
         if image.mode[0] not in "IF":
             raise FrameError(path, f"expected a 16-bit or float depth image with one channel, got {image.mode}")
@@ -275,6 +279,9 @@ def _read_exr(path: Path) -> np.ndarray:
     OpenEXR = optional("OpenEXR", "EXR files need OpenEXR", "'ufmstar-torch[eval]'")
     try:
         with redirect_stdout(StringIO()):  # the library prints messages for damaged files
+            for header in (part.header for part in OpenEXR.File(str(path), header_only=True).parts):
+                (left, top), (right, bottom) = (np.asarray(corner).tolist() for corner in header["dataWindow"])
+                require_pixels("the map", (bottom - top + 1, right - left + 1))
             parts = OpenEXR.File(str(path), separate_channels=True).parts
         if not parts:
             raise ValueError("no pixels can be decoded")

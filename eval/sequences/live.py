@@ -6,14 +6,16 @@ from __future__ import annotations
 
 import base64
 import binascii
+import hashlib
 import json
 import math
+import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +25,11 @@ from ufmstar_torch.eval.sequences.attach import stem_times
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.images import IMAGE_SUFFIXES, is_sidecar, listed_path, read_color
 from ufmstar_torch.eval.sequences.poses import in_metres, parse_pose, poses_from_columns
+from ufmstar_torch.stream_warnings import LOGGER
 
 _FPS = 30.0  # of a recording without timestamps
 _POLL = 0.01  # [s] interval of polling a folder
+_KEPT = 256  # [bytes] of each end of a file of poses, by which a file that was written anew is recognised
 _UNREADABLE = 1.0  # [s] largest time to write an image
 
 
@@ -40,27 +44,51 @@ class LiveEvent:
 
 
 class PoseFile:
-    """A growing text file of poses in a format with timestamps of ``poses.py``; it may not exist yet. Its poses have a
-    ``convention`` of ``CONVENTIONS``, and positions in units of ``scale`` metres."""
+    """A growing text file of poses in a format with timestamps of ``poses.py``; it may not exist yet. A file that was
+    written anew, as by a program that starts again, is read from its start. Its poses have a ``convention`` of
+    ``CONVENTIONS``, and positions in units of ``scale`` metres."""
 
     def __init__(self, path: str | Path, convention: str = OURS, scale: float = 1.0) -> None:
         self.path, self._convert, self._scale = Path(path), CONVENTIONS[convention].convert, scale
         self._read, self._line = 0, 0
+        self._head, self._tail = b"", b""  # first and last bytes of what was read
+        self._digest = hashlib.sha256()  # of all that was read
+        self._file: tuple[int, int] | None = None  # device and inode
 
     def new(self) -> Iterator[LiveEvent]:
         """The poses of lines that were completed since the last call. Raises ValueError: a line is no pose with a
         timestamp."""
-        if not self.path.exists():
+        try:
+            file = self.path.open("rb")
+        except FileNotFoundError:  # not yet written, or about to be replaced
             return
-        with self.path.open("rb") as file:
+        with file:
+            if not self._continues(file):
+                LOGGER.warning("%s was written anew: its poses are read from the start", self.path)
+                self._read, self._line, self._head, self._tail, self._digest = 0, 0, b"", b"", hashlib.sha256()
             file.seek(self._read)
             text = file.read()
         complete = text[: text.rfind(b"\n") + 1]
+        self._head, self._tail = (self._head + complete)[:_KEPT], (self._tail + complete)[-_KEPT:]
         self._read += len(complete)
+        self._digest.update(complete)
         for line in complete.decode("utf-8", "replace").splitlines():
             self._line += 1
             if (pose := parse_pose(line, f"{self.path}:{self._line}")) is not None:
                 yield LiveEvent(pose[0], T_world_cam=in_metres(self._convert(pose[1]), self._scale))
+
+    def _continues(self, file: BinaryIO) -> bool:
+        """True if the open file begins with what was read. A file with the same inode is compared at both ends, another
+        one completely."""
+        status = os.fstat(file.fileno())
+        same, self._file = (status.st_dev, status.st_ino) == self._file, (status.st_dev, status.st_ino)
+        if status.st_size < self._read:
+            return False
+        if not same:
+            return hashlib.sha256(file.read(self._read)).digest() == self._digest.digest()
+        head = file.read(len(self._head))
+        file.seek(self._read - len(self._tail))
+        return head == self._head and file.read(len(self._tail)) == self._tail
 
 
 def replay(sequence: FrameSequence, speed: float = 1.0) -> Iterator[LiveEvent]:
@@ -107,17 +135,20 @@ def camera(index: int, poses: PoseFile) -> Iterator[LiveEvent]:
 def growing_folder(
     folder: str | Path, poses: PoseFile, idle: float = math.inf, clock: Callable[[], float] = time.monotonic
 ) -> Iterator[LiveEvent]:
-    """Yield new images of a folder, in the order of their names, and the poses of a file. The time of an image is its
-    name if that is a number ([s], or [ns], [us] as ``stem_times``), else that of the file. Ends after ``idle`` seconds
-    without a new image. Raises FileNotFoundError: no such folder."""
+    """Yield new images of a folder, also those that replace earlier ones, in the order of their names, and the poses of
+    a file. The time of an image is its name if that is a number ([s], or [ns], [us] as ``stem_times``), else that of
+    the file. Ends after ``idle`` seconds without a new image. Raises FileNotFoundError: no such folder."""
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"no such folder: {folder}")
-    seen, last = {path.name for path in folder.iterdir()}, clock()
+    seen, last = {path.name: _changed(path) for path in folder.iterdir()}, clock()
     while clock() - last <= idle:
         yield from poses.new()
         for path in sorted(folder.iterdir()):
-            if path.name in seen or path.suffix.lower() not in IMAGE_SUFFIXES or is_sidecar(path):
+            if path.suffix.lower() not in IMAGE_SUFFIXES or is_sidecar(path):
+                continue
+            changed = _changed(path)
+            if seen.get(path.name) == changed:
                 continue
             try:
                 written = path.stat().st_mtime
@@ -127,12 +158,20 @@ def growing_folder(
                 image = read_color(path)
             except FrameError:
                 if time.time() - written > _UNREADABLE:
-                    seen.add(path.name)
+                    seen[path.name] = changed
                 break  # it is still being written; keep the order of images
-            seen.add(path.name)
+            seen[path.name] = changed
             last, times = clock(), stem_times([path.stem])
             yield LiveEvent(written if times is None else float(times[0]), image)
         time.sleep(_POLL)
+
+
+def _changed(path: Path) -> int | None:
+    """The time of the last change of a file [ns]; None if it was removed."""
+    try:
+        return path.lstat().st_mtime_ns
+    except OSError:
+        return None
 
 
 def json_lines(

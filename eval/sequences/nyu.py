@@ -16,6 +16,7 @@ from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.images import first_depth_size, is_sidecar, natural_key, positive
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.limits import require_bytes
 
 LOOKED_FOR = "val/SCENE/*.h5 or train/SCENE/*.h5 (the root, meaning val, the part's folder or the scene's)"
 PARTS = ("train", "val")
@@ -93,6 +94,7 @@ def _dataset(path: Path, name: str) -> np.ndarray:
         with h5py.File(path, "r") as file:
             if name not in file:
                 raise KeyError(f"no dataset {name!r}, only {sorted(file)}")
+            require_bytes(f"dataset {name!r}", file[name].size * file[name].dtype.itemsize)
             return np.asarray(file[name])
     except _BROKEN as error:
         raise FrameError(path, f"cannot be read: {error}") from error

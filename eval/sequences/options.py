@@ -69,7 +69,7 @@ class Options:
     model_index: int | None = None
     drive: str | int | None = field(default=None, metadata=_WORD)
     scans: int | None = None  # moving things smear
-    plugin: tuple[str, ...] = ()
+    plugin: tuple[str, ...] = field(default=(), metadata={"typed": True})
 
     def __post_init__(self) -> None:
         for name in ("intrinsics", "depth_intrinsics"):

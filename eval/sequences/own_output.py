@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,15 +42,37 @@ def own_output(path: Path) -> OwnOutput | None:
 
 
 def read_records(content: bytes, file: Path) -> list[dict]:
-    """The lines of frames.jsonl, each with "name" and "state", and "intrinsics" or "reason"; ``file`` is its name for
-    messages. Raises ValueError: a line has another form; the message names it."""
+    """The lines of frames.jsonl, each with "name", "state" and "index", and "intrinsics" or "reason"; ``file`` is its
+    name for messages. Raises ValueError: a line has another form; the message names line and field."""
     records = []
     for number, line in enumerate(content.splitlines(), start=1):
+        shown = line[:60].decode(errors="replace")
         try:
             record = json.loads(line)
-            _ = record["name"], record["intrinsics" if record["state"] == "done" else "reason"]
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
-            shown = line[:60].decode(errors="replace")
+        except (ValueError, RecursionError) as error:
             raise ValueError(f"{file}, line {number} is not the record of a frame: {shown}") from error
+        if (wrong := _wrong_field(record)) is not None:
+            raise ValueError(f"{file}, line {number} is not the record of a frame ({wrong}): {shown}")
         records.append(record)
     return records
+
+
+def _wrong_field(record: Any) -> str | None:
+    """The first field of a record that is missing or has another form, or None."""
+    if not isinstance(record, dict):
+        return "an object is expected"
+    name, state, index, K = (record.get(field) for field in ("name", "state", "index", "intrinsics"))
+    done = state == "done"
+    fine = {
+        "name": isinstance(name, str) and name != "" and not name.startswith(".") and not set(name) & set("/\\\0"),
+        "state": state in ("done", "skipped"),
+        "index": not done or (type(index) is int and index >= 0),
+        "timestamp": "timestamp" not in record or _is_number(record["timestamp"]),
+        "intrinsics": not done or (isinstance(K, list) and len(K) == 4 and all(map(_is_number, K)) and min(K[:2]) > 0),
+        "reason": done or isinstance(record.get("reason"), str),
+    }
+    return next((f"its {field}" for field, right in fine.items() if not right), None)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf

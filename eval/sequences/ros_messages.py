@@ -22,6 +22,7 @@ from ufmstar_torch.eval.sequences.frame import FrameError
 from ufmstar_torch.eval.sequences.images import full_scale, grey_bytes, positive, read_color
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.poses import trajectory_of
+from ufmstar_torch.limits import require_pixels
 from ufmstar_torch.optional import optional
 from ufmstar_torch.trajectory import Trajectory, interpolate_pose
 
@@ -107,6 +108,7 @@ def _grey16(data: bytes) -> np.ndarray | None:
     """[H, W] of a PNG of 16-bit grey; None for other files, or damaged ones."""
     try:
         with Image.open(BytesIO(data)) as image:
+            require_pixels("the image", (image.height, image.width))
             values = np.array(image) if image.mode.startswith("I;16") else None
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
         return None
@@ -121,6 +123,7 @@ def _compressed_depth(data: bytes, form: str, path: Path) -> np.ndarray:
         if quantised:
             _, a, b = struct.unpack_from("<iff", data)
         with Image.open(BytesIO(data[12:] if quantised else data)) as image:
+            require_pixels("the map", (image.height, image.width))
             values, mode = np.array(image), image.mode
     except (struct.error, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise FrameError(path, f"compressed depth ({form[:40]!r}) must be PNG: {error}") from error

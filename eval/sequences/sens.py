@@ -24,6 +24,7 @@ from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence,
 from ufmstar_torch.eval.sequences.images import read_color
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.limits import MOST_PIXELS
 
 LOOKED_FOR = "a .sens file, or a folder that holds one (and no SensReader export)"
 _SUFFIX = ".sens"
@@ -44,7 +45,6 @@ _BYTES_PER_DEPTH = 2
 _MAX_NAME = 10_000  # [bytes] largest sensor name; a file with a longer one is no .sens file
 _MAX_FRAMES = 10_000_000  # 92 hours at 30 Hz: more is a broken header
 _FEW_FRAMES = 10_000  # accepted in a file of any size, which may be truncated
-_MAX_PIXELS = 100_000_000  # of a depth map
 _MICROSECOND = 1e-6
 
 
@@ -98,7 +98,7 @@ def _read_header(file: BinaryIO, path: Path) -> np.void:
     header = np.frombuffer(_take(file, path, _HEADER.itemsize), _HEADER)[0]
     (color_w, color_h), (depth_w, depth_h) = header["color_size"], header["depth_size"]
     frames, units = header["frames"], header["units_per_metre"]
-    sizes_fit = 0 < int(depth_w) * int(depth_h) <= _MAX_PIXELS and min(color_w, color_h) > 0
+    sizes_fit = 0 < int(depth_w) * int(depth_h) <= MOST_PIXELS and min(color_w, color_h) > 0
     if not (sizes_fit and 1 <= units < np.inf and frames <= _MAX_FRAMES):
         found = f"images of {color_w}x{color_h}, depth of {depth_w}x{depth_h}, {units:g} units per metre"
         raise ValueError(f"{path}: broken header: {frames} frames, {found}")

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ufmstar_torch.eval.sequences.frame import FrameError, Size
+from ufmstar_torch.limits import require_pixels
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 
@@ -38,6 +39,7 @@ class Video:
 
         height, width = capture.get(cv2.CAP_PROP_FRAME_HEIGHT), capture.get(cv2.CAP_PROP_FRAME_WIDTH)
         self.size: Size = int(height), int(width)
+        require_pixels(f"{self.path}: a frame", self.size)
         self._times = self._decoded_times()
         if self._times.size == 0 or 0 in self.size:
             raise ValueError(f"{self.path}: the video has no frame that can be decoded")

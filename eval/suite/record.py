@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
@@ -17,6 +16,7 @@ from ufmstar_torch.eval.engine.judge import METRICS
 from ufmstar_torch.eval.methods.row import Row, row_from
 from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
 from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
+from ufmstar_torch.models.checkpoints import read_tensors
 
 FORMAT = 1
 Sums = Mapping[str, Mapping[str, Tensor]]
@@ -75,10 +75,11 @@ class Record:
         """``RowFigures.sums``. Raises ResultsError: the file has none."""
         path = self.path.with_suffix(".pt")
         try:
-            stored = torch.load(path, map_location="cpu", weights_only=True)
+            with path.open("rb") as file:
+                stored = read_tensors(file, path)
             packed = {METRICS: stored[METRICS], **stored}
             return {name: {key: unpack(v) for key, v in states.items()} for name, states in packed.items()}
-        except (EOFError, KeyError, RuntimeError, TypeError, ValueError, pickle.UnpicklingError) as error:
+        except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:
             reason = " ".join(str(error).split())[:200]
             raise ResultsError(f"{path} does not hold the sums of metrics: {reason}") from error
 

@@ -16,10 +16,12 @@ from ufmstar_torch.eval.tour.path import tour_path
 from ufmstar_torch.eval.tour.style import STYLES
 from ufmstar_torch.eval.tour.tour import Tour, make_tour
 from ufmstar_torch.eval.tour.view import TourView, intrinsics, render
+from ufmstar_torch.limits import require_bytes, require_pixels
 
 PREFIX = "tour:"
 _FORM = "tour:SEED or tour:SEED?option=value&..., with the options style, frames, size, fov, path, pan and sensor"
 FPS = 15.0  # of the timestamps
+_FRAME_BYTES = 4096  # of a frame's pose and entry, and of the arrays from which its pose is computed
 
 
 def open_tour(name: str) -> FrameSequence:
@@ -74,6 +76,8 @@ def tour_sequence(
     """
     if len(size) != 2 or min(size) < 8:
         raise ValueError(f"size must be (H, W) of at least 8 px each, got {size}")
+    require_pixels("size", size)
+    require_bytes("frames", frames * _FRAME_BYTES)
     if not 20 <= fov <= 120:
         raise ValueError(f"fov must be 20 to 120 degrees, got {fov}")
     tour = make_tour(seed, style)

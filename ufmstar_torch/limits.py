@@ -1,0 +1,21 @@
+"""The limits on the sizes that files, names of tours and settings may state, checked before memory is allocated."""
+
+from __future__ import annotations
+
+from math import prod
+
+MOST_BYTES = 2**30  # of one array, of a state, or of a list of frames
+MOST_PIXELS = MOST_BYTES // 12  # of an image, which takes 12 bytes a pixel as float32 RGB
+
+
+def require_bytes(what: str, size: int) -> None:
+    """Raise a ValueError if ``what`` would take more than ``MOST_BYTES`` bytes."""
+    if size > MOST_BYTES:
+        raise ValueError(f"{what} would take {size:,} bytes, more than the limit of {MOST_BYTES:,}")
+
+
+def require_pixels(what: str, size: tuple[int, int]) -> None:
+    """Raise a ValueError if ``what``, an image or map of ``size`` (H, W), has more than ``MOST_PIXELS`` pixels."""
+    if prod(size) > MOST_PIXELS:
+        limit = f"more than the limit of {MOST_PIXELS:,} pixels"
+        raise ValueError(f"{what} would have {size[0]} x {size[1]} pixels, {limit}")
