@@ -55,6 +55,7 @@ def write_summary(
         "network_alone": figures.get(ALONE),
         "network_alone_reason": None if ALONE in figures else alone_reason,
         **_posterior(done, figures.get(POSTERIOR)),
+        **_parts(figures),
         "uncertainty": _uncertainty(done),
         "anchors": _anchors(done),
         "mixture": _mixture(done, job.ufm(checkpoint).mixture),
@@ -127,6 +128,12 @@ def _posterior(done: Records, figures: Mapping[str, float] | None) -> dict[str, 
         return {}
     sigma = mean(record["mean_sigma"] for record in records)
     return {"posterior": {**records[-1], "mean_sigma": sigma, "metrics": figures}}
+
+
+def _parts(figures: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
+    """The metrics on what moves and on what stands still, by the names of ``RunMetrics``; {} without masks."""
+    parts = {name: values for name, values in figures.items() if "." in name}
+    return {"parts": parts} if parts else {}
 
 
 def _sequence(sequence: FrameSequence) -> dict[str, Any]:
