@@ -39,7 +39,7 @@ class Anchors:
         shared: [B] variance of the inverse-depth error that all anchors of the frame share, as from wrong poses
             [1/m^2]; None = 0.
         scale: [B] variance of the logarithm of a factor that all depths of the frame share; None = 0.
-        motion: [B, M, 3] pixels (u, v) all over the depth map [px], and the log odds that the surface there moves, for
+        motion: [B, M, 3] pixels (u, v) all over the depth map [px], and the log likelihood ratio of motion there, for
             depths that matching of images has measured; NaN = unknown, None = the depths hold for moving things, too.
         moving: [B] int64, number of depths that were not used because the surface moves, or because views disagree;
             None = not counted.

@@ -229,20 +229,20 @@ class DenseEvidence(SavedState):
         if compared is not None and trusted:
             coarse = self._coarse(small, found.pixel, compared[0], cell)
             found = Depths(*(np.concatenate(pair) for pair in zip(found, coarse, strict=True)))
-        odds = self._motion.odds(tested, small.shape, cell) if trusted else None
-        moving = np.zeros(len(found.pixel), np.bool_) if odds is None else moves(odds, found.pixel, cell)
+        ratios = self._motion.log_ratios(tested, small.shape, cell) if trusted else None
+        moving = np.zeros(len(found.pixel), np.bool_) if ratios is None else moves(ratios, found.pixel, cell)
         found = Depths(*(column[~moving] for column in found))
         shared = self._tracker.shared(max(self._baseline, self._tracker.baseline))
         total = found.variance + self._memory.apart * np.square(found.rho) + shared
         surface, outlier_variance = check_anchors(small, found.pixel, found.rho, total, cell)
         far = self._apart(corners, surface, small.shape[1]) if trusted else np.zeros(0, np.int64)
-        far = far if odds is None else far[~moves(odds, corners.pixel[far], cell)]
+        far = far if ratios is None else far[~moves(ratios, corners.pixel[far], cell)]
         depth = np.concatenate([1 / found.rho, corners.depth[far]])
         variance = np.concatenate([(total + outlier_variance) * depth[: len(total)] ** 4, corners.variance[far]])
         position = (np.concatenate([surface, corners.pixel[far]]) - scale[:2, 2]) / scale.diagonal()[:2]
         none = corners.none if corners.contradicted else Landmarks.none
         judged = corners.pose_error, shared, corners.contradicted, self._memory.apart, corners.lag
-        motion = None if odds is None else located(odds, cell)
+        motion = None if ratios is None else located(ratios, cell)
         if motion is not None:
             motion[:, :2] = (motion[:, :2] - scale[:2, 2]) / scale.diagonal()[:2]
         withheld = int(moving.sum()) + disagree

@@ -45,7 +45,7 @@ class Landmarks:
         contradicted: the poses contradict the images, and no depth is used.
         scale: variance of the logarithm of a factor that all depths of the image share; ``variance`` includes it.
         lag: delay of the input poses, estimated from corners [images]; negative = early.
-        motion: [M, 3] pixels (u, v) all over the image [px], and the log odds that the surface there moves
+        motion: [M, 3] pixels (u, v) all over the image [px], and the log likelihood ratio of motion there
             (``motion``); None = the depths hold for things that move, too.
         moving: number of depths that were not used because the surface moves, or because views disagree.
     """

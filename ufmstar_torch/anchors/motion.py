@@ -1,4 +1,4 @@
-"""Tests in the images of whether a surface stands still, and the log odds of motion that they add up to.
+"""Tests in the images of whether a surface stands still, and the log likelihood ratio of motion that they add up to.
 
 A surface that stands still passes three tests, up to errors of the matching:
 
@@ -7,10 +7,10 @@ A surface that stands still passes three tests, up to errors of the matching:
 - line: a match lies on its epipolar line.
 
 A test of kind k fails on a still surface with the probability F_k, estimated from the stream, and on a surface that
-moves with F_k + (1 - F_k) c_k. So a test contributes log((F_k + (1 - F_k) c_k)/F_k) to the log odds if it fails, else
-log(1 - c_k). Neighbouring tests are not independent, which the weights of the kinds account for. The log odds of a cell
-are the prior's plus the contributions around it in a Gaussian window. Motion along the epipolar line, in proportion to
-the camera's, passes all tests.
+moves with F_k + (1 - F_k) c_k. So a test contributes log((F_k + (1 - F_k) c_k)/F_k) if it fails, else log(1 - c_k).
+Neighbouring tests are not independent, which the weights of the kinds account for. The log ratio of a cell is the sum
+of the contributions around it in a Gaussian window. Motion along the epipolar line, in proportion to the camera's,
+passes all tests.
 
 The constants are fitted to tours with moving things (eight tours of 60 frames, 6 things each).
 """
@@ -29,9 +29,8 @@ KINDS = SEARCH, LANDMARK, LINE = range(3)
 _CAUGHT, _WEIGHT = np.array([0.4, 0.4, 0.1]), np.array([0.19, 0.48, 0.85])
 _FAILING, _FIRST = np.array([0.4, 0.06, 0.06]), 50.0
 _LEAST, _MOST = 0.02, 0.98  # limits of F_k
-PRIOR = -1.9  # log odds of motion without a test
 _WINDOW = 1.5  # standard deviation of the window [cells]
-_CERTAIN_ODDS = 0.0  # log odds from which a surface counts as moving
+_CERTAIN = 1.9  # log ratio from which a surface counts as moving: motion is then more probable, by the prior odds
 OFF_LINE = 9.0  # squared distance of a match from its line, over its variance, from which the test fails
 
 
@@ -57,7 +56,7 @@ class Tested(NamedTuple):
 
 
 class MotionTests(SavedState):
-    """The log odds of motion of an image's cells.
+    """The log likelihood ratios of motion of an image's cells.
 
     Args:
         memory: share of the running estimates that remains after a frame.
@@ -74,8 +73,8 @@ class MotionTests(SavedState):
         self._count = np.full(len(KINDS), _FIRST)
         self._failed = _FAILING * _FIRST
 
-    def odds(self, tested: Tested, size: tuple[int, int], cell: int) -> NDArray[np.float64]:
-        """[R, C] log odds that the surface in each cell moves; updates F_k.
+    def log_ratios(self, tested: Tested, size: tuple[int, int], cell: int) -> NDArray[np.float64]:
+        """[R, C] log likelihood ratio of motion against rest in each cell, 0 without a test; updates F_k.
 
         Args:
             tested: of the image.
@@ -92,21 +91,21 @@ class MotionTests(SavedState):
         column, row = (tested.pixel / cell).astype(np.int64).clip(0, [cols - 1, rows - 1]).T
         value = np.where(tested.failed, fails[tested.kind], passes[tested.kind])
         cells = np.bincount(row * cols + column, value, rows * cols).reshape(rows, cols)
-        odds: NDArray[np.float64] = PRIOR + _window(rows) @ cells @ _window(cols)
-        return odds
+        around: NDArray[np.float64] = _window(rows) @ cells @ _window(cols)
+        return around
 
 
-def moves(odds: NDArray[np.float64], pixel: NDArray[np.float64], cell: int) -> NDArray[np.bool_]:
-    """Which pixels [N, 2] lie in a cell that moves, from the log odds [R, C] of the cells."""
+def moves(ratios: NDArray[np.float64], pixel: NDArray[np.float64], cell: int) -> NDArray[np.bool_]:
+    """Which pixels [N, 2] lie in a cell that moves, from the log ratios [R, C] of the cells."""
     column, row = (pixel / cell).astype(np.int64).T
-    return odds[row.clip(0, odds.shape[0] - 1), column.clip(0, odds.shape[1] - 1)] > _CERTAIN_ODDS
+    return ratios[row.clip(0, len(ratios) - 1), column.clip(0, ratios.shape[1] - 1)] > _CERTAIN
 
 
-def located(odds: NDArray[np.float64], cell: int) -> NDArray[np.float64]:
-    """[R C, 3] the centre (u, v) of every cell [px], and its log odds [R, C]."""
-    row, column = np.indices(odds.shape)
+def located(ratios: NDArray[np.float64], cell: int) -> NDArray[np.float64]:
+    """[R C, 3] the centre (u, v) of every cell [px], and its log ratio [R, C]."""
+    row, column = np.indices(ratios.shape)
     centres = ((x + 0.5) * cell - 0.5 for x in (column, row))
-    return np.stack([*centres, odds], -1).reshape(-1, 3)
+    return np.stack([*centres, ratios], -1).reshape(-1, 3)
 
 
 def _window(count: int) -> NDArray[np.float64]:
