@@ -12,9 +12,10 @@ m is the log likelihood ratio of the tests in the images (``anchors.motion``). T
 similar predicted depth, in a Gaussian window: the network bounds the region that moves. A surface counts as still
 unless there is evidence of motion: its probability of motion is P = max(0, (sigma(l) - c)/(1 - c)).
 
-With the probability P the local correction does not hold, as on another surface: y - b . x is normal with the variance
-w (``update``). Where P exceeds one half, the depth is that of this explanation, d e^(b . x), and the evidence's is the
-other one.
+With the probability P the local correction does not hold, as on another surface: the depth is that of the prediction
+with the shared scale, y - b . x is normal with the variance w (``update``). The stated depth stays that of the
+evidence, which is right more often than the prediction even where P exceeds one half; its variance is the second moment
+about it. So P adds to the probability p of another surface: 1 - (1 - p)(1 - P).
 
 The constants are fitted to eight tours with six moving things each, FastDepth and the demo's network.
 """
@@ -22,12 +23,9 @@ The constants are fitted to eight tours with six moving things each, FastDepth a
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-from ufmstar_torch.posterior.cells import LARGEST
-from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.field import fast
 from ufmstar_torch.posterior.running import Floats
 
@@ -37,22 +35,6 @@ _MOVING = 0.8
 _PRIOR, _WEIGHT, _CERTAIN = -1.4, 1.05, 0.15
 # Window of the mean: standard deviation and half width [nodes], and difference of log d at which a weight is halved.
 _SIGMA, _HALF, _CONTRAST = 1.5, 3, 0.3
-
-
-class NodeValues(NamedTuple):
-    """Values at n nodes.
-
-    Attributes:
-        offset: f.
-        variance: second moment of the relative error of the stated depth.
-        inlier: the same if the explanation of the stated depth holds.
-        outlier: probability that it does not.
-    """
-
-    offset: Floats
-    variance: Floats
-    inlier: Floats
-    outlier: Floats
 
 
 def tests_at(motion: Floats, height: int, width: int, rows: int, cols: int) -> Floats:
@@ -114,31 +96,3 @@ def _mean_around(value, log_depth, out):
                     total += w * value[i, j]
                     weights += w
             out[r, c] = total / weights
-
-
-def with_motion(nodes: NodeValues, P: Floats, spread: Floats, wide: Floats, config: PosteriorConfig) -> NodeValues:
-    """The values at n nodes with both explanations.
-
-    Args:
-        nodes: without motion.
-        P: [n] probability of motion.
-        spread: [n] variance of y if the local correction holds.
-        wide: [n] variance w of y - b . x if it does not.
-        config: of the posterior.
-    """
-    tail = _moment(-nodes.offset, wide)
-    outlier = 1 - (1 - nodes.outlier) * (1 - P)
-    still = NodeValues(nodes.offset, (1 - P) * nodes.variance + P * tail, nodes.inlier, outlier)
-    # The stated depth is d e^(b . x): the evidence's is off by f and its error.
-    alone, evidence = _moment(0 * wide, wide), _moment(nodes.offset, np.minimum(spread, config.widest))
-    held = 1 - outlier
-    stated = NodeValues(0 * nodes.offset, (1 - held) * alone + held * evidence, alone, held)
-    columns = zip(stated, still, strict=True)
-    return NodeValues(*(np.where(P > 0.5, a, b) for a, b in columns))
-
-
-def _moment(mean: Floats, variance: Floats) -> Floats:
-    """E[(e^n - 1)^2] of n ~ N(mean, variance); e^mean at most 100."""
-    q = np.exp(np.minimum(mean, LARGEST))
-    moment: Floats = q * q * np.exp(2 * variance) - 2 * q * np.exp(variance / 2) + 1
-    return moment

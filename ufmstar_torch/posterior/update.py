@@ -42,7 +42,7 @@ a is the variance of the anchors' y in a Gaussian window: depths differ more bet
 farther the evidence, the more surfaces lie between. v and w are at most ``widest``. Contradictory evidence thus limits
 the certainty of every pixel, and a depth far below the global correction is less certain than one above it.
 
-Anchors that matching has measured are wrong on surfaces that move: ``motion`` changes the values at the nodes.
+Anchors that matching has measured are wrong on surfaces that move: p then includes the probability of ``motion``.
 
 A stream whose anchors were all invalid so far has the network's depth with the variance of a node without evidence. A
 stream without anchors has UfM*'s output.
@@ -67,7 +67,7 @@ from ufmstar_torch.posterior.cells import cell_means, features, read
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.field import at
 from ufmstar_torch.posterior.learn import learnt
-from ufmstar_torch.posterior.motion import NodeValues, probability, tests_at, with_motion
+from ufmstar_torch.posterior.motion import probability, tests_at
 from ufmstar_torch.posterior.running import Floats, Running
 from ufmstar_torch.posterior.scene import (
     MOST_WRONG,
@@ -184,12 +184,11 @@ def _of_stream(
     wide = elsewhere_variance(config, spread_around(scene, all_anchors, b[0]), unseen)
     scale = local_scale(scene, left_out, all_anchors)
     p = np.minimum(updated.ratios["wrong"] * wrong_factor(config, away, scale), MOST_WRONG)
-    spread = scale * (variance + steepness(grid, field.offset))
-    nodes = NodeValues(offset, *second_moments(config, spread, p, offset, wide), p)
     if anchors.motion is not None:
         tests, share = tests_at(anchors.motion, *depth.shape, rows, cols), away / config.reach
         P = probability(offset, grid.log_depth, share, tests, updated.ratios["between"], (rows, cols))
-        nodes = with_motion(nodes, P, spread, wide, config)
-    nodes = np.stack([grid.log_depth, *nodes, away / config.reach], 1)
+        p = 1 - (1 - p) * (1 - P)
+    variance, inlier = second_moments(config, scale * (variance + steepness(grid, field.offset)), p, offset, wide)
+    nodes = np.stack([grid.log_depth, offset, variance, inlier, p, away / config.reach], 1)
     depth, spread, inlier, p = read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
     return memory, depth, spread, p, inlier, updated
