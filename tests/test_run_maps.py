@@ -114,3 +114,12 @@ def test_maps_of_some_frames_are_enough_where_only_those_are_run(path, tmp_path)
     assert cli.main([*words, str(tmp_path / "out"), "--frames", "2:4"]) == 0
     assert [read_frame(tmp_path / "out" / "frames" / f"{n}.npz")["depth"].max() for n in (9, 10)] == [1, 2]
     assert cli.main([*words, str(tmp_path / "other")]) == 2
+
+
+def test_a_run_on_things_that_move_has_metrics_on_them_and_outside_of_them(tmp_path):
+    job = own_depth_job("tour:62?style=hall&frames=8&size=24x32&movers=2")
+    summary = run(job, tmp_path / "out")
+    parts = summary["parts"]
+    assert set(parts) == {"ufm.moving", "ufm.still"}
+    assert min(figures["pixels"] for figures in parts.values()) > 0
+    assert sum(figures["pixels"] for figures in parts.values()) == summary["metrics"]["pixels"]

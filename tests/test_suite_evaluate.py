@@ -348,6 +348,18 @@ def test_pixels_that_a_row_leaves_out_are_counted(sequence):
     assert outcome["UfMstar-DepthOnly"].figures["nll_left_out_share"] >= 0.5
 
 
+def test_what_moves_and_what_stands_still_have_figures():
+    sequence = open_sequence("tour:62?style=hall&frames=8&size=24x32&movers=2")
+    assert any(frame.moving.any() for frame in sequence)
+    networks = {"depth_only": base_network("depth_only=ground-truth:24x32")}
+    figures = evaluate(sequence, [row("UfM*-DepthOnly")], networks)["UfMstar-DepthOnly"].figures
+    parts = [figures[f"{part}.pixels"] for part in ("moving", "still")]
+    assert min(parts) > 0
+    assert sum(parts) == figures["pixels"]
+    weighted = sum(figures[f"{part}.nll"] * figures[f"{part}.pixels"] for part in ("moving", "still"))
+    assert figures["nll"] == pytest.approx(weighted / sum(parts))
+
+
 @pytest.mark.parametrize("trouble", ["nothing readable", "no truth", "no frames"])
 def test_a_sequence_that_cannot_be_used(networks, sequence, trouble):
     def fail():

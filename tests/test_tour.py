@@ -9,9 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ufmstar_torch.eval.check.check import check_sequence
+from ufmstar_torch.eval.sequences.frame import in_memory
+from ufmstar_torch.eval.sequences.ground_truth import moving_at, resample_nearest
 from ufmstar_torch.eval.sequences.open import open_sequence
-from ufmstar_torch.eval.tour import Tour, export_tour, make_tour, render, tour_path, tour_sequence
+from ufmstar_torch.eval.tour import Tour, export_tour, make_movers, make_tour, render, tour_path, tour_sequence
 from ufmstar_torch.eval.tour.intersect import entry
+from ufmstar_torch.eval.tour.movers import MOTIONS, SHARES, SIZES
 from ufmstar_torch.eval.tour.shapes import BOX, ELLIPSOID, FRUSTUM, QUAD, Finish, ball, box, part, surfaces
 from ufmstar_torch.eval.tour.style import HALL_TEXTURES, HOME_TEXTURES, STYLES, TEXTURES
 from ufmstar_torch.eval.tour.texture import noise_table
@@ -303,3 +306,72 @@ def test_an_exported_tour_reads_as_a_generic_sequence(tmp_path):
         np.testing.assert_allclose(a.T_world_cam, b.T_world_cam, atol=1e-12)
     with pytest.raises(FileExistsError, match="new or empty"):
         export_tour(sequence, tmp_path / "tour")
+
+
+# --- things that move ----------------------------------------------------------------------------------------
+
+
+def things(seed=62, style="hall", frames=60, count=6):
+    tour = make_tour(seed, style)
+    poses = tour_path(tour, frames)
+    return tour, poses, make_movers(tour, poses, torch.from_numpy(intrinsics(48, 64)), (48, 64), count)
+
+
+def test_movers_have_each_motion_and_size_and_move_as_named():
+    _, poses, movers = things()
+    assert {m.motion for m in movers} == set(MOTIONS)
+    assert sorted(m.size for m in movers) == sorted([*SIZES, *SIZES])
+    camera = poses[:, :3, 3].numpy()
+    for m in movers:
+        moved, (start, end) = m.position - m.position[0], (m.start, m.start + len(m.position))
+        assert (m.position[:, 1] == 0).all()
+        ground = (camera[start:end] - camera[start]) * [1, 0, 1]
+        if m.motion in SHARES:
+            np.testing.assert_allclose(moved, SHARES[m.motion] * ground, atol=1e-12)
+            continue
+        steps = np.diff(m.position, axis=0)
+        np.testing.assert_allclose(steps, np.broadcast_to(steps[0], steps.shape), atol=1e-12)
+        assert np.linalg.norm(steps[0]) > 0.02
+
+
+def test_movers_touch_nothing_and_keep_clear_of_the_camera():
+    tour, poses, movers = things(2, "home")
+    assert len(movers) == 6
+    low, high = tour.surfaces.corners.amin(1).numpy(), tour.surfaces.corners.amax(1).numpy()
+    for m in movers:
+        body = m.surfaces.corners.numpy()
+        for n, position in enumerate(m.position):
+            corners = body.reshape(-1, 3) + position
+            margin = np.array([0.05, 0.0, 0.05])
+            a, b = corners.min(0) + margin, np.minimum(corners.max(0) - margin, [9e9, -0.05, 9e9])
+            assert not ((a < high) & (b > low)).all(1).any()
+            gap = np.maximum(a - poses[m.start + n, :3, 3].numpy(), poses[m.start + n, :3, 3].numpy() - b).clip(0)
+            assert np.linalg.norm(gap[::2]) > 0.5
+
+
+def test_a_tour_with_movers_has_their_mask_and_their_depth_and_is_unchanged_beside_them():
+    name = "tour:62?style=hall&frames=30&size=48x64&sensor=0"
+    plain, moved = open_sequence(name), open_sequence(f"{name}&movers=4")
+    shares = []
+    for a, b in zip(plain, moved, strict=True):
+        assert a.moving is None
+        np.testing.assert_array_equal(a.T_world_cam, b.T_world_cam)
+        np.testing.assert_array_equal(a.depth[~b.moving], b.depth[~b.moving])
+        assert (b.depth[b.moving] < a.depth[b.moving]).all()
+        shares.append(b.moving.mean())
+    assert 0.02 < np.mean(shares) < 0.4
+    again = open_sequence(f"{name}&movers=4")
+    np.testing.assert_array_equal(again[7].image, moved[7].image)
+    assert in_memory(moved)[7].moving.dtype == bool
+    with pytest.raises(ValueError, match="movers must be a number of at least 0"):
+        open_sequence(f"{name}&movers=-1")
+
+
+def test_the_mask_of_moving_pixels_follows_the_prediction_s_camera():
+    frame = next(f for f in open_sequence("tour:62?style=hall&frames=30&size=48x64&movers=4") if f.moving.mean() > 0.05)
+    half = intrinsics(24, 32)
+    np.testing.assert_array_equal(
+        moving_at(frame, half, (24, 32)),
+        resample_nearest(frame.moving.astype(float), frame.intrinsics, half, (24, 32)) > 0,
+    )
+    assert moving_at(open_sequence("tour:2?frames=1&size=24x32")[0], half, (24, 32)) is None

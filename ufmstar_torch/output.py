@@ -36,6 +36,7 @@ class FrameStatistics:
             frames, and is 0 at the start.
         anchors_rejected: anchors that differ from the prediction by more than a factor of 100. If they are the
             majority, they count as an error of the prediction and widen the variance.
+        anchors_moving: depths from images that were not used because the surface moves, or because views disagree.
         pose_error: disagreement of poses and images: standard deviation of tracked corners from their epipolar lines
             [px] of the searched image; NaN = not measured, None = no source of anchors measures it. Without anchors
             it is not measured, because the search costs as much as the step; a run measures some pairs of frames
@@ -65,6 +66,7 @@ class FrameStatistics:
     anchors: Tensor | None = None
     anchors_used: Tensor | None = None
     anchors_rejected: Tensor | None = None
+    anchors_moving: Tensor | None = None
     pose_error: Tensor | None = None
     calibration: Tensor | None = None
     unseen: Tensor | None = None

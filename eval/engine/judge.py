@@ -52,7 +52,8 @@ def metrics_of(metrics: dict[str, SequenceMetrics], key: str, **how: Any) -> Seq
 
 class RunMetrics(FrameSink):
     """The figures of a run's row, ``UFM``, of its network ``ALONE``, and of its ``POSTERIOR``, on the row's valid
-    pixels. ``sums`` are those of an earlier part of the run. ``FrameResult.ms`` gets "metrics", the time [ms]."""
+    pixels, and as "ufm.moving", "ufm.still", ... on its ``RowResult.parts``. ``sums`` are those of an earlier part of
+    the run. ``FrameResult.ms`` gets "metrics", the time [ms]."""
 
     def __init__(self, key: str, sums: Mapping[str, Mapping[str, Tensor]], plugins: PluginMetrics = NO_PLUGINS) -> None:
         self._key, self._plugins = key, plugins
@@ -82,7 +83,9 @@ class RunMetrics(FrameSink):
             maps[POSTERIOR] = row.posterior_depth, row.posterior_variance
         for name, (depth, variance) in maps.items():
             mixture = row.mixture if name == POSTERIOR else None
-            metrics_of(self._metrics, name, plugins=self._plugins).update(depth, variance, target, row.valid, mixture)
+            masks = {name: row.valid, **{f"{name}.{part}": row.valid & mask for part, mask in row.parts.items()}}
+            for key, valid in masks.items():
+                metrics_of(self._metrics, key, plugins=self._plugins).update(depth, variance, target, valid, mixture)
 
 
 @dataclass(frozen=True)
@@ -144,6 +147,8 @@ class RowJudge(FrameSink):
         how = {"with_variance": variance is not None, "bins": self._bins, "plugins": self._plugins}
         mixture = result.mixture if self.row.setting.posterior else None
         metrics_of(self._metrics, METRICS, **how).update(depth, variance, target, mixture=mixture)
+        for part, mask in result.parts.items():
+            metrics_of(self._metrics, part, **how).update(depth, variance, target, mask, mixture)
         if variance is None:
             return
         if result.confidence is not None:
@@ -172,12 +177,17 @@ class RowJudge(FrameSink):
         return RowFigures(
             row=self.row,
             frames={**frames, **self._idle, "reasons": reasons},
-            figures=metrics.compute(),
+            figures=metrics.compute() | self._parts(),
             curves=curves,
             state=self._state(),
             ms={stage: median(values) for stage, values in times.items() if values},
             sums={name: {entry: value.cpu() for entry, value in state.items()} for name, state in sums.items()},
         )
+
+    def _parts(self) -> dict[str, float]:
+        """The figures of what moves and what stands still, "moving.delta1" and so on; {} without masks."""
+        parts = {part: metrics for part, metrics in self._metrics.items() if part != METRICS}
+        return {f"{part}.{name}": value for part, m in parts.items() for name, value in m.compute().items()}
 
     def _state(self) -> dict[str, float]:
         """The size of the method's state over the sequence, for ``Record``."""

@@ -19,6 +19,7 @@ from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError
+from ufmstar_torch.eval.sequences.ground_truth import moving_at
 from ufmstar_torch.frame import FRAME_FAULTS
 from ufmstar_torch.output import FrameStatistics
 from ufmstar_torch.prediction import DepthPrediction
@@ -51,6 +52,7 @@ class RowResult:
     intrinsics: NDArray[np.float64]  # [3, 3] of the maps [px]
     # [h, w] ground truth at the maps' pixels [m], 0 = none; None without a depth map, or if it serves as anchors
     truth: NDArray[np.float32] | None
+    moving: NDArray[np.bool_] | None = None  # [h, w] True on things that move; None = unknown
     T_world_cam: NDArray[np.float64]  # [4, 4] the row's pose, with noise [m]
     member: int | None  # index of the network that predicted; None if all predicted, and for maps
     landmarks: Landmarks | None  # from which the frame's anchors were made; None for a row without anchors
@@ -69,6 +71,14 @@ class RowResult:
         if self.posterior_inlier_variance is None or self.posterior_outlier is None:
             return None
         return self.posterior_inlier_variance, self.posterior_outlier
+
+    @property
+    def parts(self) -> dict[str, Tensor]:
+        """[h, w] bool masks of what moves and what stands still, by name; {} where this is unknown."""
+        if self.moving is None:
+            return {}
+        moving = torch.from_numpy(self.moving)
+        return {"moving": moving, "still": ~moving}
 
     @property
     def size(self) -> tuple[int, int]:
@@ -140,6 +150,7 @@ class RowRunner:
             network_variance=None if network_variance is None else network_variance[0].cpu(),
             intrinsics=prediction.K[0].numpy(),
             truth=None if self.anchors is not None and self.anchors.sensor else truth,
+            moving=moving_at(frame, prediction.K[0].numpy(), prediction.size),
             T_world_cam=T,
             member=member,
             landmarks=landmarks,

@@ -58,6 +58,7 @@ def write_summary(
         "network_alone": figures.get(ALONE),
         "network_alone_reason": None if ALONE in figures else alone_reason,
         **_posterior(done, figures.get(UFM)),
+        **_parts(figures),
         "uncertainty": _uncertainty(done),
         "anchors": _anchors(done),
         "mixture": _mixture(done, job.ufm(checkpoint).mixture),
@@ -134,6 +135,12 @@ def _posterior(done: Records, figures: Mapping[str, float] | None) -> dict[str, 
         return {}
     before = {"metrics": figures, "mean_sigma": _pixel_mean(done, "mean_ufm_sigma")}
     return {"posterior": done[-1]["posterior"], "ufm": before}
+
+
+def _parts(figures: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
+    """The metrics on what moves and on what stands still, by the names of ``RunMetrics``; {} without masks."""
+    parts = {name: values for name, values in figures.items() if "." in name}
+    return {"parts": parts} if parts else {}
 
 
 def _sequence(sequence: FrameSequence) -> dict[str, Any]:

@@ -59,6 +59,7 @@ class Frame:
     intrinsics: np.ndarray  # [3, 3] float64 of the image [px]
     depth_intrinsics: np.ndarray | None = None  # [3, 3] of the depth map [px]; None = those of the image
     timestamp: float | None = None  # [s]
+    moving: np.ndarray | None = None  # [Hd, Wd] bool, True where the depth map shows a thing that moves; None = unknown
 
 
 @dataclass(frozen=True)
@@ -72,8 +73,8 @@ class Skipped:
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """A frame before decoding: ``load_image`` and ``load_depth`` return the arrays of :class:`Frame`. A frame whose
-    pose is not finite is skipped and counted."""
+    """A frame before decoding: ``load_image``, ``load_depth`` and ``load_moving`` return the arrays of :class:`Frame`.
+    A frame whose pose is not finite is skipped and counted."""
 
     name: str
     T_world_cam: np.ndarray
@@ -84,6 +85,7 @@ class Entry:
     intrinsics: np.ndarray | None = None
     depth_intrinsics: np.ndarray | None = None
     image_size: Size | None = None
+    load_moving: Loader | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +139,7 @@ class FrameSequence:
             intrinsics=self.intrinsics_of(entry).copy(),
             depth_intrinsics=None if K_depth is None else K_depth.copy(),
             timestamp=entry.timestamp,
+            moving=_load(entry.name, "mask of moving pixels", entry.load_moving, self.depth_size),
         )
 
     def intrinsics_of(self, entry: Entry) -> np.ndarray:
@@ -207,7 +210,8 @@ def in_memory(sequence: FrameSequence, progress: Callable[[int], object] = lambd
     for frame, entry in zip(sequence, sequence.entries, strict=True):
         load_image = entry.load_image and partial(np.asarray, frame.image)
         load_depth = entry.load_depth and partial(np.asarray, frame.depth)
-        entries.append(replace(entry, load_image=load_image, load_depth=load_depth))
+        load_moving = entry.load_moving and partial(np.asarray, frame.moving)
+        entries.append(replace(entry, load_image=load_image, load_depth=load_depth, load_moving=load_moving))
         progress(len(entries))
     return replace(sequence, entries=tuple(entries))
 

@@ -61,6 +61,11 @@ def truth_at(frame: Frame, K: NDArray, size: Size) -> NDArray | None:
     return None if frame.depth is None else resample_nearest(frame.depth, depth_camera(frame), K, size)
 
 
+def moving_at(frame: Frame, K: NDArray, size: Size) -> NDArray[np.bool_] | None:
+    """The mask of moving pixels at the pixels of a prediction, as :func:`truth_at`; None without a mask."""
+    return None if frame.moving is None else resample_nearest(frame.moving, depth_camera(frame), K, size)
+
+
 def register_depth(
     depth: np.ndarray, K_depth: np.ndarray, K_color: np.ndarray, T_color_depth: np.ndarray, size: Size
 ) -> np.ndarray:

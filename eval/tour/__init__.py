@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from ufmstar_torch.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from ufmstar_torch.eval.tour.movers import make_movers as make_movers
     from ufmstar_torch.eval.tour.path import tour_path as tour_path
     from ufmstar_torch.eval.tour.sequence import export_tour as export_tour
     from ufmstar_torch.eval.tour.sequence import tour_sequence as tour_sequence

@@ -64,6 +64,13 @@ class Palette:
         texture = "plain" if "plain" in self._style.textures else self._draw("metal").texture
         return Finish(texture, color, other, 0.12, glow)
 
+    def patterned(self) -> Finish:
+        """A finish with a fine pattern in any colour, for things that must be seen to move."""
+        available = [t for t in self._style.textures if t not in (*_PICTURES, "plain")]
+        texture = available[int(self._rng.integers(len(available)))]
+        first, second = self._colors((0.2, 0.7), (0.35, 0.9), (0.0, 1.0))
+        return Finish(texture, first, second, float(self._rng.uniform(0.06, 0.16)))
+
     def _draw(self, role: str) -> Finish:
         textures, saturation, value, period = _ROLES[role]
         available = [t for t in textures if t in self._style.textures]

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, make_sequence, parse_size
+from ufmstar_torch.eval.tour.movers import Mover, make_movers, with_movers
 from ufmstar_torch.eval.tour.path import tour_path
 from ufmstar_torch.eval.tour.style import STYLES
 from ufmstar_torch.eval.tour.tour import Tour, make_tour
@@ -19,7 +20,9 @@ from ufmstar_torch.eval.tour.view import TourView, intrinsics, render
 from ufmstar_torch.limits import require_bytes, require_pixels
 
 PREFIX = "tour:"
-_FORM = "tour:SEED or tour:SEED?option=value&..., with the options style, frames, size, fov, path, pan and sensor"
+_FORM = (
+    "tour:SEED or tour:SEED?option=value&..., with the options style, frames, size, fov, path, pan, sensor and movers"
+)
 FPS = 15.0  # of the timestamps
 _FRAME_BYTES = 4096  # of a frame's pose and entry, and of the arrays from which its pose is computed
 
@@ -28,7 +31,8 @@ def open_tour(name: str) -> FrameSequence:
     """The tour of a name.
 
     Options: ``style`` (home, hall, mixed, blank, scales), ``frames``, ``size`` (HxW), ``fov`` (degrees), ``path`` (seed
-    of the way), ``pan`` (1: the camera turns in place) and ``sensor`` (1, or 0 for a perfect camera).
+    of the way), ``pan`` (1: the camera turns in place), ``sensor`` (1, or 0 for a perfect camera) and ``movers``
+    (number of things that move).
 
     Raises:
         ValueError: another form, an unknown option, or an invalid value.
@@ -61,6 +65,7 @@ def tour_sequence(
     path_seed: int | None = None,
     pan: bool = False,
     sensor: bool = True,
+    movers: int = 0,
 ) -> FrameSequence:
     """A tour as a sequence; frames are rendered when they are indexed.
 
@@ -70,6 +75,7 @@ def tour_sequence(
         size: (H, W) [px].
         fov: horizontal field of view [degrees].
         sensor: True to add exposure, vignetting and noise.
+        movers: number of things that move (:func:`make_movers`); frames have a mask of them if there are any.
 
     Raises:
         ValueError: a value is out of range.
@@ -83,9 +89,17 @@ def tour_sequence(
     tour = make_tour(seed, style)
     poses = tour_path(tour, frames, path_seed, pan=pan)
     K = intrinsics(size[0], size[1], fov)
-    renderer = _Renderer(tour, poses, torch.from_numpy(K), size, sensor)
+    things = make_movers(tour, poses, torch.from_numpy(K), size, movers)
+    renderer = _Renderer(tour, poses, torch.from_numpy(K), size, sensor, things)
     entries = [
-        Entry(f"{i:06d}", poses[i].numpy(), partial(renderer.image, i), partial(renderer.depth, i), timestamp=i / FPS)
+        Entry(
+            f"{i:06d}",
+            poses[i].numpy(),
+            partial(renderer.image, i),
+            partial(renderer.depth, i),
+            timestamp=i / FPS,
+            load_moving=partial(renderer.moving, i) if movers else None,
+        )
         for i in range(frames)
     ]
     return make_sequence(f"tour-{seed}-{style}", "tour", entries, K, image_size=size, depth_size=size)
@@ -100,6 +114,7 @@ class _Renderer:
     K: torch.Tensor
     size: Size
     sensor: bool
+    movers: tuple[Mover, ...]
 
     def image(self, index: int) -> np.ndarray:
         """[H, W, 3] uint8 RGB."""
@@ -109,11 +124,16 @@ class _Renderer:
         """[H, W] float32 [m]."""
         return _view(self, index).depth.float().numpy()
 
+    def moving(self, index: int) -> np.ndarray:
+        """[H, W] bool, True on things that move."""
+        return (_view(self, index).surface >= len(self.tour.surfaces.kind)).numpy()
+
 
 @lru_cache(maxsize=4)  # a frame's image and depth come from one rendering
 def _view(walk: _Renderer, index: int) -> TourView:
     seed = walk.tour.seed * 1_000_003 + index if walk.sensor else None
-    return render(walk.tour, walk.poses[index], walk.K, *walk.size, frame_seed=seed)
+    tour = with_movers(walk.tour, walk.movers, index)
+    return render(tour, walk.poses[index], walk.K, *walk.size, frame_seed=seed)
 
 
 def export_tour(sequence: FrameSequence, folder: str | Path) -> Path:
@@ -153,4 +173,5 @@ _OPTIONS: dict[str, tuple[str, Callable[[str], Any], str]] = {
     "path": ("path_seed", _whole, "a number of at least 0"),
     "pan": ("pan", {"0": False, "1": True}.__getitem__, "0 or 1"),
     "sensor": ("sensor", {"0": False, "1": True}.__getitem__, "0 or 1"),
+    "movers": ("movers", _whole, "a number of at least 0"),
 }

@@ -39,6 +39,10 @@ class Anchors:
         shared: [B] variance of the inverse-depth error that all anchors of the frame share, as from wrong poses
             [1/m^2]; None = 0.
         scale: [B] variance of the logarithm of a factor that all depths of the frame share; None = 0.
+        motion: [B, M, 3] pixels (u, v) all over the depth map [px], and the log likelihood ratio of motion there, for
+            depths that matching of images has measured; NaN = unknown, None = the depths hold for moving things, too.
+        moving: [B] int64, number of depths that were not used because the surface moves, or because views disagree;
+            None = not counted.
     """
 
     pixel: Tensor
@@ -48,6 +52,8 @@ class Anchors:
     pose_error: Tensor | None = None
     shared: Tensor | None = None
     scale: Tensor | None = None
+    motion: Tensor | None = None
+    moving: Tensor | None = None
 
     @classmethod
     def from_points(
@@ -112,7 +118,11 @@ class Anchors:
         # inv_ex does not synchronise with the device; for singular intrinsics the result is not finite.
         mapping = product(K_to.detach().double(), torch.linalg.inv_ex(K_from.detach().double().to(K_to.device)).inverse)
         mapping = mapping.to(pixel.device)
-        return replace(self, pixel=apply(mapping[..., None, :2, :2], pixel) + mapping[..., None, :2, 2])
+        motion = self.motion
+        if motion is not None:
+            at = apply(mapping[..., None, :2, :2], motion[..., :2]) + mapping[..., None, :2, 2]
+            motion = torch.cat([at, motion[..., 2:]], -1)
+        return replace(self, pixel=apply(mapping[..., None, :2, :2], pixel) + mapping[..., None, :2, 2], motion=motion)
 
     def to(self, device: torch.device | str) -> Anchors:
         """Copy the anchors to another device."""
@@ -135,7 +145,7 @@ class AnchorInput:
         rejected: [B] number of anchors that only this factor makes invalid; None = not counted.
         contradiction: [B] mean r^2 of the rejected anchors, r at most 100, where they outnumber the valid ones and
             therefore measure the prediction's error; else 0. None = not counted.
-        pose_error, shared, scale: [B] as in :class:`Anchors`.
+        pose_error, shared, scale, motion, moving: as in :class:`Anchors`.
     """
 
     pixel: Tensor
@@ -150,6 +160,8 @@ class AnchorInput:
     pose_error: Tensor | None = None
     shared: Tensor | None = None
     scale: Tensor | None = None
+    motion: Tensor | None = None
+    moving: Tensor | None = None
 
 
 def check_anchors(anchors: Anchors, frame: FrameInput, network_variances: Sequence[Tensor] = ()) -> AnchorInput:
@@ -182,6 +194,11 @@ def check_anchors(anchors: Anchors, frame: FrameInput, network_variances: Sequen
     for name in ("pose_error", "shared", "scale"):
         if (value := getattr(anchors, name)) is not None:
             require_float(f"anchors.{name}", value, [(b,)], frame.depth)
+    motion = anchors.motion
+    if motion is not None:
+        motion = require_float("anchors.motion", motion, like=frame.depth).detach().double()
+        if motion.dim() != 3 or motion.shape[0] != b or motion.shape[2] != 3:
+            raise ValueError(f"anchors.motion must be [{b}, M, 3], got {tuple(motion.shape)}")
     one, zero = torch.ones_like(depth), torch.zeros_like(depth)
     pixel = torch.where(usable[..., None], pixel, zero[..., None])
     u, v = pixel.round().long().unbind(-1)
@@ -206,6 +223,8 @@ def check_anchors(anchors: Anchors, frame: FrameInput, network_variances: Sequen
         pose_error=anchors.pose_error,
         shared=anchors.shared,
         scale=anchors.scale,
+        motion=motion,
+        moving=anchors.moving,
     )
 
 

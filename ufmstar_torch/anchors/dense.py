@@ -5,7 +5,8 @@ lines. Therefore edges yield depths too, and most surfaces have them. Pixels wit
 Cells without a match are searched again with windows of twice the width, for surfaces without fine texture. The search
 measures inverse depth, rho = 1/depth with a standard deviation sigma: an anchor has the depth 1/rho and the variance
 sigma^2 depth^4. Some corners are tracked, too. They measure how far poses and images disagree, which a search along the
-lines of these poses cannot, and become anchors where no other is near.
+lines of these poses cannot, and become anchors where no other is near. Where the images show that a surface moves
+(``motion``), there is no anchor.
 
 Needs OpenCV and numba, on the CPU. Each camera needs its own object. Its state has a fixed size: keyframes, landmarks
 and some numbers.
@@ -26,6 +27,7 @@ from ufmstar_torch.anchors.dense_memory import Memory
 from ufmstar_torch.anchors.dense_poses import Fit, PoseErrors
 from ufmstar_torch.anchors.epipolar import median
 from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, OtherCameraError, checked, opencv
+from ufmstar_torch.anchors.motion import LANDMARK, LINE, OFF_LINE, SEARCH, MotionTests, Tested, located, moves
 from ufmstar_torch.anchors.saved_state import SavedState
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.checked import Checked, number
@@ -45,6 +47,8 @@ _JUMPED = 3
 _SCALE = 0.005
 # Variance of a match of the wide windows over that computed from its residual; 2 to 4 on tours.
 _COARSE_NOISE = 4.0
+# [px] Distance from the border within which a view does not show a position.
+_BORDER = 3
 _CORNERS = "corners_"  # prefix of the names of the tracker's state
 
 
@@ -131,6 +135,7 @@ class DenseEvidence(SavedState):
         self._keyframes = Keyframes(self.config.keyframes)
         self._memory = Memory(self.config.landmarks, self.config.memory)
         self._errors = PoseErrors(len(_BASELINES), self.config.memory)
+        self._motion = MotionTests(self.config.memory)
         corners = TrackerConfig(max_points=self.config.corners, start_depth=self.config.start_depth)
         self._tracker = LandmarkTracker(corners)
         self.reset()
@@ -145,6 +150,7 @@ class DenseEvidence(SavedState):
         self._keyframes.reset()
         self._memory.reset()
         self._errors.reset()
+        self._motion.reset()
         self._tracker.reset()
         self._size, self._K = np.zeros(2, np.int64), np.eye(3)  # of the images; no size before the first
         self._depth, self._contradicted, self._baseline = self.config.start_depth, 0, 0.0
@@ -152,12 +158,13 @@ class DenseEvidence(SavedState):
     def state(self) -> dict[str, Tensor]:
         """The state, for :meth:`load_state`. Images are shared and must not be written to."""
         corners = {_CORNERS + name: value for name, value in self._tracker.state().items()}
-        return super().state() | self._keyframes.state() | self._memory.state() | self._errors.state() | corners
+        parts = self._keyframes, self._memory, self._errors, self._motion
+        return super().state() | {name: value for part in parts for name, value in part.state().items()} | corners
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Restore a result of :meth:`state`; ValueError: another number of keyframes or landmarks."""
         super().load_state(state)
-        for part in (self._keyframes, self._memory, self._errors):
+        for part in (self._keyframes, self._memory, self._errors, self._motion):
             part.load_state(state)
         corners = {name: value for name, value in state.items() if name.startswith(_CORNERS)}
         self._tracker.load_state({name.removeprefix(_CORNERS): value for name, value in corners.items()})
@@ -217,21 +224,29 @@ class DenseEvidence(SavedState):
         trusted = not corners.contradicted
         precise = self._tracker.refined_variance * self._depth**2 <= self.config.corner_sigma**2
         compared = self._compared(T, K, small.shape[1]) if trusted and precise else None
-        found, searched, trusted = self._in_cells(small, T, K, cell, compared, trusted)
+        found, searched, trusted, tested, disagree = self._in_cells(small, T, K, cell, compared, trusted)
         self._contradicted = 0 if trusted else self._contradicted + 1
         if compared is not None and trusted:
             coarse = self._coarse(small, found.pixel, compared[0], cell)
             found = Depths(*(np.concatenate(pair) for pair in zip(found, coarse, strict=True)))
+        ratios = self._motion.log_ratios(tested, small.shape, cell) if trusted else None
+        moving = np.zeros(len(found.pixel), np.bool_) if ratios is None else moves(ratios, found.pixel, cell)
+        found = Depths(*(column[~moving] for column in found))
         shared = self._tracker.shared(max(self._baseline, self._tracker.baseline))
         total = found.variance + self._memory.apart * np.square(found.rho) + shared
         surface, outlier_variance = check_anchors(small, found.pixel, found.rho, total, cell)
         far = self._apart(corners, surface, small.shape[1]) if trusted else np.zeros(0, np.int64)
+        far = far if ratios is None else far[~moves(ratios, corners.pixel[far], cell)]
         depth = np.concatenate([1 / found.rho, corners.depth[far]])
         variance = np.concatenate([(total + outlier_variance) * depth[: len(total)] ** 4, corners.variance[far]])
         position = (np.concatenate([surface, corners.pixel[far]]) - scale[:2, 2]) / scale.diagonal()[:2]
         none = corners.none if corners.contradicted else Landmarks.none
         judged = corners.pose_error, shared, corners.contradicted, self._memory.apart, corners.lag
-        return Landmarks(position, depth, variance, searched, none, *judged)
+        motion = None if ratios is None else located(ratios, cell)
+        if motion is not None:
+            motion[:, :2] = (motion[:, :2] - scale[:2, 2]) / scale.diagonal()[:2]
+        withheld = int(moving.sum()) + disagree
+        return Landmarks(position, depth, variance, searched, none, *judged, motion=motion, moving=withheld)
 
     def _in_cells(
         self,
@@ -241,13 +256,14 @@ class DenseEvidence(SavedState):
         cell: int,
         compared: tuple[Views, NDArray] | None,
         trusted: bool,
-    ) -> tuple[Depths, int, bool]:
+    ) -> tuple[Depths, int, bool, Tested, int]:
         """Measure visible landmarks again where the camera has moved, and new pixels in the cells without a landmark.
 
         Also updates the running estimates.
 
         Returns:
-            The depths; the number of searched pixels; False if the views contradict each other.
+            The depths; the number of searched pixels; False if the views contradict each other; tests of whether
+            surfaces stand still; the number of pixels where views, or old and new measurements, disagree.
         """
         sighted = self._memory.sighted(small, T, K, cell)
         n = len(sighted.slot)
@@ -255,8 +271,15 @@ class DenseEvidence(SavedState):
         rho, variance = np.zeros(len(pixel)), np.ones(len(pixel))
         measured, storable = np.zeros((2, len(pixel)), np.bool_)
         searched = np.concatenate([np.flatnonzero(sighted.due), np.arange(n, len(pixel))])
+        tests, disagree = [(sighted.compared, LANDMARK, sighted.hidden)], 0
         if compared is not None:
-            found, fit, precise, trusted = self._searched(small, pixel[searched], *compared, K, cell)
+            found, fit, precise, trusted, disagree = self._searched(small, pixel[searched], *compared, K, cell)
+            seen = _shown_twice(pixel[searched], compared[0], small.shape, 1 / self._depth)
+            unmatched = np.ones(len(searched), np.bool_)
+            unmatched[found] = False
+            tests.append((pixel[searched][seen], SEARCH, unmatched[seen]))
+            on_line = np.isfinite(fit.off_line)
+            tests.append((pixel[searched][found][on_line], LINE, fit.off_line[on_line] > OFF_LINE))
             index = searched[found]
             storable[index] = precise
             measured[index], rho[index], variance[index] = True, fit.rho, fit.variance + np.square(_SCALE * fit.rho)
@@ -272,17 +295,18 @@ class DenseEvidence(SavedState):
         if len(valid) >= _ENOUGH:
             self._depth *= float(np.exp((1 - self.config.memory) * np.log(median(1 / rho[valid]) / self._depth)))
         count = n + (0 if compared is None else len(searched))
-        return Depths(pixel[valid], rho[valid], variance[valid]), count, trusted
+        disagree += int((measured[:n] & ~consistent).sum())
+        return Depths(pixel[valid], rho[valid], variance[valid]), count, trusted, Tested.of(*tests), disagree
 
     def _searched(
         self, small: NDArray[np.uint8], pixel: NDArray, views: Views, shares: NDArray, K: NDArray, cell: int
-    ) -> tuple[NDArray[np.int64], Fit, NDArray[np.bool_], bool]:
+    ) -> tuple[NDArray[np.int64], Fit, NDArray[np.bool_], bool, int]:
         """Match pixels [N, 2] with the keyframes.
 
         Returns:
             Indices [n] of the measured pixels; their depths, corrected for errors of the poses; [n] True for depths to
             store (not an uncertain match of a single view, which the next images measure better); False if the views
-            contradict each other.
+            contradict each other; the number of pixels with depths that disagree.
         """
         from ufmstar_torch.kernels.anchor_check_cpu import CERTAIN, confirmed
         from ufmstar_torch.kernels.dense_cpu import measure
@@ -296,7 +320,7 @@ class DenseEvidence(SavedState):
         arguments = matches.only(found), shares, views, K, self._depth, trusted
         fit = self._errors.corrected(pixel[found], *arguments)
         storable = (matches.agreed[found] > 1) | (fit.variance < np.square(CERTAIN * fit.rho))
-        return found, fit, storable, trusted
+        return found, fit, storable, trusted, int((matches.contradicted > 0).sum())
 
     def _coarse(self, small: NDArray[np.uint8], occupied: NDArray[np.float64], views: Views, cell: int) -> Depths:
         """Search the cells without a pixel of ``occupied`` [N, 2] with windows of twice the width, in images of half
@@ -348,6 +372,19 @@ class DenseEvidence(SavedState):
         b = ((T[:3, 3] - pose[:, :3, 3])[:, None] @ pose[:, :3, :3])[:, 0] @ K.T
         noise = self._errors.positions(K, width, self._depth)[shares]
         return Views(image, np.ascontiguousarray(H), np.ascontiguousarray(b), noise), shares
+
+
+def _shown_twice(
+    pixel: NDArray[np.float64], views: Views, size: tuple[int, int], start: float
+) -> NDArray[np.bool_]:  # fmt: skip
+    """[N] whether two views show the lines of pixels [N, 2], from infinity to twice the inverse depth ``start``."""
+    point = np.concatenate([pixel, np.ones((len(pixel), 1))], axis=1)
+    shown = np.ones((len(views.H), len(pixel)), np.bool_)
+    for rho in (0.0, 2 * start):
+        x, y, z = np.moveaxis(point @ views.H.transpose(0, 2, 1) + rho * views.b[:, None], -1, 0)
+        inside = (x > _BORDER * z) & (x < (size[1] - 1 - _BORDER) * z)
+        shown &= (z > 0) & inside & (y > _BORDER * z) & (y < (size[0] - 1 - _BORDER) * z)
+    return np.asarray(shown.sum(0) > 1)
 
 
 def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:

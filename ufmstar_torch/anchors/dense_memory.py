@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -33,6 +33,8 @@ class Sighted:
         rho: [n] inverse depth [1/m].
         variance: [n] of ``rho`` [1/m^2].
         due: [n] bool, True where they must be measured again.
+        compared: [m, 2] pixels of all landmarks whose patch was compared with the image.
+        hidden: [m] bool, True where the image shows something else there.
     """
 
     slot: NDArray[np.int64]
@@ -40,6 +42,8 @@ class Sighted:
     rho: NDArray[np.float64]
     variance: NDArray[np.float64]
     due: NDArray[np.bool_]
+    compared: NDArray[np.float64]
+    hidden: NDArray[np.bool_]
 
 
 class Memory(SavedState):
@@ -102,7 +106,8 @@ class Memory(SavedState):
         columns = self._point, self._pose, self._sigma, self._patch, self._used
         pixel, depth, spread, shown = sight(image, *columns, T_world_cam, K)
         self._seen[shown > 0], self._failed[shown > 0] = self.frame, 0
-        hidden = np.flatnonzero(shown < 0)
+        compared, hidden = np.flatnonzero(shown), np.flatnonzero(shown < 0)
+        tests = pixel[compared], shown[compared] < 0
         self._failed[hidden] += 1
         self._forget(hidden)
         slot = np.flatnonzero(shown > 0)
@@ -115,7 +120,7 @@ class Memory(SavedState):
         pixel, depth, spread = pixel[slot], depth[slot], spread[slot]
         moved = np.linalg.norm(self._pose[slot, :3, 3] - T_world_cam[:3, 3], axis=1)
         due = moved >= _DUE * depth * np.minimum(1 + self.confirmed[slot], _LONGEST)
-        return Sighted(slot, pixel, 1 / depth, np.square(spread / np.square(depth)), due)
+        return Sighted(slot, pixel, 1 / depth, np.square(spread / np.square(depth)), due, *tests)
 
     @property
     def empty(self) -> bool:
@@ -158,7 +163,7 @@ class Memory(SavedState):
         merged = np.where(confirmed, (sighted.rho * old + rho * new) / (old + new), sighted.rho)
         # Measurements share keyframes and patches: merging them does not reduce the smaller variance.
         least = np.where(confirmed, np.minimum(sighted.variance, variance), sighted.variance)
-        return Sighted(sighted.slot, sighted.pixel, merged, least, sighted.due), ~refuted
+        return replace(sighted, rho=merged, variance=least), ~refuted
 
     def write(
         self,

@@ -56,10 +56,13 @@ class Fit:
     Attributes:
         rho: [N] [1/m].
         variance: [N] of ``rho`` [1/m^2].
+        off_line: [N] largest squared distance of a match from its epipolar line, over its variance, of all views; NaN
+            where no view measures it.
     """
 
     rho: NDArray[np.float64]
     variance: NDArray[np.float64]
+    off_line: NDArray[np.float64]
 
 
 class PoseErrors(SavedState):
@@ -128,7 +131,7 @@ class PoseErrors(SavedState):
             trusted: False = poses and images contradict each other; the camera's errors are not updated.
         """
         if not len(pixel):
-            return Fit(measured.rho, measured.variance)
+            return Fit(measured.rho, measured.variance, np.zeros(0))
         used = np.isfinite(measured.value)
         shows = used & np.isfinite(measured.across)
         speed, slope = (np.where(used, x, 1.0) for x in (measured.speed, measured.slope))
@@ -145,7 +148,7 @@ class PoseErrors(SavedState):
             solution = solved(shown, *prior)
             rho = measured.rho + solution.rho
         if not np.isfinite(solution.covariance).all():  # never store NaN
-            return Fit(measured.rho, np.full(len(pixel), np.inf))
+            return Fit(measured.rho, np.full(len(pixel), np.inf), np.full(len(pixel), np.nan))
         self._learn_poses(solution, shares, K, depth)
         if trusted:
             self._learn_camera(solution, views.image.shape[2])
@@ -153,7 +156,8 @@ class PoseErrors(SavedState):
         self._learn_noise(solution.residual[compared], solution.across_residual, measured.across_noise, shows, shares)
         dispersion = (self._disagreement + solution.residual.sum(1)) / np.maximum(measured.agreed, 1)
         variance = _PATCH * dispersion * noise.min(1, initial=np.inf) + solution.common
-        return Fit(rho, variance)
+        off_line = np.where(shows, solution.across_residual / across_variance, -1.0).max(1, initial=-1.0)
+        return Fit(rho, variance, np.where(shows.any(1), off_line, np.nan))
 
     def _prior(self, shares: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Prior precision [S, S] and mean [S] of the errors of V keyframes and of the camera, S = 6 V + 4."""

@@ -157,13 +157,15 @@ class AnchorFrame(FrameExtension):
         """Count the anchors, those that were used and those that were rejected."""
         none, anchors = torch.zeros_like(self._used), self.anchors
         count, rejected = (none, none) if anchors is None else (anchors.valid.sum(1), anchors.rejected)
+        moving = none if anchors is None or anchors.moving is None else anchors.moving
         measured = out.statistics.pose_error
         if anchors is not None:
             self._warn()
             measured = anchors.pose_error
         counts = replace(
-            out.statistics, anchors=count, anchors_used=self._used, anchors_rejected=rejected, pose_error=measured
-        )
+            out.statistics, anchors=count, anchors_used=self._used, anchors_rejected=rejected, anchors_moving=moving,
+            pose_error=measured,
+        )  # fmt: skip
         return state, replace(out, statistics=counts)
 
     def disagreement(self, disagreement: Tensor, depth: Tensor) -> Tensor:

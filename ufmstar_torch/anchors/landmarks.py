@@ -45,6 +45,9 @@ class Landmarks:
         contradicted: the poses contradict the images, and no depth is used.
         scale: variance of the logarithm of a factor that all depths of the image share; ``variance`` includes it.
         lag: delay of the input poses, estimated from corners [images]; negative = early.
+        motion: [M, 3] pixels (u, v) all over the image [px], and the log likelihood ratio of motion there
+            (``motion``); None = the depths hold for things that move, too.
+        moving: number of depths that were not used because the surface moves, or because views disagree.
     """
 
     pixel: NDArray[np.float64]
@@ -57,6 +60,8 @@ class Landmarks:
     contradicted: bool = False
     scale: float = 0.0
     lag: float = 0.0
+    motion: NDArray[np.float64] | None = None
+    moving: int = 0
 
     @classmethod
     def skipped(cls, fault: str) -> Landmarks:
@@ -87,7 +92,9 @@ class Landmarks:
         # NumPy: each torch operation takes several times as long after a network.
         valid = torch.from_numpy(np.arange(rows)[None] < n).to(intrinsics.device)
         frame = torch.from_numpy(np.array([[self.pose_error], [self.shared], [self.scale]])).to(intrinsics.device)
-        result = Anchors(padded(self.pixel), padded(self.depth), padded(self.variance), valid, *frame)
+        motion = None if self.motion is None else torch.from_numpy(self.motion[None]).to(intrinsics.device)
+        moving = torch.tensor([self.moving], device=intrinsics.device)
+        result = Anchors(padded(self.pixel), padded(self.depth), padded(self.variance), valid, *frame, motion, moving)
         return result.moved(torch.as_tensor(K_camera), intrinsics.reshape(3, 3))
 
 

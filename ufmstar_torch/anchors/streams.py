@@ -34,7 +34,7 @@ SourceLike = Literal["corners", "dense"] | Path | LandmarkSource
 # Successive images that contradict their poses, or have a time offset, before a warning; a blurred one affects several.
 _SUCCESSIVE = 8
 _LARGEST_LAG = 0.5  # [images] time offset of the poses up to which there is no warning
-_FIELDS = ("pixel", "depth", "variance", "valid", "pose_error", "shared", "scale")
+_FIELDS = ("pixel", "depth", "variance", "valid", "pose_error", "shared", "scale", "moving")
 
 
 class StreamLandmarks:
@@ -147,8 +147,9 @@ class StreamLandmarks:
                 _LOG.warning("stream %d: %s; no depth is used. %s", i, landmarks.none, _CAUSES)
         capacity = max(len(landmarks.depth) for landmarks in result)
         by_stream = [landmarks.anchors(K[i].numpy(), K[i], capacity) for i, landmarks in enumerate(result)]
-        fields = (torch.cat([getattr(anchors, name) for anchors in by_stream]) for name in _FIELDS)
-        return Anchors(*fields).to(pose.device if image is None else image.device)
+        fields = {name: torch.cat([getattr(anchors, name) for anchors in by_stream]) for name in _FIELDS}
+        anchors = Anchors(**fields, motion=_padded([anchors.motion for anchors in by_stream]))
+        return anchors.to(pose.device if image is None else image.device)
 
     def _updated(
         self, source: LandmarkSource, image: NDArray[np.uint8] | None, T: NDArray[np.float64], K: NDArray[np.float64]
@@ -212,6 +213,18 @@ class StreamLandmarks:
     def _restore(self, states: Sequence[Mapping[str, Tensor]], streams: Sequence[int]) -> None:
         for i in streams:
             self._sources[i].load_state(states[i])
+
+
+def _padded(motion: Sequence[Tensor | None]) -> Tensor | None:
+    """[B, M, 3] of all streams, NaN where a stream has fewer; None if no stream has any."""
+    found = [m[0] for m in motion if m is not None]
+    if not found:
+        return None
+    result = found[0].new_full((len(motion), max(map(len, found)), 3), torch.nan)
+    for stream, m in enumerate(motion):
+        if m is not None:
+            result[stream, : m.shape[1]] = m[0]
+    return result
 
 
 def camera_faults(pose: Tensor, K: Tensor, size: tuple[float, ...], tolerance: float) -> list[int]:

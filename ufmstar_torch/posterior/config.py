@@ -35,6 +35,7 @@ class PosteriorConfig(Checked):
             distance from the evidence beyond which local errors do not change ``wrong``
         wrong: initial value of the probability that the local correction does not hold
         elsewhere: factor on ``unseen`` where the local correction does not hold
+        between: initial value of the scale of y over surfaces, beyond the shared scale
         near: standard deviation of the Gaussian window of the local scale
         widest: upper limit of the variance of y
         edge_contrast: difference of log d between a node and a pixel at which the node's weight is halved
@@ -59,6 +60,7 @@ class PosteriorConfig(Checked):
     radius: float = number(0.15, "r", "width", 0.0, open_low=True)
     wrong: float = number(0.015, "p_0", "1", 0.0, 0.5)
     elsewhere: float = number(12.0, "v_3", "1", 0.0)
+    between: float = number(0.2, "s_0", "1", 0.0, open_low=True)
     near: float = number(0.05, "r_1", "width", 0.0, open_low=True)
     widest: float = number(2.0, "v_2", "1", 0.0, 4.0, open_low=True)
     edge_contrast: float = number(0.1, "delta", "1", 0.0, open_low=True)

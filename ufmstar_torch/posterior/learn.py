@@ -85,6 +85,7 @@ def _of_discs(
     sums = {
         "wrong": (area * elsewhere, area * more_wrong),
         "inlier": (area * (1 - elsewhere) * factor * error**2 / inlier_variance, area * (1 - elsewhere)),
+        "between": (area * np.minimum((error + offset) ** 2, config.clip * running.ratios["between"]), area),
         "calibration": (area * error**2 / stated, area),
     }
     added = {name: (float(above.sum()), float(below.sum())) for name, (above, below) in sums.items()}

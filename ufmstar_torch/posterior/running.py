@@ -8,6 +8,7 @@ Frames with anchors update these ratios:
 - unseen: increase of the error's variance with the distance from evidence
 - wrong: probability that the local correction does not hold
 - inlier: factor by which the variance is too small where the correction holds
+- between: squared scale of y - b . x over the surfaces
 - calibration: mean z^2 of held-out anchors
 
 Each ratio is the quotient of two sums that fade towards a prior, so that few anchors change it little.
@@ -52,6 +53,7 @@ def ratios(config: PosteriorConfig) -> dict[str, Ratio]:
         "unseen": Ratio(config.unseen, weight, 0.0, 16.0),
         "wrong": Ratio(config.wrong, weight, config.wrong / 10, 10 * config.wrong),
         "inlier": Ratio(1.0, weight, 0.05, 4.0),
+        "between": Ratio(config.between**2, weight, 0.03**2, 1.0),
         "calibration": Ratio(0.0, 0.0, 0.0, 1e6),
     }
 

@@ -34,6 +34,8 @@ class AnchorRows(NamedTuple):
         predicted: [N] d at the pixel [m].
         depth: [N] g [m].
         variance: [N] of g [m^2].
+        motion: [M, 3] pixels (u, v) [px], and the log likelihood ratio of motion there; None = the anchors hold for
+            surfaces that move, too.
     """
 
     pixel: Floats
@@ -41,6 +43,7 @@ class AnchorRows(NamedTuple):
     predicted: Floats
     depth: Floats
     variance: Floats
+    motion: Floats | None = None
 
 
 class Grid(NamedTuple):

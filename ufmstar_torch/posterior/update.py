@@ -42,6 +42,8 @@ a is the variance of the anchors' y in a Gaussian window: depths differ more bet
 farther the evidence, the more surfaces lie between. v and w are at most ``widest``. Contradictory evidence thus limits
 the certainty of every pixel, and a depth far below the global correction is less certain than one above it.
 
+Anchors that matching has measured are wrong on surfaces that move: p then includes the probability of ``motion``.
+
 A stream whose anchors were all invalid so far has the network's depth with the variance of a node without evidence. A
 stream without anchors has UfM*'s output.
 """
@@ -65,6 +67,7 @@ from ufmstar_torch.posterior.cells import cell_means, features, read
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.field import at
 from ufmstar_torch.posterior.learn import learnt
+from ufmstar_torch.posterior.motion import probability, tests_at
 from ufmstar_torch.posterior.running import Floats, Running
 from ufmstar_torch.posterior.scene import (
     MOST_WRONG,
@@ -142,8 +145,11 @@ def _anchors(anchors: AnchorInput | None, streams: int) -> list[AnchorRows | Non
     if anchors is None:
         return [None] * streams
     fields = [array(x) for x in (anchors.pixel, anchors.index, anchors.predicted, anchors.depth, anchors.variance)]
-    used = array(anchors.valid)
-    return [AnchorRows(*(x[b][used[b]] for x in fields)) for b in range(streams)]
+    used, motion = array(anchors.valid), None if anchors.motion is None else array(anchors.motion)
+    return [
+        AnchorRows(*(x[b][used[b]] for x in fields), motion=None if motion is None else motion[b])
+        for b in range(streams)
+    ]
 
 
 def _of_stream(
@@ -178,6 +184,10 @@ def _of_stream(
     wide = elsewhere_variance(config, spread_around(scene, all_anchors, b[0]), unseen)
     scale = local_scale(scene, left_out, all_anchors)
     p = np.minimum(updated.ratios["wrong"] * wrong_factor(config, away, scale), MOST_WRONG)
+    if anchors.motion is not None:
+        tests, share = tests_at(anchors.motion, *depth.shape, rows, cols), away / config.reach
+        P = probability(offset, grid.log_depth, share, tests, updated.ratios["between"], (rows, cols))
+        p = 1 - (1 - p) * (1 - P)
     variance, inlier = second_moments(config, scale * (variance + steepness(grid, field.offset)), p, offset, wide)
     nodes = np.stack([grid.log_depth, offset, variance, inlier, p, away / config.reach], 1)
     depth, spread, inlier, p = read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
