@@ -22,6 +22,7 @@ from ufmstar_torch.kernels.select import LateStep, select_check, select_step
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.network_variance import NetworkVariance
 from ufmstar_torch.output import MeanUncertainty, StepOutput, UfMStarOutput
+from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.regress import Regression, regress
 from ufmstar_torch.sample import mean_uncertainty, sample_pixels, sample_size
 from ufmstar_torch.state import NAMES, UfMStarState
@@ -131,6 +132,7 @@ class UfMStar(StatefulModule):
         a, e = (None if v is None else as_tensor(n, v) for n, v in (("aleatoric", aleatoric), ("epistemic", epistemic)))
         frame = self._checked(depth, pose, intrinsics, a, e, valid, features, member, informative)
         out, maps = self._observe(frame, inputs)
+        quantiles = maps.pop("quantiles", None)
         originals: dict[str, Any] = {"epistemic": e} if self.config.aleatoric_in_h else {"aleatoric": a, "epistemic": e}
 
         def shaped(value: Tensor) -> Tensor:
@@ -145,6 +147,8 @@ class UfMStar(StatefulModule):
             valid=shaped(frame.valid),
             current_cam=out.current_cam,
             statistics=out.statistics,
+            quantiles=quantiles,
+            recalibrated=any(isinstance(one, Recalibration) for one in self._extensions.each),
         )
 
     if TYPE_CHECKING:
