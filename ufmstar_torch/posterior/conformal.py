@@ -18,6 +18,7 @@ What this leaves out is ``TRANSFER``, the factor from t_L at anchors to t_L at p
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -43,6 +44,21 @@ SIZE: Final = 1 + len(LEVELS)
 DISTANCES: Final = (0.015, 0.05, 0.12, 0.25)
 # Largest weight of a score over the mean.
 MOST_WEIGHT: Final = 10.0
+
+
+def after_frame(states: Tensor, scores: Sequence[Tensor]) -> Tensor:
+    """The states [B, 4] after a frame with ``scores``, for each stream [2, M] scores and weights; () = unchanged."""
+    if not scores:
+        return states
+    rows = [updated(s, *one.numpy()) for s, one in zip(states.cpu().numpy(), scores, strict=True)]
+    return torch.from_numpy(np.stack(rows)).to(states.device)
+
+
+def require(states: Tensor) -> None:
+    """Raise a ValueError if no scores can have led to the states [B, 4]."""
+    frames, logs = states[:, 0], states[:, 1:]
+    if bool((frames < 0).any() | (frames != frames.round()).any() | (logs.abs() > math.log(LARGEST) + 1e-9).any()):
+        raise ValueError("intervals holds impossible values: a number of frames, and logs of factors from .1 to 10")
 
 
 def updated(state: Floats, scores: Floats, weights: Floats) -> Floats:

@@ -12,11 +12,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.special import ndtr, ndtri
 
-from ufmstar_torch.posterior.conformal import corrected, uncorrected
+from ufmstar_torch.posterior.conformal import LEVELS, Floats, corrected, uncorrected
 
 # Least distance of F from 0 and 1 [1]: z stays finite in float64.
 _TAIL = 1e-15
@@ -81,6 +82,21 @@ class DepthDistribution:
     def _quantiles_at(self, like: Tensor) -> Tensor:
         """[3, B, 1, ...] to broadcast over the pixels of ``like`` [B, ...]."""
         return self.quantiles.double().T.reshape(3, -1, *[1] * (like.dim() - 1))
+
+
+def score(error: Floats, p: Floats, moment: Floats, inlier: Floats) -> Floats:
+    """|z| [N] of held-out anchors.
+
+    Args:
+        error: [N] log of the depth over the posterior's.
+        p: [N] probability that the posterior's local correction does not hold.
+        moment, inlier: [N] second moment of the relative error, and the same if the local correction holds.
+    """
+    elsewhere = np.maximum((moment - (1 - p) * inlier) / p, inlier)
+    maps = (np.stack(x)[:, None] for x in ((1 - p, p), (np.ones_like(p), np.ones_like(p)), (inlier, elsewhere)))
+    distribution = DepthDistribution(*(torch.from_numpy(x) for x in maps), torch.full((1, len(LEVELS)), torch.nan))
+    z: Floats = distribution.standard(torch.from_numpy(np.exp(error))[None])[0].abs().numpy()
+    return z
 
 
 def _conditional(distribution: DepthDistribution, depth: Tensor) -> Tensor:
