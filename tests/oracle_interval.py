@@ -1,7 +1,8 @@
-"""Intervals of a mixture of normal distributions, and their correction, for one pixel or stream: NumPy and math alone."""
+"""Intervals of a mixture of normal distributions, and their correction, for one pixel or stream, with math alone."""
 
 from __future__ import annotations
 
+import itertools
 import math
 
 NORMAL = {0.5: 0.6744897501960817, 0.9: 1.6448536269514722, 0.99: 2.5758293035489004}
@@ -36,7 +37,7 @@ def standard(components, x: float) -> float:
 def corrected(z: float, quantiles) -> float:
     """The normal z of a mixture's z; ``quantiles``: |z| at 50, 90, 99 %."""
     knots, size = [(0.0, 0.0), *zip(quantiles, NORMAL.values(), strict=True)], abs(z)
-    for (x0, y0), (x1, y1) in zip(knots, knots[1:], strict=False):
+    for (x0, y0), (x1, y1) in itertools.pairwise(knots):
         if size <= x1:
             return math.copysign(y0 + (size - x0) / (x1 - x0) * (y1 - y0), z)
     return math.copysign(size * knots[-1][1] / knots[-1][0], z)
@@ -71,7 +72,7 @@ def weights(distance, area, everywhere):
     bounds = [-1.0, 0.015, 0.05, 0.12, 0.25, math.inf]
     result = []
     for one, a in zip(distance, area, strict=True):
-        low, high = next((lo, hi) for lo, hi in zip(bounds, bounds[1:], strict=False) if lo < one <= hi)
+        low, high = next((lo, hi) for lo, hi in itertools.pairwise(bounds) if lo < one <= hi)
         wanted = sum(low < x <= high for x in everywhere) / len(everywhere)
         shown = sum(x for d, x in zip(distance, area, strict=True) if low < d <= high) / sum(area)
         result.append(a * min(wanted / shown, 10.0))

@@ -59,6 +59,7 @@ def test_values_against_the_oracle_over_frames():
         np.testing.assert_allclose(out.outlier[0], outlier, rtol=1e-7)
         assert float(out.calibration) == pytest.approx(oracle.ratio(state, "calibration"), rel=1e-7)
         assert float(out.unseen) == pytest.approx(oracle.ratio(state, "unseen"), rel=1e-7)
+        np.testing.assert_allclose(out.scores[0], np.array(state["scores"]), rtol=1e-6)
 
 
 @pytest.mark.parametrize(("rows", "cols"), [(5, 9), (3, 1), (1, 4), (30, 28)])

@@ -127,10 +127,9 @@ class UfMStarOutput:
             before any anchor; None unless ``config.posterior``.
         posterior_inlier_variance: V_1 [m^2], the variance if it lies on their surface. ``posterior_variance`` V is that
             of the mixture: on another surface, the variance is (V - (1 - p) V_1)/p.
-        quantiles: [B, 3] half-widths of the central intervals of 50, 90 and 99 % at every pixel, in standard deviations of
-            a normal distribution (``posterior.conformal``). NaN in a stream without evidence; None unless
-            ``config.posterior``.
-        recalibrated: True if a :class:`~ufmstar_torch.recalibrate.Recalibration` has mapped ``variance``.
+        quantiles: [B, 3] half-widths of the central intervals of 50, 90 and 99 %, in standard deviations of a normal
+            distribution (``posterior.conformal``). NaN in a stream without evidence; None unless ``config.posterior``.
+        recalibrated: [B, 1] True if a ``Recalibration`` has mapped ``variance``, or None.
         features: regressed further entries of H, [B, H, W, F], in the caller's units.
         measured: share in [0, 1] of M that rests on surfaces seen from two or more views; below one half the pixel
             counts as not measured (``config.unmeasured``). NaN where not valid.
@@ -156,7 +155,7 @@ class UfMStarOutput:
     posterior_outlier: Tensor | None = None
     posterior_inlier_variance: Tensor | None = None
     quantiles: Tensor | None = None
-    recalibrated: bool = False
+    recalibrated: Tensor | None = None
 
     def __repr__(self) -> str:
         """Shape, median standard deviation and counts in one line."""
@@ -221,12 +220,19 @@ class UfMStarOutput:
             raise ValueError("near must be at most far, got a larger one")
         return self.probability_nearer(far) - self.probability_nearer(near)
 
+    @property
+    def has_intervals(self) -> bool:
+        """True if :meth:`interval` and the probabilities have evidence in at least one stream."""
+        return self.recalibrated is not None or (self.quantiles is not None and bool(self.quantiles.isfinite().any()))
+
     def distribution(self) -> DepthDistribution:
         """The distribution of the depth at every pixel, of which the intervals and probabilities are.
 
         Raises:
             ValueError: no stream has evidence, as :meth:`interval`.
         """
+        if not self.has_intervals:
+            raise ValueError(_WITHOUT_EVIDENCE if self.quantiles is None else _NO_ANCHORS_YET)
         V1, p = self.posterior_inlier_variance, self.posterior_outlier
         streams = 1 if self.depth.dim() < 3 else len(self.depth)
         quantiles = self.variance.new_full((streams, 3), torch.nan) if self.quantiles is None else self.quantiles
@@ -237,10 +243,8 @@ class UfMStarOutput:
             p = torch.where(p.isnan() & V.isfinite(), 0.0, p)  # before any anchor
             elsewhere = torch.maximum((V - (1 - p) * V1) / p.clamp_min(1e-12), V1)
             weight, mean, variance = torch.stack([1 - p, p]), torch.stack([d, d]), torch.stack([V1, elsewhere])
-        if self.recalibrated:
-            quantiles = torch.where(quantiles.isnan(), quantiles.new_tensor(NORMAL), quantiles)
-        if quantiles.device.type != "meta" and not bool(quantiles.isfinite().any()):
-            raise ValueError(_WITHOUT_EVIDENCE if self.quantiles is None else _NO_ANCHORS_YET)
+        if self.recalibrated is not None:
+            quantiles = torch.where(quantiles.isnan() & self.recalibrated, quantiles.new_tensor(NORMAL), quantiles)
         return DepthDistribution(torch.where(variance.isfinite(), weight, torch.nan), mean, variance, quantiles)
 
 

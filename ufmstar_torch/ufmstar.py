@@ -22,7 +22,6 @@ from ufmstar_torch.kernels.select import LateStep, select_check, select_step
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.network_variance import NetworkVariance
 from ufmstar_torch.output import MeanUncertainty, StepOutput, UfMStarOutput
-from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.regress import Regression, regress
 from ufmstar_torch.sample import mean_uncertainty, sample_pixels, sample_size
 from ufmstar_torch.state import NAMES, UfMStarState
@@ -132,11 +131,10 @@ class UfMStar(StatefulModule):
         a, e = (None if v is None else as_tensor(n, v) for n, v in (("aleatoric", aleatoric), ("epistemic", epistemic)))
         frame = self._checked(depth, pose, intrinsics, a, e, valid, features, member, informative)
         out, maps = self._observe(frame, inputs)
-        quantiles = maps.pop("quantiles", None)
         originals: dict[str, Any] = {"epistemic": e} if self.config.aleatoric_in_h else {"aleatoric": a, "epistemic": e}
 
-        def shaped(value: Tensor) -> Tensor:
-            return value if value.shape == depth.shape else value.reshape(depth.shape)
+        def shaped(value: Tensor) -> Tensor:  # no map: [B, n]
+            return value if value.shape == depth.shape or value.dim() == 2 else value.reshape(depth.shape)
 
         maps = {name: None if value is None else shaped(value) for name, value in maps.items()}
         return UfMStarOutput(
@@ -147,8 +145,6 @@ class UfMStar(StatefulModule):
             valid=shaped(frame.valid),
             current_cam=out.current_cam,
             statistics=out.statistics,
-            quantiles=quantiles,
-            recalibrated=any(isinstance(one, Recalibration) for one in self._extensions.each),
         )
 
     if TYPE_CHECKING:

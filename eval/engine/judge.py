@@ -80,9 +80,11 @@ class RunMetrics(FrameSink):
         maps |= {} if row.network_variance is None else {ALONE: (row.depth, row.network_variance)}
         if row.posterior_depth is not None:
             maps[POSTERIOR] = row.posterior_depth, row.posterior_variance
+        corrected = POSTERIOR if POSTERIOR in maps else UFM
         for name, (depth, variance) in maps.items():
-            mixture = row.mixture if name == POSTERIOR else None
-            metrics_of(self._metrics, name, plugins=self._plugins).update(depth, variance, target, row.valid, mixture)
+            mixture, level = row.mixture if name == POSTERIOR else None, row.level if name == corrected else None
+            metrics = metrics_of(self._metrics, name, plugins=self._plugins)
+            metrics.update(depth, variance, target, row.valid, mixture, level)
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,8 @@ class RowJudge(FrameSink):
         )  # fmt: skip
         how = {"with_variance": variance is not None, "bins": self._bins, "plugins": self._plugins}
         mixture = result.mixture if self.row.setting.posterior else None
-        metrics_of(self._metrics, METRICS, **how).update(depth, variance, target, mixture=mixture)
+        metrics = metrics_of(self._metrics, METRICS, **how)
+        metrics.update(depth, variance, target, mixture=mixture, level=None if variance is None else result.level)
         if variance is None:
             return
         if result.confidence is not None:

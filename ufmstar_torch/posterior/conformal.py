@@ -5,9 +5,10 @@ distribution (``distribution``). For each level L, t_L is tracked so that the sh
 (Gibbs and Candes, "Adaptive Conformal Inference Under Distribution Shift", 2021, with the quantile as the adapted
 value):
 
-    log t_L <- log t_L + step (share of the frame's scores above t_L - (1 - L)) / slope,      step = max(rate, 1/(n + 3))
+    log t_L <- log t_L + step (share of the frame's scores above t_L - (1 - L)) / slope,
 
-n counts frames with scores. ``slope`` is the change of the share per unit of log t for a normal distribution, so that
+with step = max(rate, 1/(n + 3)). n counts frames with scores.
+``slope`` is the change of the share per unit of log t for a normal distribution, so that
 all levels adapt at the same rate; the constant rate forgets old frames. A frame with few scores takes a smaller step.
 
 Anchors lie on textured surfaces, and a held-out one is farther from the others than most pixels are. Each score

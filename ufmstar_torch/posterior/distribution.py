@@ -92,7 +92,7 @@ def score(error: Floats, p: Floats, moment: Floats, inlier: Floats) -> Floats:
         p: [N] probability that the posterior's local correction does not hold.
         moment, inlier: [N] second moment of the relative error, and the same if the local correction holds.
     """
-    elsewhere = np.maximum((moment - (1 - p) * inlier) / p, inlier)
+    elsewhere = np.maximum((moment - (1 - p) * inlier) / np.maximum(p, 1e-12), inlier)
     maps = (np.stack(x)[:, None] for x in ((1 - p, p), (np.ones_like(p), np.ones_like(p)), (inlier, elsewhere)))
     distribution = DepthDistribution(*(torch.from_numpy(x) for x in maps), torch.full((1, len(LEVELS)), torch.nan))
     z: Floats = distribution.standard(torch.from_numpy(np.exp(error))[None])[0].abs().numpy()

@@ -61,7 +61,7 @@ class PosteriorFrame(FrameExtension):
         return state.with_tensors(tensors), replace(out, statistics=statistics)
 
     def outputs(self) -> dict[str, Tensor]:
-        """Corrected depth, its variance, the probability of another surface, and the variance without that case; and the
+        """Corrected depth, its variance, the probability of another surface, the variance without that case, and the
         quantiles of intervals [B, 3]."""
         assert self._posterior is not None
         p = self._posterior
