@@ -7,9 +7,9 @@ FastDepth with dense anchors and the posterior. For every sequence it prints the
 in central intervals, from frame 30 on (in a shorter sequence: in its last ten frames), and the pixels that gates on
 sigma / depth keep, plain and with the posterior. Over all sequences it prints false and missed stops: the truth is a
 stop if more than 1 % of the middle of the image is nearer than ``--nearer``; a rule stops if it says so of more than
-1 % of these pixels. ``--noise``: rotation noise of every pose [degrees]. ``--fit``: also the factors
-``posterior.conformal.TRANSFER`` with which the mean coverage is that of ``TARGETS``; only on tours. ``--figure``: writes
-coverage and gates as a picture.
+1 % of these pixels. ``--noise``: rotation noise of every pose [degrees]. ``--fit`` also prints the factors of
+``posterior.conformal.TRANSFER`` with which the mean coverage is that of ``TARGETS``; use it on tours only. ``--figure``
+writes coverage and gates as pictures.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -111,7 +112,7 @@ def gates(depth: Tensor, variance: Tensor, frame: Frame) -> list[tuple[Tensor, T
     """Relative errors of the pixels with truth between each two ``GATES``."""
     used = frame.known_truth & variance.isfinite()
     ratio, error = variance[used].sqrt() / depth[used], (depth[used] / frame.truth[used] - 1).abs()
-    return [(error[(ratio > low) & (ratio <= high)]) for low, high in zip(GATES, GATES[1:], strict=False)]
+    return [(error[(ratio > low) & (ratio <= high)]) for low, high in pairwise(GATES)]
 
 
 def rules(out: UfMStarOutput, nearer: float) -> dict[str, Tensor]:
@@ -170,8 +171,8 @@ def main() -> None:
             truth = middle_of(frame.known_truth)
             stop = bool((middle_of(frame.truth)[truth] < arguments.nearer).double().mean() > LEAST)
             for rule, near in rules(frame.out, arguments.nearer).items():
-                said_so = bool(middle_of(near)[truth].double().mean() > LEAST)
-                stops.setdefault(rule, Stops()).add(stop, said_so)
+                stopped = bool(middle_of(near)[truth].double().mean() > LEAST)
+                stops.setdefault(rule, Stops()).add(stop, stopped)
     if arguments.fit:
         print("TRANSFER:", *fitted(errors))
     print_gates(tables)
@@ -185,7 +186,7 @@ def main() -> None:
 
 def print_gates(tables: dict[tuple[str, str], list[Tensor]]) -> None:
     """Share, median error and delta1 of the pixels between gates."""
-    between = [f"{low:g} to {high:g}" for low, high in zip(GATES[1:-2], GATES[2:-1], strict=True)]
+    between = [f"{low:g} to {high:g}" for low, high in pairwise(GATES[1:-1])]
     names = [f"below {GATES[1]:g}", *between, f"above {GATES[-2]:g}"]
     print("\n| sigma / depth | | " + " | ".join(names) + " | all |\n" + "|---" * (3 + len(names)) + "|")
     for (name, kind), parts in tables.items():

@@ -161,7 +161,7 @@ def test_without_evidence_an_interval_is_refused():
     early = UfMStar(CONFIG)(first[0], first[1], K, anchors=first[2])
     for out, reason in ((plain, "or a Recalibration"), (early, "too few anchors were held out so far")):
         assert not out.has_intervals
-        for name, arguments in (
+        for name, values in (
             ("interval", [0.9]),
             ("probability_nearer", [1.0]),
             ("probability_between", [1.0, 2.0]),

@@ -113,7 +113,8 @@ def _anchor_figures(row: RowResult) -> dict[str, Any]:
 
 
 def _posterior_figures(row: RowResult) -> dict[str, Any]:
-    """The posterior's mean sigma [m] and figures of held-out anchors (``FrameStatistics``); {} without one."""
+    """The posterior's mean sigma [m], figures of held-out anchors (``FrameStatistics``) and the quantiles of intervals
+    (``UfMStarOutput``); {} without one."""
     variance, statistics = row.posterior_variance, row.statistics
     if variance is None or statistics is None or statistics.calibration is None or statistics.unseen is None:
         return {}
@@ -122,6 +123,7 @@ def _posterior_figures(row: RowResult) -> dict[str, Any]:
         "mean_sigma": _mean(variance.sqrt(), row.valid),
         "calibration": calibration if math.isfinite(calibration) else None,
         "unseen": float(statistics.unseen[0]),
+        "quantiles": None if row.distribution is None else row.distribution.quantiles[0].tolist(),
     }
     return {"posterior": figures}
 

@@ -56,6 +56,7 @@ def write_summary(
         "network_alone_reason": None if ALONE in figures else alone_reason,
         **_posterior(done, figures.get(POSTERIOR)),
         "uncertainty": _uncertainty(done),
+        "recalibrated": job.recalibration is not None,
         "anchors": _anchors(done),
         "mixture": _mixture(done, job.ufm(checkpoint).mixture),
         "time": _time(done, checkpoint.sessions),
