@@ -9,7 +9,7 @@ sigma / depth keep, plain and with the posterior. Over all sequences it prints f
 stop if more than 1 % of the middle of the image is nearer than ``--nearer``; a rule stops if it says so of more than
 1 % of these pixels. ``--noise``: rotation noise of every pose [degrees]. ``--fit`` also prints the factors of
 ``posterior.conformal.TRANSFER`` with which the mean coverage is that of ``TARGETS``; use it on tours only. ``--figure``
-writes coverage and gates as pictures.
+writes coverage and gates as pictures, ``--picture`` the maps of the first sequence's last frame.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ from ufmstar_torch import UncertainDepth
 from ufmstar_torch.eval.methods.perturb import perturbed
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.eval.report import style
 from ufmstar_torch.eval.report.figures_gates import gates_figure, intervals_figure
-from ufmstar_torch.eval.report.style import save_figure
+from ufmstar_torch.eval.report.style import new_figure
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.models.load import load_network
@@ -52,8 +53,9 @@ LEAST = 0.01  # share of these pixels
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Maps [h, w] of one frame: UfM*'s output, and the ground truth [m], 0 = none."""
+    """One frame: its image [H, W, 3], UfM*'s output, and the ground truth [h, w] [m], 0 = none."""
 
+    image: NDArray[np.uint8]
     out: UfMStarOutput
     truth: Tensor
 
@@ -83,7 +85,7 @@ def frames_of(source: str, weights: Path, noise: float) -> Iterator[Frame]:
         out = model(frame.image, T, frame.intrinsics)
         truth = truth_at(frame, out.intrinsics[0].numpy(), (out.depth.shape[1], out.depth.shape[2]))
         if truth is not None:
-            yield Frame(out.ufm, torch.from_numpy(truth))
+            yield Frame(frame.image, out.ufm, torch.from_numpy(truth))
 
 
 def standard_errors(frame: Frame) -> Tensor:
@@ -142,6 +144,7 @@ def main() -> None:
     parser.add_argument("--noise", type=float, default=0.0, help="rotation noise of every pose [degrees]")
     parser.add_argument("--fit", action="store_true", help="fit TRANSFER; on tours only")
     parser.add_argument("--figure", type=Path, help="PNG or SVG")
+    parser.add_argument("--picture", type=Path, help="PNG")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     errors, stops, curves = list[Tensor](), dict[str, Stops](), {}
@@ -149,6 +152,8 @@ def main() -> None:
     tables = {}
     for source in arguments.sequences:
         name, frames = Path(source).name, list(frames_of(source, arguments.weights, arguments.noise))
+        if arguments.picture and not tables:
+            draw_maps(arguments.picture, frames[-1], arguments.nearer)
         with_intervals = [frame for frame in frames if frame.out.has_intervals]
         late = with_intervals[FIRST - len(frames) :] if len(frames) > FIRST + LAST / 2 else with_intervals[-LAST:]
         metrics = SequenceMetrics()
@@ -199,10 +204,40 @@ def print_gates(tables: dict[tuple[str, str], list[Tensor]]) -> None:
         print(f"| {name} | {kind} | " + " | ".join(cells) + " |")
 
 
+def draw_maps(file: Path, frame: Frame, nearer: float) -> None:
+    """The image, what supports its depth, and a row of the interval with the truth."""
+    out, figure = frame.out, new_figure(11, 6.6, "")
+    (lower, upper), (depth, _) = (x[0].numpy() for x in out.interval(0.9)), (x[0].numpy() for x in out.posterior())
+    assert out.posterior_outlier is not None
+    maps = {
+        "measured: share seen from two views": (out.measured[0].numpy(), "viridis", 1.0),
+        "posterior_outlier: another surface": (out.posterior_outlier[0].numpy(), "magma", 0.2),
+        "90 % interval: (upper - lower) / depth": ((upper - lower) / depth, "magma", 1.0),
+        f"P(nearer than {nearer:g} m)": (out.probability_nearer(nearer)[0].numpy(), "magma", 1.0),
+    }
+    panels = figure.subplots(2, 3).ravel()
+    panels[0].imshow(frame.image)
+    style.finish(panels[0], title="image, and the row below")
+    row, width = depth.shape[0] // 2, depth.shape[1]
+    panels[0].axhline(frame.image.shape[0] / 2, color="#D55E00", linewidth=1.0)
+    for axes, (title, (values, colours, high)) in zip(panels[1:5], maps.items(), strict=True):
+        figure.colorbar(axes.imshow(values, cmap=colours, vmin=0, vmax=high), ax=axes, shrink=0.7)
+        style.finish(axes, title=title)
+    for axes in panels[:5]:
+        axes.set(xticks=[], yticks=[])
+    last, truth = panels[5], frame.truth[row].numpy()
+    last.fill_between(range(width), lower[row], upper[row], color="#0072B2", alpha=0.25, label="90 % interval")
+    last.plot(depth[row], color="#0072B2", label="depth")
+    last.plot(np.where(truth > 0, truth, np.nan), color="#1a1a1a", label="truth")
+    style.finish(last, title="along the row", x="column [px]", y="depth [m]")
+    last.legend(frameon=False, fontsize=style.TICK)
+    style.save_figure(figure, file)
+
+
 def draw(file: Path, curves: dict[str, dict[str, list[float]]]) -> None:
     """Two pictures: FILE with gates, and FILE-intervals."""
-    save_figure(gates_figure(curves, "Gates on sigma / depth, posterior"), file)
-    save_figure(intervals_figure(curves, "Central intervals"), file.with_stem(f"{file.stem}_intervals"))
+    style.save_figure(gates_figure(curves, "Gates on sigma / depth, posterior"), file)
+    style.save_figure(intervals_figure(curves, "Central intervals"), file.with_stem(f"{file.stem}_intervals"))
 
 
 if __name__ == "__main__":
