@@ -207,6 +207,13 @@ def test_a_run_with_a_posterior_corrects_the_depth_and_goes_on_after_a_stop(tour
     assert posterior["metrics"]["ece_delta"] < plain["ece_delta"]
     assert posterior["unseen"] > 0
     assert "posterior  " in run_table(summary)
+    covered = [posterior["metrics"][f"coverage_{level}"] for level in (50, 90, 99)]
+    assert 0 < covered[0] < covered[1] <= covered[2] <= 1
+    assert f"intervals of 50, 90 and 99 % hold {covered[0]:.0%}, {covered[1]:.0%}, {covered[2]:.0%}" in run_table(
+        summary
+    )
+    assert "coverage_90" not in plain
+    assert len(posterior["quantiles"]) == 3
     for name in tour.names:
         one, other = (read_frame(out / "frames" / f"{name}.npz") for out in (whole, parts))
         for key in ("posterior_depth", "posterior_variance", "posterior_inlier_variance", "posterior_outlier"):
