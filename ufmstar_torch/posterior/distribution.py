@@ -93,8 +93,9 @@ def score(error: Floats, p: Floats, moment: Floats, inlier: Floats) -> Floats:
         moment, inlier: [N] second moment of the relative error, and the same if the local correction holds.
     """
     elsewhere = np.maximum((moment - (1 - p) * inlier) / np.maximum(p, 1e-12), inlier)
-    maps = (np.stack(x)[:, None] for x in ((1 - p, p), (np.ones_like(p), np.ones_like(p)), (inlier, elsewhere)))
-    distribution = DepthDistribution(*(torch.from_numpy(x) for x in maps), torch.full((1, len(LEVELS)), torch.nan))
+    parts = (1 - p, p), (np.ones_like(p), np.ones_like(p)), (inlier, elsewhere)
+    weight, mean, variance = (torch.from_numpy(np.stack(part)[:, None]) for part in parts)
+    distribution = DepthDistribution(weight, mean, variance, torch.full((1, len(LEVELS)), torch.nan))
     z: Floats = distribution.standard(torch.from_numpy(np.exp(error))[None])[0].abs().numpy()
     return z
 

@@ -49,7 +49,7 @@ stream without anchors has UfM*'s output.
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -138,8 +138,8 @@ def update(
     unseen = [one.ratios["unseen"] for one in memories]
     outputs = depth, variance, np.array(calibration), np.array(unseen), outlier, inlier
     scores = tuple(torch.from_numpy(result[6]) for result in results)
-    maps_out = (torch.from_numpy(x).to(device) for x in outputs)
-    return torch.from_numpy(memory).to(device), Posterior(*maps_out, scores=scores)
+    posterior = Posterior(*(torch.from_numpy(x).to(device) for x in outputs))
+    return torch.from_numpy(memory).to(device), replace(posterior, scores=scores)
 
 
 def _anchors(anchors: AnchorInput | None, streams: int) -> list[AnchorRows | None]:
