@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.posterior.conformal import NORMAL
-from ufmstar_torch.posterior.distribution import DepthDistribution
+from ufmstar_torch.posterior.distribution import LEAST_VARIANCE, DepthDistribution
 
 _WITHOUT_EVIDENCE = (
     "an interval needs evidence: UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig()) and images or "
@@ -245,7 +245,8 @@ class UfMStarOutput:
             weight, mean, variance = torch.stack([1 - p, p]), torch.stack([d, d]), torch.stack([V1, elsewhere])
         if self.recalibrated is not None:
             quantiles = torch.where(quantiles.isnan() & self.recalibrated, quantiles.new_tensor(NORMAL), quantiles)
-        return DepthDistribution(torch.where(variance.isfinite(), weight, torch.nan), mean, variance, quantiles)
+        weight = torch.where(variance.isfinite(), weight, torch.nan)
+        return DepthDistribution(weight, mean, variance.clamp_min(LEAST_VARIANCE), quantiles)
 
 
 @dataclass(frozen=True)

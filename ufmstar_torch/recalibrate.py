@@ -113,10 +113,10 @@ class Recalibration(Checked, Extension):
     ) -> FrameExtension:
         """A map of the confidence during a frame. Raises ValueError: the frame has no confidence."""
         if self.covariate == VARIANCE:
-            return _Recalibrated(len(frame.depth))
+            return _Recalibrated(frame)
         if argument is None:
             raise ValueError("the recalibration maps the confidence, but the network predicts none")
-        return _Recalibrated(len(frame.depth), self.factor(as_confidence(argument, frame)))
+        return _Recalibrated(frame, self.factor(as_confidence(argument, frame)))
 
     def require(self, config: UfMStarConfig, network: str = "") -> None:
         """Check that settings and network are those of the fit.
@@ -151,10 +151,10 @@ class Recalibration(Checked, Extension):
 
 
 class _Recalibrated(FrameExtension):
-    """During a frame of B ``streams``, V times a ``factor`` [B, H, W] for a map of the confidence."""
+    """During a frame of B streams, V times a ``factor`` [B, H, W] for a map of the confidence."""
 
-    def __init__(self, streams: int, factor: Tensor | None = None) -> None:
-        self._streams, self._factor = streams, factor
+    def __init__(self, frame: FrameInput, factor: Tensor | None = None) -> None:
+        self._frame, self._factor = frame, factor
 
     def map_variance(self, variance: Tensor, chosen: Chosen) -> Tensor:
         """V' = h(c) V."""
@@ -162,7 +162,8 @@ class _Recalibrated(FrameExtension):
 
     def outputs(self) -> dict[str, Tensor]:
         """Intervals need no other evidence."""
-        return {"recalibrated": torch.ones(self._streams, 1, dtype=torch.bool)}
+        depth = self._frame.depth
+        return {"recalibrated": torch.ones(len(depth), 1, dtype=torch.bool, device=depth.device)}
 
 
 def recalibration_path(weights: str | Path) -> Path:

@@ -19,6 +19,8 @@ from torch.special import ndtr, ndtri
 
 from ufmstar_torch.posterior.conformal import LEVELS, Floats, corrected, uncorrected
 
+# [m^2] of a component: a variance of 0 has no density.
+LEAST_VARIANCE = 1e-12
 # Least distance of F from 0 and 1 [1]: z stays finite in float64.
 _TAIL = 1e-15
 # Steps of the bisection: a bracket of 20 m shrinks to a micrometre.
