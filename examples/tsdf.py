@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ufmstar_torch.eval.run.export import gated_frames, run_settings
+from ufmstar_torch.eval.run.export import gated_frames, run_summary
 from ufmstar_torch.eval.sequences import open_sequence
 
 VOXEL, TRUNCATION = 0.08, 0.4  # [m]; the truncation is about the posterior's mean sigma
@@ -50,7 +50,11 @@ def surface(total, weight, low):
 
 def main(out):
     """Print and return, by weights: mean error [cm] and share of the true surface within 10 cm, best half and all."""
-    frames, sequence, true = list(gated_frames(out, np.inf, np.inf)), open_sequence(run_settings(out)["sequence"]), []
+    frames, sequence, true = (
+        list(gated_frames(out, np.inf, np.inf)),
+        open_sequence(run_summary(out)["settings"]["sequence"]),
+        [],
+    )
     for frame in (sequence[frame.index] for frame in frames):
         v, u = (one[::4] for one in np.nonzero(frame.depth))
         rays = np.linalg.inv(frame.intrinsics) @ np.stack([u, v, np.ones_like(u)])

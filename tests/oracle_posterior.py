@@ -6,6 +6,7 @@ import heapq
 import math
 
 import numpy as np
+import oracle_interval as interval
 
 SIDE, FEATURES = 28, 4
 START = {
@@ -178,8 +179,9 @@ def update(state, depth, claimed, pixel, g, variance):
         unit = ratio(state, name) / np.maximum(part, 1e-12)
         new[name] = (weights * (part + square - total) * unit).sum(), weights.sum()
     z2 = np.minimum(residual**2 / total, CLIP)
-    new |= discs(state, logs, Q, mean0, H, y, weight, noise, z2, node, u, v)
+    new |= discs(state, logs, Q, mean0, H, y, weight, noise, z2, node, u, v, stated - 1 / N, away)
     after = {"frames": state["frames"] + 1, "m0": m0, "b": mean[:4], "C": C[:4, :4], "sums": {}}
+    after["scores"] = new.pop("scores")
     for name, (value, prior, low, high) in START.items():
         above, below = state["sums"][name]
         below = MEMORY * below + (1 - MEMORY) * prior + new[name][1]
@@ -266,7 +268,7 @@ def elsewhere(around, unseen):
     return min(around + 12 * unseen, 2)
 
 
-def discs(state, logs, Q, mean0, H, y, weight, noise, z2, node, u, v):
+def discs(state, logs, Q, mean0, H, y, weight, noise, z2, node, u, v, measured, everywhere):
     held = np.zeros(len(y), bool)
     for k in range(3):
         number = state["frames"] * 3 + k + 1
@@ -293,12 +295,20 @@ def discs(state, logs, Q, mean0, H, y, weight, noise, z2, node, u, v):
     wide = noise + beyond
     p = np.minimum(ratio(state, "wrong") * more_wrong, 0.5)
     final = [second_moment(*each) for each in zip(p, inlier_variance, offset, beyond, strict=True)]
+    scores = []
+    for i in np.nonzero(held)[0]:
+        at_pixel = factor[i] * (var[i] + ratio(state, "roughness") + away[i] * ratio(state, "unseen"))
+        at_pixel = scale[i] * (at_pixel + measured[i] + steepness(logs.shape, mean[FEATURES:])[node[i]])
+        total, alone = (second_moment(q, at_pixel, offset[i], beyond[i] + measured[i]) for q in (p[i], 0.0))
+        mixture = [(1 - p[i], 1.0, alone), (p[i], 1.0, max((total - (1 - p[i]) * alone) / p[i], alone))]
+        scores.append(abs(interval.standard(mixture, math.exp(error[i]))))
     inlier, outlier = (1 - p) * normal(error, inlier_variance), p * normal(error + offset, wide)
     inlier, outlier = inlier / (inlier + outlier), outlier / (inlier + outlier)
     return pairs(state, logs, held, node, error, var, away, noise) | {
         "wrong": ((area * outlier).sum(), (area * more_wrong).sum()),
         "inlier": ((area * inlier * factor * error**2 / inlier_variance).sum(), (area * inlier).sum()),
         "calibration": ((area * error**2 / final).sum(), area.sum()),
+        "scores": (scores, interval.weights(away[held], area[held], everywhere)),
     }
 
 

@@ -62,6 +62,32 @@ def test_depth_is_gated(finished):
     assert (read_depth(out / "export" / "depth" / "9.png") == 0).all()
 
 
+def test_a_gate_states_what_it_keeps_and_warns_where_nothing_supports_sigma(finished, capsys):
+    out, _, _ = finished
+    words = ["export", str(out), "--to", "depth", "--max-sigma", "0.05"]
+    assert cli.main(words) == 0
+    printed = capsys.readouterr().out
+    depths = np.stack([read_frame(file)["depth"] for file in sorted((out / "frames").iterdir())])
+    usable, below = depths > 0, 0.02 * depths <= 0.05
+    below[:, :20] = False  # sigma is 1 m there
+    assert f"keep {below[usable].mean():.1%} of the pixels with a depth" in printed
+    assert "warning: nothing supports this sigma, since the run has neither a posterior" in printed
+    assert cli.main(["export", str(out), "--to", "depth"]) == 0
+    assert "keep" not in capsys.readouterr().out, "no limit"
+    summary = json.loads((out / "summary.json").read_text())
+    for change, warned in (
+        ({"posterior": {"calibration": 1.2}}, ""),
+        ({"recalibrated": True}, ""),
+        ({"posterior": {"calibration": 12.0}}, "since held-out anchors have a mean z^2 of 12 instead of 1"),
+    ):
+        (out / "summary.json").write_text(json.dumps(summary | change))
+        assert cli.main(words) == 0
+        printed = capsys.readouterr().out
+        assert ("warning" in printed) == bool(warned)
+        assert warned in printed
+    (out / "summary.json").write_text(json.dumps(summary))
+
+
 def test_the_trajectory(finished):
     out, _, truth = finished
     assert cli.main(["export", str(out), "--to", "tum"]) == 0

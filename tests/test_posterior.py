@@ -59,6 +59,7 @@ def test_values_against_the_oracle_over_frames():
         np.testing.assert_allclose(out.outlier[0], outlier, rtol=1e-7)
         assert float(out.calibration) == pytest.approx(oracle.ratio(state, "calibration"), rel=1e-7)
         assert float(out.unseen) == pytest.approx(oracle.ratio(state, "unseen"), rel=1e-7)
+        np.testing.assert_allclose(out.scores[0], np.array(state["scores"]), rtol=1e-6)
 
 
 @pytest.mark.parametrize(("rows", "cols"), [(5, 9), (3, 1), (1, 4), (30, 28)])
@@ -136,15 +137,21 @@ def test_a_frame_without_anchors_equals_one_with_invalid_anchors():
     invalid = dataclasses.replace(anchors, valid=torch.zeros_like(anchors.valid))
     (a, first), (b, second) = (update(packed, frame, none, claimed, MODEL) for none in (None, invalid))
     assert torch.equal(a, b)
-    for name, value in vars(first).items():
-        torch.testing.assert_close(value[:2], vars(second)[name][:2], rtol=0, atol=0, equal_nan=True)
+    assert [len(scores[0]) for scores in (*first.scores, *second.scores)] == [0] * 6
+    for name, value in maps_of(first).items():
+        torch.testing.assert_close(value[:2], maps_of(second)[name][:2], rtol=0, atol=0, equal_nan=True)
+
+
+def maps_of(posterior):
+    """Its tensors by name, without the scores."""
+    return {name: value for name, value in vars(posterior).items() if name != "scores"}
 
 
 def test_on_device_meta_the_results_have_shapes():
     frame, anchors, claimed = streams_of((0, 1, 2), torch.float32)
     arguments = torch.zeros(3, SIZE, dtype=torch.float64), frame, anchors, claimed
     (expected, real), (packed, out) = (update(*moved(arguments, device), MODEL) for device in ("cpu", "meta"))
-    for value, same in zip((packed, *vars(out).values()), (expected, *vars(real).values()), strict=True):
+    for value, same in zip((packed, *maps_of(out).values()), (expected, *maps_of(real).values()), strict=True):
         assert value.is_meta
         assert (value.shape, value.dtype) == (same.shape, same.dtype)
 

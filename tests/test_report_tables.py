@@ -80,6 +80,15 @@ def test_a_mixture_has_columns_where_a_row_states_one():
     assert [cell.value for cell in extended.cells.iloc[1][-4:]] == ["0.25", "", "", "99.0"]
 
 
+def test_coverage_has_columns_where_a_row_has_intervals():
+    plain = {(row, ("d", "s")): {"rmse": 0.5} for row in (ALONE, UFM_STAR)}
+    coverage = {"coverage_50": 0.52, "coverage_90": 0.905, "coverage_99": 0.99}
+    extended = extra_table(in_memory(plain | {(UFM_STAR, ("d", "s")): {"rmse": 0.5, **coverage}}))
+    new = [heading for heading in extended.headings if heading not in extra_table(in_memory(plain)).headings]
+    assert new == ["in the 50 % interval [%]", "in the 90 % interval [%]", "in the 99 % interval [%]"]
+    assert [cell.value for cell in extended.cells.iloc[1][-3:]] == ["52.0", "90.5", "99.0"]
+
+
 class TestMainTable:
     def test_fewer_than_five_sequences_have_no_interval(self, results):
         assert main_table(results, "7-scenes").notes[1] == "One sequence: no confidence intervals."

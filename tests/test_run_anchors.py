@@ -219,6 +219,12 @@ def test_a_run_with_a_posterior_corrects_the_depth_and_goes_on_after_a_stop(tour
     assert second.endswith(f" {summary['ufm']['mean_sigma']:.3g}")
     assert "times that of tracked corners" in run_table(summary)
     assert "the posterior corrects it" in run_table(summary)
+    covered = [corrected[f"coverage_{level}"] for level in (50, 90, 99)]
+    assert 0 < covered[0] < covered[1] <= covered[2] <= 1
+    text = ", ".join(f"{share:.0%}" for share in covered)
+    assert f"intervals of 50, 90 and 99 % hold {text}" in run_table(summary)
+    assert "coverage_90" not in before
+    assert len(summary["posterior"]["quantiles"]) == 3
     for name in tour.names:
         one, other = (read_frame(out / "frames" / f"{name}.npz") for out in (whole, parts))
         for key in ("depth", "variance", "posterior_inlier_variance", "posterior_outlier"):

@@ -4,9 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+import torch
 from torch import Tensor
 
 from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.posterior.conformal import NORMAL
+from ufmstar_torch.posterior.distribution import LEAST_VARIANCE, DepthDistribution
+
+_WITHOUT_EVIDENCE = (
+    "an interval needs evidence: UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig()) and images or "
+    "anchors, or a Recalibration; without one, nothing shows how large the errors are"
+)
+_NO_ANCHORS_YET = (
+    "an interval needs evidence, and too few anchors were held out so far: quantiles is NaN. Move the camera, or use a "
+    "Recalibration until then"
+)
 
 
 @dataclass(frozen=True, repr=False)
@@ -117,6 +129,9 @@ class UfMStarOutput:
             before any anchor; None unless ``config.posterior``.
         posterior_inlier_variance: V_1 [m^2], the variance if it lies on their surface. ``posterior_variance`` V is that
             of the mixture: on another surface, the variance is (V - (1 - p) V_1)/p.
+        quantiles: [B, 3] half-widths of the central intervals of 50, 90 and 99 %, in standard deviations of a normal
+            distribution (``posterior.conformal``). NaN in a stream without evidence; None unless ``config.posterior``.
+        recalibrated: [B, 1] True if a ``Recalibration`` has mapped ``variance``, or None.
         features: regressed further entries of H, [B, H, W, F], in the caller's units.
         measured: share in [0, 1] of M that rests on surfaces seen from two or more views; below one half the pixel
             counts as not measured (``config.unmeasured``). NaN where not valid.
@@ -141,6 +156,8 @@ class UfMStarOutput:
     posterior_variance: Tensor | None = None
     posterior_outlier: Tensor | None = None
     posterior_inlier_variance: Tensor | None = None
+    quantiles: Tensor | None = None
+    recalibrated: Tensor | None = None
 
     def __repr__(self) -> str:
         """Shape, median standard deviation and counts in one line."""
@@ -164,6 +181,74 @@ class UfMStarOutput:
         if self.posterior_depth is None or self.posterior_variance is None:
             raise ValueError("posterior needs UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())")
         return self.posterior_depth, self.posterior_variance
+
+    def interval(self, level: float) -> tuple[Tensor, Tensor]:
+        """Central interval that holds the true depth with probability ``level``: lower and upper end [m], in the shape
+        of ``depth``; NaN where not valid, and in a stream without evidence.
+
+        The interval is that of the posterior's mixture, widened or narrowed so that it holds the held-out anchors
+        (``posterior.conformal``). With a ``Recalibration`` and without a posterior, it is that of N(depth, variance).
+
+        Raises:
+            ValueError: ``level`` is not within (0, 1); or no stream has evidence: neither a posterior with held-out
+                anchors, nor a ``Recalibration``.
+        """
+        if not 0 < level < 1:
+            raise ValueError(f"level must lie within (0, 1), got {level!r}")
+        lower, upper = self.distribution().interval(level)
+        return lower.to(self.depth.dtype), upper.to(self.depth.dtype)
+
+    def probability_nearer(self, than: float | Tensor) -> Tensor:
+        """Probability that the depth is below ``than`` [m], in the shape of ``depth``; from the distribution of
+        :meth:`interval`.
+
+        Args:
+            than: a depth, or a map that broadcasts with ``depth``.
+
+        Raises:
+            ValueError: as :meth:`interval`, without its ``level``.
+        """
+        bound = torch.as_tensor(than, dtype=torch.float64, device=self.depth.device).expand(self.depth.shape)
+        return self.distribution().below(bound).to(self.depth.dtype)
+
+    def probability_between(self, near: float | Tensor, far: float | Tensor) -> Tensor:
+        """Probability that the depth lies between ``near`` and ``far`` [m]; otherwise as :meth:`probability_nearer`.
+
+        Raises:
+            ValueError: as :meth:`probability_nearer`; or ``near`` is beyond ``far``.
+        """
+        near, far = (torch.as_tensor(x, dtype=torch.float64, device=self.depth.device) for x in (near, far))
+        if bool((near > far).any()):
+            raise ValueError("near must be at most far, got a larger one")
+        return self.probability_nearer(far) - self.probability_nearer(near)
+
+    @property
+    def has_intervals(self) -> bool:
+        """True if :meth:`interval` and the probabilities have evidence in at least one stream."""
+        return self.recalibrated is not None or (self.quantiles is not None and bool(self.quantiles.isfinite().any()))
+
+    def distribution(self) -> DepthDistribution:
+        """The distribution of the depth at every pixel, of which the intervals and probabilities are.
+
+        Raises:
+            ValueError: no stream has evidence, as :meth:`interval`.
+        """
+        if not self.has_intervals:
+            raise ValueError(_WITHOUT_EVIDENCE if self.quantiles is None else _NO_ANCHORS_YET)
+        V1, p = self.posterior_inlier_variance, self.posterior_outlier
+        streams = 1 if self.depth.dim() < 3 else len(self.depth)
+        quantiles = self.variance.new_full((streams, 3), torch.nan) if self.quantiles is None else self.quantiles
+        if V1 is None or p is None:
+            mean, variance, weight = self.depth[None], self.variance[None], torch.ones_like(self.depth)[None]
+        else:
+            d, V = self.posterior()
+            p = torch.where(p.isnan() & V.isfinite(), 0.0, p)  # before any anchor
+            elsewhere = torch.maximum((V - (1 - p) * V1) / p.clamp_min(1e-12), V1)
+            weight, mean, variance = torch.stack([1 - p, p]), torch.stack([d, d]), torch.stack([V1, elsewhere])
+        if self.recalibrated is not None:
+            quantiles = torch.where(quantiles.isnan() & self.recalibrated, quantiles.new_tensor(NORMAL), quantiles)
+        weight = torch.where(variance.isfinite(), weight, torch.nan)
+        return DepthDistribution(weight, mean, variance.clamp_min(LEAST_VARIANCE), quantiles)
 
 
 @dataclass(frozen=True)

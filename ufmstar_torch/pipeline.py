@@ -85,6 +85,18 @@ class UncertainPrediction:
         """[B, H, W] M [m^2]."""
         return self.ufm.disagreement
 
+    def interval(self, level: float) -> tuple[Tensor, Tensor]:
+        """As :meth:`UfMStarOutput.interval`, [B, H, W] [m]."""
+        return self.ufm.interval(level)
+
+    def probability_nearer(self, than: float | Tensor) -> Tensor:
+        """As :meth:`UfMStarOutput.probability_nearer`, [B, H, W]."""
+        return self.ufm.probability_nearer(than)
+
+    def probability_between(self, near: float | Tensor, far: float | Tensor) -> Tensor:
+        """As :meth:`UfMStarOutput.probability_between`, [B, H, W]."""
+        return self.ufm.probability_between(near, far)
+
 
 @dataclass(frozen=True)
 class _Predicted:

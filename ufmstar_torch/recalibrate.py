@@ -113,10 +113,10 @@ class Recalibration(Checked, Extension):
     ) -> FrameExtension:
         """A map of the confidence during a frame. Raises ValueError: the frame has no confidence."""
         if self.covariate == VARIANCE:
-            return FrameExtension()
+            return _Recalibrated(frame)
         if argument is None:
             raise ValueError("the recalibration maps the confidence, but the network predicts none")
-        return _Scaled(self.factor(as_confidence(argument, frame)))
+        return _Recalibrated(frame, self.factor(as_confidence(argument, frame)))
 
     def require(self, config: UfMStarConfig, network: str = "") -> None:
         """Check that settings and network are those of the fit.
@@ -150,15 +150,20 @@ class Recalibration(Checked, Extension):
         return ((v[0], 2 * v[0]), (r[0], 2 * r[0])) if self.covariate == VARIANCE else ((v[0], v[0] + 1), (r[0], r[0]))
 
 
-class _Scaled(FrameExtension):
-    """V times a factor [B, H, W] during a frame."""
+class _Recalibrated(FrameExtension):
+    """During a frame of B streams, V times a ``factor`` [B, H, W] for a map of the confidence."""
 
-    def __init__(self, factor: Tensor) -> None:
-        self._factor = factor
+    def __init__(self, frame: FrameInput, factor: Tensor | None = None) -> None:
+        self._frame, self._factor = frame, factor
 
     def map_variance(self, variance: Tensor, chosen: Chosen) -> Tensor:
         """V' = h(c) V."""
-        return variance * chosen(self._factor).to(variance.dtype)
+        return variance if self._factor is None else variance * chosen(self._factor).to(variance.dtype)
+
+    def outputs(self) -> dict[str, Tensor]:
+        """Intervals need no other evidence."""
+        depth = self._frame.depth
+        return {"recalibrated": torch.ones(len(depth), 1, dtype=torch.bool, device=depth.device)}
 
 
 def recalibration_path(weights: str | Path) -> Path:

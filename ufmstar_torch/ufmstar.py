@@ -128,8 +128,8 @@ class UfMStar(StatefulModule):
         out, maps = self._observe(frame, inputs)
         originals: dict[str, Any] = {"epistemic": e} if self.config.aleatoric_in_h else {"aleatoric": a, "epistemic": e}
 
-        def shaped(value: Tensor) -> Tensor:
-            return value if value.shape == depth.shape else value.reshape(depth.shape)
+        def shaped(value: Tensor) -> Tensor:  # no map: [B, n]
+            return value if value.shape == depth.shape or value.dim() == 2 else value.reshape(depth.shape)
 
         maps = {name: None if value is None else shaped(value) for name, value in maps.items()}
         return UfMStarOutput(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from ufmstar_torch.eval.commands.options import option, positional, reader, usage_errors
+from ufmstar_torch.eval.report.text import supported
 from ufmstar_torch.eval.run import export
 from ufmstar_torch.eval.run.export_bag import export_bag
 from ufmstar_torch.eval.run.rerun_log import export_rerun
@@ -24,7 +26,8 @@ _EXPORTERS: dict[str, Callable[..., str]] = {
 class ExportOptions:
     """A run's result for other programs, in OUT/export.
 
-    Depth and sigma are the posterior's, where the run has one. Pixels beyond a limit are left out. The images come from
+    Depth and sigma are the posterior's, where the run has one. Pixels beyond a limit are left out; the share of the
+    others is printed, with a warning if no held-out anchors and no recalibration support sigma. The images come from
     the recording that --sequence names, opened with the same options as for `ufmstar run`.
 
     Attributes:
@@ -62,11 +65,27 @@ def main(options: ExportOptions) -> int:
     """Export, and print what was written; the exit code."""
     out, to = options.out, options.to
     with usage_errors(FileNotFoundError, ValueError):
-        frames = export.gated_frames(out, options.max_sigma, options.max_relative_sigma)
+        counts = export.GateCount()
+        frames = counts.of(export.gated_frames(out, options.max_sigma, options.max_relative_sigma))
         if to not in ("depth", "tum") and options.sequence is not None:
             frames = export.with_images(frames, open_sequence(options.sequence, **options.opening.changed()))
         elif to not in ("depth", "tum"):
             print("no colours: --sequence SEQUENCE names the recording with the images")
         how = {"voxel": options.voxel} if to == "cloud" else {}
         print(_EXPORTERS[to](frames, out, **how))
+        if min(options.max_sigma, options.max_relative_sigma) < math.inf and to != "tum":
+            print(f"the limits of sigma keep {counts.share:.1%} of the pixels with a depth")
+            if reason := _unsupported(export.run_summary(out)):
+                remedy = "`ufmstar run` without --plain makes a sigma that anchors test (docs/thresholds.md)"
+                print(f"warning: nothing supports this sigma, {reason}: the pixels that are left may be bad; {remedy}")
     return 0
+
+
+def _unsupported(summary: Mapping[str, Any]) -> str:
+    """Why nothing supports the sigma of a run; "" if held-out anchors or a recalibration do."""
+    if supported(summary) if "posterior" in summary else summary.get("recalibrated"):
+        return ""
+    calibration = (summary.get("posterior") or {}).get("calibration")
+    if calibration is not None:
+        return f"since held-out anchors have a mean z^2 of {calibration:.2g} instead of 1"
+    return "since the run has neither a posterior with held-out anchors nor a recalibration"

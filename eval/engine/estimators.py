@@ -173,6 +173,7 @@ class Gaussians(Estimator):
         anchors_used = out.statistics.anchors_used
         self._anchors = 0 if anchors_used is None else int(anchors_used[0])
         answer = {name: getattr(out, name) for name in _OF_OUTPUT} | {"confidence": used.confidence}
+        answer["distribution"] = out.distribution() if out.has_intervals else None
         if self._posterior:
             answer["depth"], answer["variance"] = out.posterior()
         return answer

@@ -81,11 +81,13 @@ class RunMetrics(FrameSink):
         maps |= {} if row.network_variance is None else {ALONE: (row.depth, row.network_variance)}
         if row.posterior_depth is not None:
             maps[POSTERIOR] = row.posterior_depth, row.posterior_variance
+        corrected = POSTERIOR if POSTERIOR in maps else UFM
         for name, (depth, variance) in maps.items():
-            mixture = row.mixture if name == POSTERIOR else None
+            mixture, level = row.mixture if name == POSTERIOR else None, row.level if name == corrected else None
             masks = {name: row.valid, **{f"{name}.{part}": row.valid & mask for part, mask in row.parts.items()}}
             for key, valid in masks.items():
-                metrics_of(self._metrics, key, plugins=self._plugins).update(depth, variance, target, valid, mixture)
+                metrics = metrics_of(self._metrics, key, plugins=self._plugins)
+                metrics.update(depth, variance, target, valid, mixture, level)
 
 
 @dataclass(frozen=True)
@@ -146,9 +148,10 @@ class RowJudge(FrameSink):
         )  # fmt: skip
         how = {"with_variance": variance is not None, "bins": self._bins, "plugins": self._plugins}
         mixture = result.mixture if self.row.setting.posterior else None
-        metrics_of(self._metrics, METRICS, **how).update(depth, variance, target, mixture=mixture)
+        level = None if variance is None else result.level
+        metrics_of(self._metrics, METRICS, **how).update(depth, variance, target, mixture=mixture, level=level)
         for part, mask in result.parts.items():
-            metrics_of(self._metrics, part, **how).update(depth, variance, target, mask, mixture)
+            metrics_of(self._metrics, part, **how).update(depth, variance, target, mask, mixture, level)
         if variance is None:
             return
         if result.confidence is not None:

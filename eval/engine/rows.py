@@ -22,6 +22,7 @@ from ufmstar_torch.eval.sequences.frame import Frame, FrameError
 from ufmstar_torch.eval.sequences.ground_truth import moving_at
 from ufmstar_torch.frame import FRAME_FAULTS
 from ufmstar_torch.output import FrameStatistics
+from ufmstar_torch.posterior.distribution import DepthDistribution
 from ufmstar_torch.prediction import DepthPrediction
 
 # Prefixes of the tensors of a row's state.
@@ -46,6 +47,7 @@ class RowResult:
     posterior_variance: Tensor | None = None  # likewise [m^2]
     posterior_inlier_variance: Tensor | None = None  # variance of pixels on the surface of their evidence [m^2]
     posterior_outlier: Tensor | None = None  # probability that a pixel is not on that surface
+    distribution: DepthDistribution | None = None  # [1, h, w] of the depth, on its device; None = no evidence
     statistics: FrameStatistics | None = None  # of UfM*, [1] per count, or None
     confidence: Tensor | None = None  # of the prediction, in the network's unit, if UfM* used it; or None
     network_variance: Tensor | None  # A + E of the prediction, even if the row ignores them [m^2]; None without both
@@ -79,6 +81,16 @@ class RowResult:
             return {}
         moving = torch.from_numpy(self.moving)
         return {"moving": moving, "still": ~moving}
+
+    @property
+    def level(self) -> Tensor | None:
+        """[h, w] level of the smallest central interval with the ground truth in it, NaN without one; None without
+        ground truth or intervals."""
+        if self.truth is None or self.distribution is None:
+            return None
+        truth = torch.from_numpy(self.truth)[None].to(self.distribution.mean.device)
+        level = self.distribution.central_level(truth.double())[0].cpu()
+        return torch.where(torch.from_numpy(self.truth > 0), level, torch.nan)
 
     @property
     def size(self) -> tuple[int, int]:

@@ -30,6 +30,7 @@ class Pixels:
     use: NDArray[np.bool_]  # [P] True = use
     inlier: Array  # [P] variance of a mixture's inliers [m^2]; [0] without a mixture
     outlier: Array  # [P] probability of an outlier; [0] without a mixture
+    level: Array  # [P] of the smallest central interval with the ground truth in it, NaN = none; [0] without intervals
 
     @cached_property
     def with_truth(self) -> NDArray[np.bool_]:
@@ -124,7 +125,7 @@ class SumMetric(Metric):
 
 def flat_pixels(
     depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None,
-    mixture: tuple[Tensor, Tensor] | None = None,
+    mixture: tuple[Tensor, Tensor] | None = None, level: Tensor | None = None,
 ) -> Pixels:  # fmt: skip
     """All pixels of maps of one shape [...], in float64.
 
@@ -134,13 +135,14 @@ def flat_pixels(
         target: ground truth [m]; NaN, infinite or <= 0 means there is none.
         valid: bool, True = use; None = everywhere.
         mixture: variance of the inliers [m^2] and probability of an outlier; None = no mixture.
+        level: of the smallest central interval with the ground truth in it; None = no intervals.
 
     Raises:
         ValueError: an argument has another shape than ``depth`` or the wrong type.
     """
     inlier, outlier = mixture or (None, None)
     maps = {"depth": depth, "variance": variance, "target": target, "valid": valid}
-    for name, value in (maps | {"inlier": inlier, "outlier": outlier}).items():
+    for name, value in (maps | {"inlier": inlier, "outlier": outlier, "level": level}).items():
         if value is None:
             continue
         if value.shape != depth.shape:
@@ -154,7 +156,7 @@ def flat_pixels(
         return np.zeros(0) if value is None else value.detach().to("cpu", torch.float64).flatten().numpy()
 
     use = np.ones(depth.numel(), np.bool_) if valid is None else valid.cpu().flatten().numpy()
-    return Pixels(flat(depth), flat(variance), flat(target), use, flat(inlier), flat(outlier))
+    return Pixels(flat(depth), flat(variance), flat(target), use, flat(inlier), flat(outlier), flat(level))
 
 
 def share(part: Tensor, whole: Tensor) -> Tensor:

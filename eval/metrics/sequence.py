@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from ufmstar_torch.eval.metrics.accuracy import RMSE, AbsRel, Delta1
 from ufmstar_torch.eval.metrics.base import SumMetric, flat_pixels
 from ufmstar_torch.eval.metrics.calibration import ECEDelta, ECEQuantile
+from ufmstar_torch.eval.metrics.intervals import GatedPixels, IntervalCoverage
 from ufmstar_torch.eval.metrics.likelihood import NLL, EntropyHistogram
 from ufmstar_torch.eval.metrics.mixture import Mixture
 from ufmstar_torch.eval.metrics.ranking import Sparsification, SpearmanCorrelation
@@ -26,7 +27,7 @@ _AUTHORS: dict[type[SumMetric], dict[str, Any]] = {ECEDelta: {"bins": 100}, ECEQ
 class SequenceMetrics(nn.Module):
     """delta1, AbsRel, RMSE and, with a variance, NLL, ECE_delta, ECE_q, entropy, AUSE, AURG, Spearman of one sequence.
 
-    Memory is 2.4 MB for any number of frames. ``state_dict`` saves the sums; ``merge_state`` adds those of another part
+    Memory is 2.6 MB for any number of frames. ``state_dict`` saves the sums; ``merge_state`` adds those of another part
     of the sequence.
 
     Args:
@@ -50,6 +51,7 @@ class SequenceMetrics(nn.Module):
         kinds: list[type[SumMetric]] = [Delta1, AbsRel, RMSE]
         if with_variance:
             kinds += [NLL, ECEDelta, ECEQuantile, EntropyHistogram, Sparsification, SpearmanCorrelation, Mixture]
+            kinds += [IntervalCoverage, GatedPixels]
         finer = _AUTHORS if bins == AUTHORS else {}
         made = {kind.__name__: kind(**finer.get(kind, {}), sync_on_compute=False) for kind in kinds}
         usable = {name: kind for name, kind in plugins.items() if with_variance or not kind.OF_VARIANCE}
@@ -58,7 +60,7 @@ class SequenceMetrics(nn.Module):
 
     def update(
         self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None,
-        mixture: tuple[Tensor, Tensor] | None = None,
+        mixture: tuple[Tensor, Tensor] | None = None, level: Tensor | None = None,
     ) -> None:  # fmt: skip
         """Add one or more frames.
 
@@ -68,13 +70,14 @@ class SequenceMetrics(nn.Module):
             target: [...] ground truth [m]; NaN or <= 0 means there is none.
             valid: [...] bool, True = use.
             mixture: of a posterior (``Mixture``), the inliers' variance and the probability of an outlier, [...] each.
+            level: [...] of the smallest central interval with the ground truth in it (``IntervalCoverage``), or NaN.
 
         All figures except the entropy use the pixels with ground truth.
 
         Raises:
             ValueError: shapes or types disagree, or a needed variance is missing.
         """
-        pixels = flat_pixels(depth, variance, target, valid, mixture)
+        pixels = flat_pixels(depth, variance, target, valid, mixture, level)
         for metric in self._all():
             metric.add(pixels)
 

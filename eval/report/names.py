@@ -71,6 +71,12 @@ MIXTURE = (
     Quantity("mixture_ece_q", "mixture: ECE_q", 3, LOWER),
     Quantity("mixture_coverage", "mixture: within 3 σ", 1, "", "%", 100.0),
 )
+# Share of the pixels with ground truth in central intervals; in the table if a row has intervals.
+INTERVALS = (
+    Quantity("coverage_50", "in the 50 % interval", 1, "", "%", 100.0),
+    Quantity("coverage_90", "in the 90 % interval", 1, "", "%", 100.0),
+    Quantity("coverage_99", "in the 99 % interval", 1, "", "%", 100.0),
+)
 OWN = "own."  # prefix of the figures of a user's metrics
 # Figures with a table of differences between rows.
 DIFFERENCES = (NLL, ECE_DELTA, ECE_Q, AUSE, SPEARMAN)

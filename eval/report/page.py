@@ -24,7 +24,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 # Quality of WebP; below it, text in pictures has visible rings.
 QUALITY = 84
 # Kinds of figures (the first words of their files' names) in each section of the page.
-CURVES, COST = ("calibration", "error", "entropy", "sweep"), ("latency",)
+CURVES, COST = ("calibration", "intervals", "gates", "error", "entropy", "sweep"), ("latency",)
 
 
 def write_page(

@@ -24,6 +24,7 @@ from ufmstar_torch.eval.report.names import (
     DIFFERENCES,
     ENERGY,
     EXTRA,
+    INTERVALS,
     MAIN,
     MEMORY,
     MIXTURE,
@@ -69,8 +70,9 @@ def main_table(results: Results, dataset: str | None = None) -> Table:
 def extra_table(results: Results, dataset: str | None = None) -> Table:
     """Figures beyond the paper's tables: errors in metres, ranking, pixels without a figure, times."""
     records = _records(results, dataset)
-    mixture = MIXTURE if any(MIXTURE[0].key in record.figures for record in results.records) else ()
-    columns, notes = _means(records, (*EXTRA, *mixture)), _notes(results, records)
+    figures = {name for record in results.records for name in record.figures}
+    optional = [q for group in (MIXTURE, INTERVALS) if group[0].key in figures for q in group]
+    columns, notes = _means(records, (*EXTRA, *optional)), _notes(results, records)
     return _table("extra", f"{results.title}, {_where(results, dataset)}", records, columns, notes)
 
 

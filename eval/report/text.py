@@ -112,10 +112,14 @@ def _metric_lines(summary: Mapping[str, Any]) -> list[str]:
         rows = [(ufm, metrics, uncertainty["mean_sigma"])]
     if alone is not None:
         rows.append(("network alone", alone, uncertainty["mean_network_sigma"]))
+    shown = next((figures for _, figures, _ in rows if (figures or {}).get("coverage_90") is not None), None)
     body = [[name, *(number(figures.get(key)) for key in _RUN_COLUMNS), number(sigma)] for name, figures, sigma in rows]
     lines = aligned([["", *_RUN_COLUMNS.values(), "sigma [m]"], *body])
     if alone is None:
         lines.append(f"network alone: no row, {summary['network_alone_reason']}")
+    if shown is not None:
+        found = ", ".join(f"{shown[f'coverage_{level}']:.0%}" for level in (50, 90, 99))
+        lines.append(f"intervals of 50, 90 and 99 % hold {found} of the pixels with truth")
     if (metrics["nll"] or 0) > NLL_OF_FEW:
         lines.append(
             f"NLL: dominated by the {uncertainty['near_zero_share']:.2%} of the pixels with a sigma between "

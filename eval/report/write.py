@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ufmstar_torch.eval.report import figures_cost, figures_curves, figures_sweep
+from ufmstar_torch.eval.report import figures_cost, figures_curves, figures_gates, figures_sweep
 from ufmstar_torch.eval.report.data import Results, load_results
 from ufmstar_torch.eval.report.page import write_page
 from ufmstar_torch.eval.report.pictures import Picture, pictures_of
@@ -61,6 +61,8 @@ def figures_of(results: Results) -> Iterator[tuple[str, Callable[[], Any]]]:
         for base in results.bases:
             name = f"calibration sequences {dataset} {base}"
             yield name, partial(figures_curves.draw_sequence_calibration, results, dataset, base)
+        yield f"intervals {dataset}", partial(figures_gates.draw_intervals, results, dataset)
+        yield f"gates {dataset}", partial(figures_gates.draw_gates, results, dataset)
         yield f"error {dataset}", partial(figures_curves.draw_error, results, dataset)
     for base in results.bases:
         yield f"entropy {base}", partial(figures_curves.draw_entropy, results, base)

@@ -46,6 +46,7 @@ class RunFrame:
     figures: Mapping[str, Any] = field(default_factory=dict)  # by name, as in frames.jsonl
     image: NDArray[np.uint8] | None = None  # [H, W, 3] RGB of the recording
     image_intrinsics: NDArray[np.float64] | None = None  # [3, 3] of the image [px]
+    left_out: int = 0  # number of pixels with a depth that exceed a limit of sigma
 
     def at_image(self) -> RunFrame:
         """The frame with maps at the pixels of its image, NaN outside the maps; unchanged without an image."""
@@ -79,10 +80,35 @@ def _gated(out: Path, record: Mapping[str, Any], max_sigma: float, max_relative_
     depth, variance = maps["depth"], maps["variance"]
     with np.errstate(invalid="ignore"):
         sigma = np.sqrt(variance)
-        mask = maps["valid"] & (depth > 0) & np.isfinite(depth)
-        mask &= (sigma <= max_sigma) & (sigma <= max_relative_sigma * depth)
+        has_depth = maps["valid"] & (depth > 0) & np.isfinite(depth)
+        mask = has_depth & (sigma <= max_sigma) & (sigma <= max_relative_sigma * depth)
+    left_out = int(np.count_nonzero(has_depth & ~mask))
     about = (record["name"], record["index"], record.get("timestamp"), maps["T_world_cam"], maps["intrinsics"])
-    return RunFrame(*about, known_where(mask, depth), known_where(mask, sigma), maps.get("anchors"), record)
+    shown = known_where(mask, depth), known_where(mask, sigma)
+    return RunFrame(*about, *shown, maps.get("anchors"), record, left_out=left_out)
+
+
+class GateCount:
+    """Counts the pixels of the frames that pass through :meth:`of`.
+
+    Attributes:
+        used, left_out: number of pixels with a depth, within and beyond the limits of sigma.
+    """
+
+    def __init__(self) -> None:
+        self.used = self.left_out = 0
+
+    def of(self, frames: Iterator[RunFrame]) -> Iterator[RunFrame]:
+        """The frames, unchanged."""
+        for frame in frames:
+            self.used += int(np.count_nonzero(np.isfinite(frame.depth)))
+            self.left_out += frame.left_out
+            yield frame
+
+    @property
+    def share(self) -> float:
+        """Share of the pixels with a depth that are within the limits; NaN without one."""
+        return self.used / total if (total := self.used + self.left_out) else float("nan")
 
 
 def with_images(frames: Iterator[RunFrame], sequence: FrameSequence) -> Iterator[RunFrame]:
@@ -203,6 +229,14 @@ def export_transforms(frames: Iterator[RunFrame], out: Path) -> str:
     }
     write_json_atomic(folder / "transforms.json", plain)
     return f"{folder / 'transforms.json'}: {len(listed)} frames"
+
+
+def run_summary(out: Path) -> dict[str, Any]:
+    """The summary of a run. Raises ValueError: it cannot be read."""
+    try:
+        return dict(json.loads((out / "summary.json").read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        raise ValueError(f"{out}/summary.json is not that of a run: {error}") from error
 
 
 def points_of(u: NDArray[Any], v: NDArray[Any], depth: NDArray[Any], K: NDArray[np.float64]) -> NDArray[np.float64]:

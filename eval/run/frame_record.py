@@ -114,8 +114,8 @@ def _anchor_figures(row: RowResult) -> dict[str, Any]:
 
 
 def _posterior_figures(row: RowResult) -> dict[str, Any]:
-    """Figures of held-out anchors (``FrameStatistics``), and the mean of sqrt(V) of UfM* [m], which ``mean_sigma`` is
-    not; {} without a posterior."""
+    """Figures of held-out anchors (``FrameStatistics``), the quantiles of intervals (``UfMStarOutput``), and the mean of
+    sqrt(V) of UfM* [m], which ``mean_sigma`` is not; {} without a posterior."""
     variance, statistics = row.variance, row.statistics
     if variance is None or statistics is None or statistics.calibration is None or statistics.unseen is None:
         return {}
@@ -123,6 +123,7 @@ def _posterior_figures(row: RowResult) -> dict[str, Any]:
     figures = {
         "calibration": calibration if math.isfinite(calibration) else None,
         "unseen": float(statistics.unseen[0]),
+        "quantiles": None if row.distribution is None else row.distribution.quantiles[0].tolist(),
     }
     return {"posterior": figures, "mean_ufm_sigma": _mean(variance.sqrt(), row.valid)}
 

@@ -60,6 +60,7 @@ def write_summary(
         **_posterior(done, figures.get(UFM)),
         **_parts(figures),
         "uncertainty": _uncertainty(done),
+        "recalibrated": job.recalibration is not None,
         "anchors": _anchors(done),
         "mixture": _mixture(done, job.ufm(checkpoint).mixture),
         "time": _time(done, checkpoint.sessions),

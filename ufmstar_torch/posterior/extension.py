@@ -15,6 +15,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Extension, FrameExtension, Tensors, Total
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.output import StepOutput
+from ufmstar_torch.posterior import conformal
 from ufmstar_torch.posterior.running import SIZE, require, restarted
 from ufmstar_torch.state import UfMStarState
 
@@ -33,6 +34,7 @@ class PosteriorFrame(FrameExtension):
     def __init__(self, anchor_frame: AnchorFrame, config: UfMStarConfig) -> None:
         self._anchors, self._config = anchor_frame, config
         self._posterior: Posterior | None = None
+        self._intervals = torch.zeros(0, conformal.SIZE)
 
     def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
         """Learn from the frame's anchors, and correct the depth (on the CPU, :mod:`ufmstar_torch.posterior.update`)."""
@@ -53,16 +55,20 @@ class PosteriorFrame(FrameExtension):
         floor = self._config.variance_floor
         variance, inlier = (v.clamp_min(floor) + added for v in (posterior.variance, posterior.inlier))
         self._posterior = replace(posterior, variance=variance, inlier=inlier)
+        self._intervals = conformal.after_frame(state.by_stream["intervals"], posterior.scores)
         statistics = replace(out.statistics, calibration=posterior.calibration, unseen=posterior.unseen)
-        return state.with_tensors({"posterior": learnt}), replace(out, statistics=statistics)
+        tensors = {"posterior": learnt, "intervals": self._intervals}
+        return state.with_tensors(tensors), replace(out, statistics=statistics)
 
     def outputs(self) -> dict[str, Tensor]:
-        """Corrected depth, its variance, the probability of another surface, and the variance without that case."""
+        """Corrected depth, its variance, the probability of another surface, the variance without that case, and the
+        quantiles of intervals [B, 3]."""
         assert self._posterior is not None
         p = self._posterior
         return {
             "posterior_depth": p.depth, "posterior_variance": p.variance,
             "posterior_outlier": p.outlier, "posterior_inlier_variance": p.inlier,
+            "quantiles": conformal.quantiles(self._intervals),
         }  # fmt: skip
 
 
@@ -81,18 +87,21 @@ class PosteriorExtension(Extension):
         config: with ``posterior`` and ``anchors``.
     """
 
-    always_float64: ClassVar[tuple[str, ...]] = ("posterior",)
+    always_float64: ClassVar[tuple[str, ...]] = ("posterior", "intervals")
 
     def __init__(self, config: UfMStarConfig) -> None:
         self._config = config
 
     def by_stream(self, streams: int, dtype: torch.dtype, device: torch.device | str) -> dict[str, Tensor]:
-        """``posterior`` [B, S] float64, the memory of each stream (``posterior.running``)."""
-        return {"posterior": torch.zeros(streams, SIZE, dtype=torch.float64, device=device)}
+        """float64: ``posterior`` [B, S], the memory of each stream (``posterior.running``), and ``intervals`` [B, 4]
+        (``posterior.conformal``)."""
+        sizes = {"posterior": SIZE, "intervals": conformal.SIZE}
+        return {n: torch.zeros(streams, size, dtype=torch.float64, device=device) for n, size in sizes.items()}
 
     def require_state(self, state: Tensors) -> None:
         """See :meth:`Extension.require_state`."""
         require(state["posterior"])
+        conformal.require(state["intervals"])
 
     def of_frame(
         self,

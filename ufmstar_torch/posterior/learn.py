@@ -12,6 +12,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.posterior.conformal import image_weights
+from ufmstar_torch.posterior.distribution import score
 from ufmstar_torch.posterior.field import Field, at, conditioned
 from ufmstar_torch.posterior.running import Floats, Running
 from ufmstar_torch.posterior.scene import (
@@ -37,11 +39,15 @@ LEAST_REST = 5
 STEPS = (0.7548776662466927, 0.5698402909980532)
 
 
-def learnt(scene: Scene, field: Field, weight: Floats, left_out: LeftOut, running: Running) -> Floats:
-    """The packed memory after the frame."""
-    above, below = running.added(_of_neighbours(scene, left_out, running) | _of_discs(scene, weight, left_out, running))
+def learnt(
+    scene: Scene, field: Field, weight: Floats, left_out: LeftOut, running: Running, away: Floats
+) -> tuple[Floats, Floats]:  # fmt: skip
+    """The packed memory after the frame; and [2, M] scores of held-out anchors with their weights (``conformal``).
+    ``away`` [R C]: distance of every node from evidence."""
+    sums, scores = _of_discs(scene, weight, left_out, running, away)
+    above, below = running.added(_of_neighbours(scene, left_out, running) | sums)
     first = [running.frames + 1, scene.grid.mean]
-    return np.concatenate([first, above, below, field.coefficients, field.covariance.ravel()])
+    return np.concatenate([first, above, below, field.coefficients, field.covariance.ravel()]), scores
 
 
 def _of_neighbours(scene: Scene, left_out: LeftOut, running: Running) -> dict[str, tuple[float, float]]:
@@ -59,9 +65,9 @@ def _of_neighbours(scene: Scene, left_out: LeftOut, running: Running) -> dict[st
 
 
 def _of_discs(
-    scene: Scene, weight: Floats, left_out: LeftOut, running: Running
-) -> dict[str, tuple[float, float]]:  # fmt: skip
-    """Sums for the other ratios, from anchors in held-out discs."""
+    scene: Scene, weight: Floats, left_out: LeftOut, running: Running, everywhere: Floats
+) -> tuple[dict[str, tuple[float, float]], Floats]:
+    """Sums for the other ratios, from anchors in held-out discs, and these anchors' scores with weights."""
     held_out, config = _discs(scene, running.frames), scene.config
     rest = ~held_out
     held_out = held_out & (np.count_nonzero(rest) >= LEAST_REST)
@@ -89,7 +95,12 @@ def _of_discs(
         "calibration": (area * error**2 / stated, area),
     }
     added = {name: (float(above.sum()), float(below.sum())) for name, (above, below) in sums.items()}
-    return _of_pairs(scene, node, np.stack([error, variance, away, noise]), running) | added
+    # At a pixel there is neither an anchor's blur nor its part in ``alone``, only the noise of its measurement.
+    measured = scene.stated[held_out] - config.alone / len(scene.stated)
+    at_pixel = factor * (variance + running.ratios["roughness"] + unseen) + steepness(scene.grid, field.offset)[node]
+    moments = second_moments(config, scale * (at_pixel + measured), p, offset, wide + measured)
+    scores = np.stack([score(error, p, *moments), image_weights(away, area, everywhere)])
+    return _of_pairs(scene, node, np.stack([error, variance, away, noise]), running) | added, scores
 
 
 def _of_pairs(

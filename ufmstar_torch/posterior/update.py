@@ -51,7 +51,7 @@ stream without anchors has UfM*'s output.
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -101,6 +101,7 @@ class Posterior:
         outlier: [B, H, W] probability in [0, 1] that a pixel lies on another surface than its evidence; NaN where not
             valid or in a stream without anchors.
         inlier: [B, H, W] variance if the pixel does not [m^2]; UfM*'s in a stream without anchors.
+        scores: for each stream, [2, M] scores of the frame's held-out anchors and their weights (``conformal``).
     """
 
     depth: Tensor
@@ -109,6 +110,7 @@ class Posterior:
     unseen: Tensor
     outlier: Tensor
     inlier: Tensor
+    scores: tuple[Tensor, ...] = ()
 
 
 def update(
@@ -138,7 +140,9 @@ def update(
     calibration = [one.ratios["calibration"] if one.below[-1] > 0 else np.nan for one in memories]
     unseen = [one.ratios["unseen"] for one in memories]
     outputs = depth, variance, np.array(calibration), np.array(unseen), outlier, inlier
-    return torch.from_numpy(memory).to(device), Posterior(*(torch.from_numpy(x).to(device) for x in outputs))
+    scores = tuple(torch.from_numpy(result[6]) for result in results)
+    posterior = Posterior(*(torch.from_numpy(x).to(device) for x in outputs))
+    return torch.from_numpy(memory).to(device), replace(posterior, scores=scores)
 
 
 def _anchors(anchors: AnchorInput | None, streams: int) -> list[AnchorRows | None]:
@@ -155,14 +159,14 @@ def _anchors(anchors: AnchorInput | None, streams: int) -> list[AnchorRows | Non
 def _of_stream(
     config: PosteriorConfig, packed: Floats, depth: NDArray[Any], valid: NDArray[np.bool_], claimed: NDArray[Any],
     anchor_rows: AnchorRows | None,
-) -> tuple[Floats, NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], Running]:  # fmt: skip
-    """The memory after the frame; depth, variance, probability of another surface and inlier variance; and the unpacked
-    memory."""
+) -> tuple[Floats, NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], Running, Floats]:  # fmt: skip
+    """The memory after the frame; depth, variance, probability of another surface and inlier variance; the unpacked
+    memory; and the scores."""
     running, anchors = Running.of(packed, config), _NONE if anchor_rows is None else anchor_rows
     has_valid = len(anchors.depth) > 0
     if anchor_rows is None and not running.frames:
         predicted = np.where(valid, depth, np.nan).astype(depth.dtype)
-        return packed, predicted, claimed, np.full_like(depth, np.nan), claimed, running
+        return packed, predicted, claimed, np.full_like(depth, np.nan), claimed, running, np.zeros((2, 0))
     with np.errstate(all="ignore"):  # invalid pixels are not read
         logs = np.log(depth)
     rows, cols = (min(SIDE, n) for n in depth.shape)
@@ -170,8 +174,9 @@ def _of_stream(
     scene = scene_of(grid, depth, valid, anchors, running)
     field, left_out, weight = fitted(scene)
     away = away_from(scene, weight * config.weak_sigma**2 >= 1)
+    scores = np.zeros((2, 0))
     if has_valid:
-        memory = learnt(scene, field, weight, left_out, running)
+        memory, scores = learnt(scene, field, weight, left_out, running, away)
     else:
         memory = running.drifted(grid.mean) if running.frames and valid.any() else packed
     node = np.arange(rows * cols)
@@ -191,4 +196,4 @@ def _of_stream(
     variance, inlier = second_moments(config, scale * (variance + steepness(grid, field.offset)), p, offset, wide)
     nodes = np.stack([grid.log_depth, offset, variance, inlier, p, away / config.reach], 1)
     depth, spread, inlier, p = read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
-    return memory, depth, spread, p, inlier, updated
+    return memory, depth, spread, p, inlier, updated, scores
