@@ -58,13 +58,14 @@ def one_caller(*names: str) -> Callable[[type[Class]], type[Class]]:
 
 def _guarded(method: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(method)
-    def guarded(self: Any, *args: Any, **kwargs: Any) -> Any:
+    def called(self: Any, *args: Any, **kwargs: Any) -> Any:
         self._caller.enter(f"{type(self).__name__}.{method.__name__}")
         try:
             return method(self, *args, **kwargs)
         finally:
             self._caller.leave()
 
+    guarded: Any = called
     # As torch.compiler.disable, which imports the compiler (6 s): torch.compile runs the method as it is.
     frames = torch._C._dynamo.eval_frame
     skip = frames._FrameAction.SKIP

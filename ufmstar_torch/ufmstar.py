@@ -177,8 +177,8 @@ class UfMStar(StatefulModule):
             ValueError: both ``pixels`` and ``fraction``, or one out of range; and as :meth:`forward`.
         """
         depth = as_tensor("depth", depth)
-        maps, view = (aleatoric, epistemic, valid, features), {"member": member, "informative": informative}
-        frame = self._checked(depth, pose, intrinsics, *maps, **view)
+        optional, view = (aleatoric, epistemic, valid, features), {"member": member, "informative": informative}
+        frame = self._checked(depth, pose, intrinsics, *optional, **view)
         index, used = sample_pixels(frame.valid, sample_size(frame.size, pixels, fraction), seed)
         out, maps = self._observe(frame, inputs, index, average=average)
         return mean_uncertainty(out, maps | {"depth": torch.gather(frame.depth.flatten(1), 1, index)}, used)

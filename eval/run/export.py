@@ -6,6 +6,7 @@ valid, or whose sigma exceeds a limit, are left out.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace

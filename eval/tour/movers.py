@@ -149,7 +149,7 @@ class _Scout:
         path = path[first : last + 1]
         half = np.array([thing.width / 2, 0.0, thing.depth / 2])
         low, high = path - half - [0, thing.height, 0], path + half - [0, _BASE, 0]
-        touches = ((low[:, None] < self._upper) & (high[:, None] > self._lower)).all(-1).any(1)
+        touches = np.any(np.all((low[:, None] < self._upper) & (high[:, None] > self._lower), -1), 1)
         camera = self._camera[first : last + 1]
         gap = np.maximum(np.maximum(low - camera, camera - high), 0)[:, ::2]
         boxes = torch.cat([self._tour.rooms, self._tour.doors]).numpy()

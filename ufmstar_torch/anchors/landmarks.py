@@ -94,7 +94,9 @@ class Landmarks:
         frame = torch.from_numpy(np.array([[self.pose_error], [self.shared], [self.scale]])).to(intrinsics.device)
         motion = None if self.motion is None else torch.from_numpy(self.motion[None]).to(intrinsics.device)
         moving = torch.tensor([self.moving], device=intrinsics.device)
-        result = Anchors(padded(self.pixel), padded(self.depth), padded(self.variance), valid, *frame, motion, moving)
+        error, shared, scale = frame
+        values = padded(self.pixel), padded(self.depth), padded(self.variance)
+        result = Anchors(*values, valid, error, shared, scale, motion, moving)
         return result.moved(torch.as_tensor(K_camera), intrinsics.reshape(3, 3))
 
 

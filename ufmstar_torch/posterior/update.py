@@ -51,7 +51,7 @@ stream without anchors has UfM*'s output.
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -139,10 +139,11 @@ def update(
     memories = [result[5] for result in results]
     calibration = [one.ratios["calibration"] if one.below[-1] > 0 else np.nan for one in memories]
     unseen = [one.ratios["unseen"] for one in memories]
-    outputs = depth, variance, np.array(calibration), np.array(unseen), outlier, inlier
+    names = ("depth", "variance", "outlier", "inlier", "calibration", "unseen")
+    arrays = depth, variance, outlier, inlier, np.array(calibration), np.array(unseen)
     scores = tuple(torch.from_numpy(result[6]) for result in results)
-    posterior = Posterior(*(torch.from_numpy(x).to(device) for x in outputs))
-    return torch.from_numpy(memory).to(device), replace(posterior, scores=scores)
+    outputs = {name: torch.from_numpy(x).to(device) for name, x in zip(names, arrays, strict=True)}
+    return torch.from_numpy(memory).to(device), Posterior(**outputs, scores=scores)
 
 
 def _anchors(anchors: AnchorInput | None, streams: int) -> list[AnchorRows | None]:
@@ -150,10 +151,8 @@ def _anchors(anchors: AnchorInput | None, streams: int) -> list[AnchorRows | Non
         return [None] * streams
     fields = [array(x) for x in (anchors.pixel, anchors.index, anchors.predicted, anchors.depth, anchors.variance)]
     used, motion = array(anchors.valid), None if anchors.motion is None else array(anchors.motion)
-    return [
-        AnchorRows(*(x[b][used[b]] for x in fields), motion=None if motion is None else motion[b])
-        for b in range(streams)
-    ]
+    rows = [AnchorRows(*(x[b][used[b]] for x in fields)) for b in range(streams)]
+    return list(rows) if motion is None else [row._replace(motion=motion[b]) for b, row in enumerate(rows)]
 
 
 def _of_stream(
@@ -190,7 +189,7 @@ def _of_stream(
     scale = local_scale(scene, left_out, all_anchors)
     p = np.minimum(updated.ratios["wrong"] * wrong_factor(config, away, scale), MOST_WRONG)
     if anchors.motion is not None:
-        tests, share = tests_at(anchors.motion, *depth.shape, rows, cols), away / config.reach
+        tests, share = tests_at(anchors.motion, depth.shape[0], depth.shape[1], rows, cols), away / config.reach
         P = probability(offset, grid.log_depth, share, tests, updated.ratios["between"], (rows, cols))
         p = 1 - (1 - p) * (1 - P)
     variance, inlier = second_moments(config, scale * (variance + steepness(grid, field.offset)), p, offset, wide)
