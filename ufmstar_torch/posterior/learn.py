@@ -85,11 +85,18 @@ def _of_discs(
     sums = {
         "wrong": (area * elsewhere, area * more_wrong),
         "inlier": (area * (1 - elsewhere) * factor * error**2 / inlier_variance, area * (1 - elsewhere)),
-        "between": (area * np.minimum((error + offset) ** 2, config.clip * running.ratios["between"]), area),
+        "between": (area * _student(error + offset, running.ratios["between"]), area),
         "calibration": (area * error**2 / stated, area),
     }
     added = {name: (float(above.sum()), float(below.sum())) for name, (above, below) in sums.items()}
     return _of_pairs(scene, node, np.stack([error, variance, away, noise]), running) | added
+
+
+def _student(residual: Floats, square: float) -> Floats:
+    """[N] squares of residuals with the weights of a Student-t distribution of two degrees of freedom and the squared
+    scale ``square``: their mean is the squared scale of largest likelihood."""
+    weighted: Floats = 3 * residual**2 / (2 + residual**2 / square)
+    return weighted
 
 
 def _of_pairs(
