@@ -16,6 +16,7 @@ START = {
     "unseen": (0.06, 20.0, 0.0, 16.0),
     "wrong": (0.015, 20.0, 0.0015, 0.15),
     "inlier": (1.0, 20.0, 0.05, 4.0),
+    "between": (0.04, 20.0, 9e-4, 1.0),
     "calibration": (0.0, 0.0, 0.0, 1e6),
 }
 PRIOR, DRIFT, MEMORY = np.array([0.5, 0.5, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
@@ -135,8 +136,9 @@ def distances(logs, source):
     return way
 
 
-def update(state, depth, claimed, pixel, g, variance):
+def update(state, depth, claimed, pixel, g, variance, motion=None):
     """One frame: depth [H, W] (0 = not valid), claimed V [m^2], anchors (pixel [N, 2], depth, variance), all valid.
+    ``motion`` [M, 3]: u, v and log likelihood ratio of motion.
 
     Returns the state after it, posterior depth, variance, variance on the evidence's surface, and probability of
     another [H, W].
@@ -194,12 +196,41 @@ def update(state, depth, claimed, pixel, g, variance):
     offset, share = HX[:, 4:] @ mean[4:], away / REACH
     around = y_variance(logs.shape, node, y, noise, np.ones(N, bool), mean[0])
     p = np.minimum(ratio(after, "wrong") * wrong_factor(share, scale), 0.5)
+    if motion is not None:
+        p = 1 - (1 - p) * (1 - moving(motion, depth.shape, logs, offset, share, ratio(after, "between")))
     wide = [elsewhere(*each) for each in zip(around, away * ratio(after, "unseen"), strict=True)]
     alone = [second_moment(0.0, *each) for each in zip(spread, offset, wide, strict=True)]
     spread = [second_moment(*each) for each in zip(p, spread, offset, wide, strict=True)]
     posterior, variance, outlier = read(depth, np.nan_to_num(claimed), logs, mean[:4], offset, spread, p, share)
     _, inlier, _ = read(depth, 0 * depth, logs, mean[:4], offset, alone, p, share)
     return after, posterior, variance, inlier, outlier
+
+
+def moving(motion, size, logs, offset, share, between):
+    """Probability of motion at the nodes."""
+    rows, cols = logs.shape
+    offset, share, ratios, P = offset.reshape(logs.shape), share.reshape(logs.shape), np.zeros(logs.shape), []
+    for r in range(rows):
+        for c in range(cols):
+            f, v = offset[r, c], between + 0.8**2
+            normal_density = math.exp(-f * f / v / 2) / math.sqrt(2 * math.pi * v)
+            student = (1 + f * f / between / 2) ** -1.5 / (2 * math.sqrt(2) * math.sqrt(between))
+            ratios[r, c] = max(1 - share[r, c], 0) * math.log(normal_density / student)
+    for r in range(rows):
+        for c in range(cols):
+            weights, values = [], []
+            for i in range(max(r - 3, 0), min(r + 4, rows)):
+                for j in range(max(c - 3, 0), min(c + 4, cols)):
+                    near = math.exp(-((i - r) ** 2 + (j - c) ** 2) / 4.5)
+                    weights.append(near / (1 + ((logs[i, j] - logs[r, c]) / 0.3) ** 2))
+                    values.append(ratios[i, j])
+            near = [(1 - abs((v + 0.5) / size[0] * rows - 0.5 - r), 1 - abs((u + 0.5) / size[1] * cols - 0.5 - c), m)
+                    for u, v, m in motion]  # fmt: skip
+            near = [(a * b, m) for a, b, m in near if a > 0 and b > 0]
+            tests = sum(w * m for w, m in near) / sum(w for w, _ in near) if near else 0.0
+            odds = -1.57 + math.log(0.12 + 0.88 * math.exp(tests)) + 1.06 * np.average(values, weights=weights)
+            P.append(max(1 / (1 + math.exp(-odds)) - 0.15, 0) / 0.85)
+    return np.array(P)
 
 
 def local_scale(shape, node, z2, noise, used):
@@ -304,9 +335,11 @@ def discs(state, logs, Q, mean0, H, y, weight, noise, z2, node, u, v, measured, 
         scores.append(abs(interval.standard(mixture, math.exp(error[i]))))
     inlier, outlier = (1 - p) * normal(error, inlier_variance), p * normal(error + offset, wide)
     inlier, outlier = inlier / (inlier + outlier), outlier / (inlier + outlier)
+    y2 = (error + offset) ** 2
     return pairs(state, logs, held, node, error, var, away, noise) | {
         "wrong": ((area * outlier).sum(), (area * more_wrong).sum()),
         "inlier": ((area * inlier * factor * error**2 / inlier_variance).sum(), (area * inlier).sum()),
+        "between": ((area * y2 * 3 / (2 + y2 / ratio(state, "between"))).sum(), area.sum()),
         "calibration": ((area * error**2 / final).sum(), area.sum()),
         "scores": (scores, interval.weights(away[held], area[held], everywhere)),
     }

@@ -91,7 +91,7 @@ def _of_discs(
     sums = {
         "wrong": (area * elsewhere, area * more_wrong),
         "inlier": (area * (1 - elsewhere) * factor * error**2 / inlier_variance, area * (1 - elsewhere)),
-        "between": (area * np.minimum((error + offset) ** 2, config.clip * running.ratios["between"]), area),
+        "between": (area * _student(error + offset, running.ratios["between"]), area),
         "calibration": (area * error**2 / stated, area),
     }
     added = {name: (float(above.sum()), float(below.sum())) for name, (above, below) in sums.items()}
@@ -101,6 +101,13 @@ def _of_discs(
     moments = second_moments(config, scale * (at_pixel + measured), p, offset, wide + measured)
     scores = np.stack([score(error, p, *moments), image_weights(away, area, everywhere)])
     return _of_pairs(scene, node, np.stack([error, variance, away, noise]), running) | added, scores
+
+
+def _student(residual: Floats, square: float) -> Floats:
+    """[N] squares of residuals with the weights of a Student-t distribution of two degrees of freedom and the squared
+    scale ``square``: their mean is the squared scale of largest likelihood."""
+    weighted: Floats = 3 * residual**2 / (2 + residual**2 / square)
+    return weighted
 
 
 def _of_pairs(

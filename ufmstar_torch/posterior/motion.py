@@ -6,11 +6,13 @@ not explain. Over the surfaces of a stream that stand still, f is Student-t dist
 the scale s ("between", learnt from held-out anchors); with motion it is normal with the variance s^2 + ``_MOVING``^2.
 With these densities, the log odds of motion at a node are
 
-    l = PRIOR + m + ``_WEIGHT`` mean(r),      r = (1 - distance/reach) log(N(f; s^2 + _MOVING^2)/t_2(f; s)).
+    l = PRIOR + log(a + (1 - a) e^m) + ``_WEIGHT`` mean(r),
+    r = (1 - distance/reach) log(N(f; s^2 + _MOVING^2)/t_2(f; s)).
 
-m is the log likelihood ratio of the tests in the images (``anchors.motion``). The mean is over neighbouring nodes of
-similar predicted depth, in a Gaussian window: the network bounds the region that moves. A surface counts as still
-unless there is evidence of motion: its probability of motion is P = max(0, (sigma(l) - c)/(1 - c)).
+m is the log likelihood ratio of the tests in the images (``anchors.motion``), and a the share of motion that passes all
+tests. The mean is over neighbouring nodes of similar predicted depth, in a Gaussian window: the network bounds the
+region that moves. A surface counts as still unless there is evidence of motion: the probability of motion is
+P = max(0, (sigma(l) - c)/(1 - c)).
 
 With the probability P the local correction does not hold, as on another surface: the depth is that of the prediction
 with the shared scale, y - b . x is normal with the variance w (``update``). The stated depth stays that of the
@@ -31,8 +33,8 @@ from ufmstar_torch.posterior.running import Floats
 
 # Standard deviation of log depth that motion adds.
 _MOVING = 0.8
-# Log odds of motion without evidence, weight of the ratio's likelihood, and c.
-_PRIOR, _WEIGHT, _CERTAIN = -1.4, 1.05, 0.15
+# Log odds of motion without evidence, share a, weight of the ratio's likelihood, and c.
+_PRIOR, _PASSING, _WEIGHT, _CERTAIN = -1.57, 0.12, 1.06, 0.15
 # Window of the mean: standard deviation and half width [nodes], and difference of log d at which a weight is halved.
 _SIGMA, _HALF, _CONTRAST = 1.5, 3, 0.3
 
@@ -78,7 +80,7 @@ def probability(
     ratio = np.maximum(1 - away, 0) * (moving - still)
     around = np.zeros(size)
     _mean_around(ratio.reshape(size), log_depth.reshape(size), around)
-    odds = _PRIOR + tests + _WEIGHT * around.ravel()
+    odds = _PRIOR + np.log(_PASSING + (1 - _PASSING) * np.exp(tests)) + _WEIGHT * around.ravel()
     P: Floats = np.maximum(1 / (1 + np.exp(-odds.clip(-50, 50))) - _CERTAIN, 0) / (1 - _CERTAIN)
     return P
 

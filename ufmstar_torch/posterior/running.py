@@ -8,7 +8,7 @@ Frames with anchors update these ratios:
 - unseen: increase of the error's variance with the distance from evidence
 - wrong: probability that the local correction does not hold
 - inlier: factor by which the variance is too small where the correction holds
-- between: squared scale of y - b . x over the surfaces
+- between: squared scale of y - b . x over surfaces (``motion``)
 - calibration: mean z^2 of held-out anchors
 
 Each ratio is the quotient of two sums that fade towards a prior, so that few anchors change it little.

@@ -1,0 +1,125 @@
+"""Measures the posterior on things that move, and what they cost on what stands still.
+
+    python docs/measure_movers.py --weights fastdepth_nyu.onnx
+
+runs FastDepth, dense anchors and the posterior on ten tours with six moving things each, and on the same tours without
+them. It prints, for each kind of motion, for all moving pixels and for those that stand still: number of pixels; median
+ratio of posterior and true depth; root mean square z; the share of pixels beyond 4 sigma; the share with a stated sigma
+below a tenth of the depth and an error above half of the truth; delta1; NLL; and NLL of the mixture. The last row has
+the still pixels in the tours without things that move. The first frames are left out, because they have no parallax.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig
+from ufmstar_torch.anchors import landmark_source
+from ufmstar_torch.eval.sequences.frame import Frame
+from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
+from ufmstar_torch.eval.sequences.images import image_tensor
+from ufmstar_torch.eval.tour import make_movers, make_tour, tour_path, tour_sequence
+from ufmstar_torch.eval.tour.movers import Mover, with_movers
+from ufmstar_torch.eval.tour.view import cast, intrinsics
+from ufmstar_torch.models.load import load_network
+from ufmstar_torch.models.network import DepthNetwork
+
+TOURS = tuple(zip(range(951, 961), ("home", "hall", "mixed", "blank", "scales") * 2, strict=True))
+SIZE, MOVERS, FIRST, STRIDE = (240, 320), 6, 5, 2
+Array = NDArray[np.float64]
+
+
+def things(seed: int, style: str, frames: int) -> tuple[tuple[Mover, ...], list[NDArray[np.int64]]]:
+    """The things of a tour; and for each frame, [H, W] the number of the one that a pixel shows, from 1, 0 = none."""
+    tour, K = make_tour(seed, style), torch.from_numpy(intrinsics(*SIZE))
+    poses = tour_path(tour, frames)
+    movers, maps = make_movers(tour, poses, K, SIZE, MOVERS), []
+    for i in range(frames):
+        surface = cast(with_movers(tour, movers, i), poses[i], K, *SIZE)[1].numpy()
+        present = [(k, len(m.surfaces.kind)) for k, m in enumerate(movers, 1) if exists(m, i)]
+        ends = np.cumsum([len(tour.surfaces.kind), *(n for _, n in present)])
+        maps.append(np.array([0, *(k for k, _ in present)])[np.searchsorted(ends, surface, side="right")])
+    return movers, maps
+
+
+def exists(mover: Mover, index: int) -> bool:
+    """Whether a thing exists in a frame."""
+    return 0 <= index - mover.start < len(mover.position)
+
+
+def posterior(frames: list[Frame], network: DepthNetwork) -> Iterator[tuple[Array, NDArray[np.float64]]]:
+    """For each frame, [h, w, 5] depth, variance, inlier variance, probability of an outlier and truth; and K [3, 3]."""
+    source = landmark_source("dense")
+    ufm = UfMStar(UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig()))
+    for frame in frames:
+        assert frame.image is not None
+        with torch.no_grad():
+            x, K = network.preprocess(image_tensor(frame), torch.from_numpy(frame.intrinsics)[None])
+            depth = network(x).depth.float()
+        K = K.double()
+        marks = source.update(frame.image, frame.T_world_cam, frame.intrinsics).anchors(frame.intrinsics, K)
+        out = ufm(depth, torch.from_numpy(frame.T_world_cam)[None], K, anchors=marks)
+        maps = out.posterior_depth, out.posterior_variance, out.posterior_inlier_variance, out.posterior_outlier
+        truth = truth_at(frame, K[0].numpy(), (depth.shape[1], depth.shape[2]))
+        yield np.stack([*(x[0].double().numpy() for x in maps if x is not None), truth], -1), K[0].numpy()
+
+
+def row(name: str, pixels: list[Array]) -> str:
+    """A row of the table from [P, 5] values."""
+    d, v, v1, p, g = np.concatenate(pixels).T
+    z2, off = (g - d) ** 2 / v, np.abs(d - g)
+    v2 = np.maximum((v - (1 - p) * v1) / np.maximum(p, 1e-12), v1)
+    parts = [np.exp(-((g - d) ** 2) / x / 2) / np.sqrt(2 * np.pi * x) for x in (v1, v2)]
+    mixture = -np.log(np.maximum((1 - p) * parts[0] + p * parts[1], 1e-30)).mean()
+    nll = (z2 + np.log(2 * np.pi * v)).mean() / 2
+    confident = (v < 0.01 * d * d) & (off > 0.5 * g)
+    figures = [f"{np.median(d / g):.2f}", f"{z2.mean() ** 0.5:.2f}", f"{(z2 > 16).mean():.3f}"]
+    figures += [f"{confident.mean():.4f}", f"{(off <= 0.25 * g).mean():.4f}", f"{nll:.3f}", f"{mixture:.3f}"]
+    return f"| {name} | {len(d)} | " + " | ".join(figures) + " |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--weights", type=Path, required=True, help="FastDepth's")
+    parser.add_argument("--frames", type=int, default=60, help="of a tour")
+    parser.add_argument("--tours", type=int, default=len(TOURS), help="number of tours")
+    arguments = parser.parse_args()
+    network = load_network("fastdepth", arguments.weights).eval()
+    found: dict[str, list[Array]] = defaultdict(list)
+    for seed, style in TOURS[: arguments.tours]:
+        options = {"frames": arguments.frames, "size": SIZE, "style": style}
+        movers, ids = things(seed, style, arguments.frames)
+        for count in (MOVERS, 0):
+            frames = list(tour_sequence(seed, movers=count, **options))
+            for i, (values, K_map) in enumerate(posterior(frames, network)):
+                if i < FIRST:
+                    continue
+                shown = resample_nearest(ids[i], frames[i].intrinsics, K_map, values.shape[:2])
+                values, shown = values[::STRIDE, ::STRIDE], shown[::STRIDE, ::STRIDE]
+                usable = (values[..., 4] > 0) & np.isfinite(values[..., 0])
+                found["still" if count else "still, in the tours without"].append(values[usable & (shown == 0)])
+                for k, mover in enumerate(movers, 1):
+                    if count and (shown == k).any():
+                        found[mover.motion].append(values[usable & (shown == k)])
+        print(f"tour {seed}, {style}: {len(movers)} things", flush=True)
+    still = [found.pop(name) for name in ("still", "still, in the tours without")]
+    print("| | pixels | ratio | rms z | beyond 4 sigma | confident and wrong | delta1 | NLL | mixture: NLL |")
+    print("|---" * 9 + "|")
+    for motion in sorted(found):
+        print(row(motion, found[motion]))
+    others = [pixels for motion, rows in found.items() if motion != "along, half" for pixels in rows]
+    print(row("all but along, half", others))
+    print(row("all moving", [pixels for rows in found.values() for pixels in rows]))
+    print(row("still", still[0]))
+    print(row("still, in the tours without", still[1]))
+
+
+if __name__ == "__main__":
+    main()

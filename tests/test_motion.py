@@ -1,0 +1,194 @@
+"""Things that move: tests in images, anchors that are withheld, and motion as an explanation of evidence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import oracle_posterior as oracle
+import pytest
+import torch
+from test_posterior import MODEL, K, checked, scene
+
+from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig
+from ufmstar_torch.anchors import Anchors, landmark_source, motion
+from ufmstar_torch.anchors.motion import LANDMARK, LINE, SEARCH, MotionTests, located, moves
+from ufmstar_torch.eval.sequences.open import open_sequence
+from ufmstar_torch.posterior.motion import probability
+from ufmstar_torch.posterior.motion import tests_at as at_nodes
+from ufmstar_torch.posterior.running import SIZE
+from ufmstar_torch.posterior.update import update
+
+CELL, SHAPE = 10, (120, 160)
+
+
+def searches(failing, seed=0):
+    """Searches in every cell; those in columns below ``failing`` fail."""
+    rng = np.random.default_rng(seed)
+    row, column = np.indices((12, 16)).reshape(2, -1)
+    pixel = (np.stack([column, row], 1) + rng.uniform(0.1, 0.9, (192, 2))) * CELL
+    return motion.Tested.of((pixel, SEARCH, pixel[:, 0] < failing * CELL))
+
+
+# --- tests in images -----------------------------------------------------------------------------------------
+
+
+def test_a_region_whose_tests_fail_moves_and_one_whose_tests_pass_does_not():
+    ratios = MotionTests(0.8).log_ratios(searches(4), SHAPE, CELL)
+    assert ratios.shape == (12, 16)
+    assert ratios[:, 0].min() > 0
+    assert ratios[:, 8:].max() < 0
+    assert (np.diff(ratios[6, 1:7]) < 0).all(), "the window spreads each test over its neighbours"
+
+
+def test_the_log_ratio_is_the_weighted_sum_of_the_tests_log_ratios():
+    tests = MotionTests(0.8)
+    pixel = np.array([[45.0, 45.0], [45.0, 45.0], [45.0, 45.0]])
+    parts = [(pixel[:1], SEARCH, np.array([True])), (pixel[:1], LANDMARK, np.array([True])),
+             (pixel[:1], LINE, np.array([False]))]  # fmt: skip
+    ratios = tests.log_ratios(motion.Tested.of(*parts), SHAPE, CELL)
+    failing = (0.8 * 50 * np.array([0.4, 0.06, 0.06]) + [1, 1, 0]) / (0.8 * 50 + 1)
+    fails = np.log((failing + (1 - failing) * [0.4, 0.4, 0.1]) / failing)
+    expected = 0.22 * fails[0] + 0.43 * fails[1] + 0.87 * np.log(0.9)
+    assert ratios[4, 4] == pytest.approx(expected)
+    assert ratios[4, 6] == pytest.approx(expected * np.exp(-(2**2) / 1.5**2 / 2))
+
+
+def test_where_tests_fail_everywhere_nothing_moves_more_than_elsewhere():
+    """Blurred images fail all tests: the stream's rate of failures takes this into account."""
+    tests = MotionTests(0.8)
+    for seed in range(10):
+        ratios = tests.log_ratios(searches(16, seed), SHAPE, CELL)
+    assert ratios.max() < 0.2
+
+
+def test_without_a_test_nothing_is_known():
+    nothing = motion.Tested.of((np.zeros((0, 2)), SEARCH, np.zeros(0, bool)))
+    assert not MotionTests(0.8).log_ratios(nothing, SHAPE, CELL).any()
+
+
+def test_the_state_of_the_tests_goes_on_to_the_bit():
+    one, other = MotionTests(0.8), MotionTests(0.8)
+    one.log_ratios(searches(4), SHAPE, CELL)
+    other.load_state(one.state())
+    following = searches(2, seed=1)
+    np.testing.assert_array_equal(one.log_ratios(following, SHAPE, CELL), other.log_ratios(following, SHAPE, CELL))
+    one.reset()
+    np.testing.assert_array_equal(
+        one.log_ratios(following, SHAPE, CELL), MotionTests(0.8).log_ratios(following, SHAPE, CELL)
+    )
+
+
+def test_cells_are_located_by_their_centres():
+    ratios = np.arange(6.0).reshape(2, 3)
+    np.testing.assert_array_equal(located(ratios, 10)[:, 2], ratios.ravel())
+    np.testing.assert_array_equal(located(ratios, 10)[4], [14.5, 14.5, 4.0])
+    assert moves(ratios, np.array([[25.0, 5.0], [5.0, 5.0], [5.0, 19.0]]), 10).tolist() == [True, False, True]
+
+
+@pytest.fixture(scope="module")
+def moving_tour():
+    """Frames of a tour with things that move, the landmarks of each, and the source after them."""
+    frames, source = list(open_sequence("tour:62?style=hall&frames=26&size=240x320&movers=4")), landmark_source("dense")
+    return frames, [source.update(frame.image, frame.T_world_cam, frame.intrinsics) for frame in frames]
+
+
+def test_tests_fail_on_things_that_move_and_their_anchors_are_withheld_and_counted(moving_tour):
+    on, beside = [], []
+    for frame, landmarks in list(zip(*moving_tour, strict=True))[10:]:
+        u, v = np.rint(landmarks.motion[:, :2]).astype(int).T
+        on.append(landmarks.motion[frame.moving[v, u], 2])
+        beside.append(landmarks.motion[~frame.moving[v, u], 2])
+    on, beside = np.concatenate(on), np.concatenate(beside)
+    assert on.mean() > beside.mean() + 0.5
+    assert np.mean(on > 1.9) > 5 * np.mean(beside > 1.9)
+    assert np.mean(beside > 1.9) < 0.04
+    assert sum(landmarks.moving for landmarks in moving_tour[1]) > 50
+
+
+def test_the_count_of_withheld_depths_is_in_the_statistics(moving_tour):
+    frame, landmarks = moving_tour[0][20], moving_tour[1][20]
+    ufm = UfMStar(UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig()))
+    camera = torch.from_numpy(frame.intrinsics)[None]
+    anchors = landmarks.anchors(frame.intrinsics, camera)
+    out = ufm(torch.from_numpy(frame.depth)[None], torch.from_numpy(frame.T_world_cam)[None], camera, anchors=anchors)
+    assert out.statistics.anchors_moving.tolist() == [landmarks.moving]
+    np.testing.assert_allclose(anchors.motion[0], landmarks.motion)
+
+
+def test_positions_of_tests_move_with_the_pixels_of_a_resized_image(moving_tour):
+    frame, landmarks = moving_tour[0][20], moving_tour[1][20]
+    half = np.diag([0.5, 0.5, 1.0]) @ frame.intrinsics
+    motion = landmarks.anchors(frame.intrinsics, torch.from_numpy(half)).motion[0].numpy()
+    np.testing.assert_allclose(motion[:, :2], landmarks.motion[:, :2] / 2)
+    np.testing.assert_array_equal(motion[:, 2], landmarks.motion[:, 2])
+
+
+# --- the posterior -------------------------------------------------------------------------------------------
+
+
+def points(value, size=(12, 16), region=None):
+    """A test at every second pixel: ``value`` in the region (rows, columns), else 0."""
+    v, u = (np.indices((size[0] // 2, size[1] // 2)) * 2.0 + 0.3).reshape(2, -1)
+    inside = np.ones(len(u), bool) if region is None else (v < region[0]) & (u < region[1])
+    return np.stack([u, v, np.where(inside, value, 0.0)], 1)
+
+
+def test_values_with_motion_against_the_oracle():
+    state, packed = oracle.start(), torch.zeros(1, SIZE, dtype=torch.float64)
+    for seed, value in enumerate((2.0, 1.0)):
+        depth, _, claimed, *anchors = scene(seed, (12, 16), 40)
+        motion = points(value, region=(7, 9))
+        state, *expected = oracle.update(state, depth, claimed, *anchors, motion=motion)
+        frame, rows = checked(depth, *anchors)
+        rows = replace(rows, motion=torch.from_numpy(motion)[None])
+        packed, out = update(packed, frame, rows, torch.from_numpy(claimed)[None], MODEL)
+        for name, value in zip(("depth", "variance", "inlier", "outlier"), expected, strict=True):
+            np.testing.assert_allclose(getattr(out, name)[0], value, rtol=1e-7, err_msg=name)
+
+
+def test_tests_at_nodes_are_means_of_the_points_around_them():
+    points = np.array([[3.5, 3.5, 2.0], [3.5, 3.5, 4.0], [11.5, 3.5, 1.0], [np.nan, 0, 5]])
+    np.testing.assert_allclose(at_nodes(points, 16, 16, 2, 2), [3.0, 1.0, 0.0, 0.0])
+
+
+def test_a_ratio_that_no_other_surface_has_is_explained_by_motion_and_a_usual_one_is_not():
+    n = 28 * 28
+    offset, logs, zero = np.zeros((28, 28)), np.zeros((28, 28)), np.zeros(n)
+    offset[8:20, 8:16], logs[8:20, 8:16] = 0.7, -0.8
+    arguments = offset.ravel(), logs.ravel(), zero, zero
+    P = probability(*arguments, 0.05**2, (28, 28)).reshape(28, 28)
+    assert P[10:18, 10:14].min() > 0.4
+    assert P[offset == 0].max() < 0.1, "the depth edge bounds the region"
+    assert probability(*arguments, 0.5**2, (28, 28)).max() < 0.15, "in this stream surfaces differ that much"
+    far = probability(offset.ravel(), logs.ravel(), zero + 1, zero, 0.05**2, (28, 28))
+    assert far.max() < 0.06, "without evidence there is nothing to explain"
+
+
+def test_motion_widens_the_variance_and_a_range_sensor_s_anchors_need_none():
+    depth, _, claimed, *anchors = scene(0)
+    frame, rows = checked(depth, *anchors)
+    start, claimed = torch.zeros(1, SIZE, dtype=torch.float64), torch.from_numpy(claimed)[None]
+    outs = {}
+    for value in (None, 0.0, 3.0):
+        motion = None if value is None else torch.from_numpy(points(value, (36, 48)))[None]
+        outs[value] = update(start, frame, replace(rows, motion=motion), claimed, MODEL)[1]
+    valid = frame.valid
+    assert (outs[3.0].outlier[valid] > 0.3).all()
+    assert (outs[3.0].variance >= outs[None].variance)[valid].all()
+    assert (outs[3.0].variance > 2 * outs[None].variance)[valid].double().mean() > 0.9
+    for out in outs.values():
+        torch.testing.assert_close(out.depth, outs[None].depth, rtol=0, atol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize(("motion", "kind", "text"), [
+    (torch.zeros(1, 4, 2), ValueError, "anchors.motion must be \\[1, M, 3\\]"),
+    (torch.zeros(2, 4, 3), ValueError, "anchors.motion must be \\[1, M, 3\\]"),
+    (torch.zeros(1, 4, 3, dtype=torch.int64), TypeError, "anchors.motion"),
+])  # fmt: skip
+def test_malformed_tests_are_refused(motion, kind, text):
+    one = torch.ones(1, 1)
+    anchors = Anchors(torch.ones(1, 1, 2), one, 0.01 * one, motion=motion)
+    ufm = UfMStar(UfMStarConfig(anchors=AnchorConfig()))
+    with pytest.raises(kind, match=text):
+        ufm(torch.ones(1, 12, 16), torch.eye(4)[None], K[None], anchors=anchors)
