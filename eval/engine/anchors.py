@@ -193,6 +193,8 @@ def landmarks_of(value: str | bool, folder: Path | None, scale: float = 1.0) -> 
         scale: metres per unit of the poses, which is the unit of the file.
     """
     name = CORNERS if value is True else str(value)
+    if name.partition(":")[0] == SENSOR:
+        raise ValueError(f"anchors: {name!r} is the depth of a recording, for `ufmstar run` and `rank`")
     is_file = Path(name).suffix.lower() in FILE_TYPES
     source = landmark_source(resolve(folder or Path(), name) if is_file else name)
     if isinstance(source, LandmarkMap) and scale != 1:
