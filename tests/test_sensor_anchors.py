@@ -14,7 +14,7 @@ from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStarConfig, cli
 from ufmstar_torch.anchors import Landmarks, sensor_landmarks
 from ufmstar_torch.anchors.sensor import completed
 from ufmstar_torch.camera import resize_intrinsics
-from ufmstar_torch.eval.engine.anchors import sensor_of
+from ufmstar_torch.eval.engine.anchors import landmarks_of, sensor_of
 from ufmstar_torch.eval.engine.maps import MapSource
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.run import run
@@ -219,3 +219,5 @@ def test_the_command(tmp_path, capfd):
     assert "--anchors sensor goes with the depth of a network" in capfd.readouterr().err
     assert cli.main([*words, "--overwrite", "--depth", str(maps), "--anchors", "sensor:x"]) == 2
     assert "the kind of sensor must be one of" in capfd.readouterr().err
+    with pytest.raises(ValueError, match="is the depth of a recording, for `ufmstar run` and `rank`"):
+        landmarks_of("sensor:tof", None)

@@ -19,6 +19,11 @@ _NO_SCALE = (
     "the network's own scale with --scale-from network"
 )
 
+_NO_UNIT = (
+    "sequence {name!r}: its files do not state the unit of its poses. Give --pose-scale M (metres per unit; 1 if they "
+    "are in metres), or --trajectory FILE with poses in metres"
+)
+
 
 @dataclass(frozen=True)
 class NetworkScale:
@@ -34,7 +39,7 @@ class NetworkScale:
 def require_metric(sequence: FrameSequence) -> None:
     """Raises ValueError: the unit of the poses is unknown; the message names the options that help."""
     if not sequence.metric:
-        raise ValueError(_NO_SCALE.format(name=sequence.name))
+        raise ValueError((_NO_SCALE if sequence.layout == "colmap" else _NO_UNIT).format(name=sequence.name))
 
 
 def network_scale(
