@@ -153,7 +153,8 @@ class _Scout:
         camera = self._camera[first : last + 1]
         gap = np.maximum(np.maximum(low - camera, camera - high), 0)[:, ::2]
         boxes = torch.cat([self._tour.rooms, self._tour.doors]).numpy()
-        inside = ((boxes[:, 0] < path[:, None]) & (path[:, None] < boxes[:, 1]))[..., ::2].all(-1).any(1)
+        within = (boxes[:, 0] < path[:, None]) & (path[:, None] < boxes[:, 1])
+        inside = np.any(np.all(within[..., ::2], -1), 1)
         blocked = touches | ~inside | (np.linalg.norm(gap, axis=1) < _CLEAR)
         before, after = np.flatnonzero(blocked[: at - first + 1]), np.flatnonzero(blocked[at - first :])
         start = int(before[-1]) + 1 if len(before) else 0
