@@ -222,7 +222,7 @@ def _deep_values(path: str | Path, image: Image.Image, content: bytes | None = N
     Raises FrameError: other numbers."""
     if image.mode[0] in "IF":
         values = np.array(image)[..., None]
-    elif any(_DEEP in str(tile[3]) for tile in getattr(image, "tile", ())):  # colours, which Pillow reduces to their high bytes
+    elif any(_DEEP in str(tile[3]) for tile in getattr(image, "tile", ())):  # of colours, Pillow keeps high bytes
         import cv2
 
         image.load()  # raises for truncated files, while OpenCV returns partial images
