@@ -60,10 +60,28 @@ def test_16_bit_grey_is_scaled_by_its_folder(tmp_path, caplog, suffix):
     for i, frame in enumerate(sequence):
         expected = grey[i] * (0.1 if i == 2 else 1.0)
         np.testing.assert_allclose(frame.image, np.repeat(expected[..., None], 3, axis=2), atol=0.6)
-    assert [record.getMessage() for record in caplog.records if "16-bit grey" in record.message] == [
-        f"{path / 'images'}: 16-bit grey images, read as 0 to 4095 and scaled to bytes"
+    assert [record.getMessage() for record in caplog.records if "16 bits" in record.message] == [
+        f"{path / 'images'}: images of 16 bits, read as 0 to 4095 and scaled to bytes"
     ]
     assert read_color("image", (path / "images" / f"7.{suffix}").read_bytes()).shape == (48, 64, 3)
+
+
+@pytest.mark.parametrize("suffix", ["png", "tiff"])
+def test_16_bit_colours_are_scaled_too(tmp_path, suffix):
+    """Pillow would keep the high bytes: 12 bits would be black."""
+    colours = RNG.integers(0, 256, (6, 5, 3))
+    colours[0, 0] = 255
+    for i, factor in enumerate((1.0, 0.1)):
+        values = np.rint(colours * factor * 4095 / 255).astype(np.uint16)
+        cv2.imwrite(str(tmp_path / f"{i}.{suffix}"), values[..., ::-1])
+        np.testing.assert_allclose(read_color(tmp_path / f"{i}.{suffix}"), colours * factor, atol=0.6)
+    content = (tmp_path / f"0.{suffix}").read_bytes()
+    np.testing.assert_allclose(read_color("image", content), colours, atol=0.6)
+    if suffix == "tiff":  # Pillow warns of truncated ones
+        return
+    layouts.truncate(tmp_path / f"1.{suffix}", 0.9)
+    with pytest.raises(FrameError):
+        read_color(tmp_path / f"1.{suffix}")
 
 
 def test_euroc_with_16_bit_images(tmp_path):

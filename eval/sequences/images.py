@@ -2,8 +2,8 @@
 
 PNGs of 8-bit RGB are decoded by kornia_rs, in a third of Pillow's time; all other files by Pillow, which raises errors
 for truncated files, while OpenCV returns partial images. An EXIF orientation is not applied, because intrinsics are
-those of the stored pixels. 16-bit grey is scaled to bytes by the range of its folder's images, transparent pixels
-become black; both are logged once per folder.
+those of the stored pixels. Images of 16 bits are scaled to bytes by the range of their folder's images, transparent
+pixels become black; both are logged once per folder.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ SCALE_KEY = "depth_scale"
 # Bit depth, colour type, compression, filter and interlacing, from a PNG's header.
 _SIGNATURE, _RGB = b"\x89PNG\r\n\x1a\n", bytes((8, 2, 0, 0, 0))
 _MILLIMETRE = 1e-3
-# Largest values of grey images of 8, 10, 12, 14 and 16 bits, which are all stored in 16 bits.
+# Largest values of images of 8, 10, 12, 14 and 16 bits, which are all stored in 16 bits.
 _FULL_SCALES = (255, 1023, 4095, 16383, 65535)
+_DEEP = ";16"  # in Pillow's name of the stored pixels of an image with 16 bits
 _SCALE_SAMPLES = 8  # images of a folder that determine its scale
 # macOS writes a file ._NAME beside NAME on disks that are not its own.
 _SIDECAR = "._"
@@ -44,20 +45,19 @@ _DEPTH_NAMES = ("Z", "depth", "V", "Y", "R")
 
 
 def read_color(path: str | Path, content: bytes | None = None) -> np.ndarray:
-    """An image of a file, or of its ``content``, as [H, W, 3] uint8 RGB; grey is repeated. 16-bit grey is scaled by the
-    range of the images in its folder (without a folder: of the image), and transparent colours are blended with black.
+    """An image of a file, or of its ``content``, as [H, W, 3] uint8 RGB; grey is repeated. 16 bits are scaled by the
+    range of the images in the folder (without a folder: of the image), and transparent colours are blended with black.
     Raises FrameError: missing, truncated, corrupt, or an image of floating-point or negative numbers."""
     if content is None and (plain := _plain_png(Path(path))) is not None:
         return plain
     try:
         with Image.open(path if content is None else BytesIO(content)) as image:
             require_pixels("the image", (image.height, image.width))
-            if image.mode[0] in "IF":  # Pillow would silently clip these at 255
-                values = _grey_values(path, image)
-                full = (
-                    full_scale(values) if content is not None else _folder_scale(Path(path).parent, Path(path).suffix)
-                )
-                return np.repeat(grey_bytes(values, full)[..., None], 3, axis=2)
+            if (values := _deep_values(path, image, content)) is not None:
+                full = full_scale(values)
+                if content is None:
+                    full = _folder_scale(Path(path).parent, Path(path).suffix)
+                return np.ascontiguousarray(np.broadcast_to(grey_bytes(values, full), (*values.shape[:2], 3)))
             if image.has_transparency_data:
                 return _opaque(np.array(image.convert("RGBA")), Path(path).parent)
             return np.array(image.convert("RGB"))
@@ -223,9 +223,20 @@ def _plain_png(path: Path) -> np.ndarray | None:
         return None
 
 
-def _grey_values(path: str | Path, image: Image.Image) -> np.ndarray:
-    """[H, W] integers from 0 to 65535 of an opened image. Raises FrameError: other numbers."""
-    values = np.array(image)
+def _deep_values(path: str | Path, image: Image.Image, content: bytes | None = None) -> np.ndarray | None:
+    """[H, W, 1] or [H, W, 3] RGB, integers from 0 to 65535, of an opened image of more than 8 bits; None for 8 bits.
+    Raises FrameError: other numbers."""
+    if image.mode[0] in "IF":
+        values = np.array(image)[..., None]
+    elif any(_DEEP in str(tile[3]) for tile in getattr(image, "tile", ())):  # of colours, Pillow keeps high bytes
+        import cv2
+
+        image.load()  # raises for truncated files, while OpenCV returns partial images
+        stored = np.frombuffer(Path(path).read_bytes() if content is None else content, np.uint8)
+        decoded = cv2.imdecode(stored, cv2.IMREAD_UNCHANGED)
+        values = np.zeros(0) if decoded is None else np.asarray(decoded)[..., 2::-1]
+    else:
+        return None
     if not np.issubdtype(values.dtype, np.integer) or values.min(initial=0) < 0 or values.max(initial=0) > 65535:
         raise FrameError(path, f"expected an image of 8 or 16 bits, got mode {image.mode}: a depth map?")
     return values
@@ -239,9 +250,9 @@ def _folder_scale(folder: Path, suffix: str) -> int:
     scales = [_FULL_SCALES[0]]
     for file in chosen:
         with suppress(FrameError, *_BROKEN_IMAGE), Image.open(file) as image:
-            if image.mode[0] in "IF":
-                scales.append(full_scale(_grey_values(file, image)))
-    LOGGER.warning("%s: 16-bit grey images, read as 0 to %d and scaled to bytes", folder, max(scales))
+            if (values := _deep_values(file, image)) is not None:
+                scales.append(full_scale(values))
+    LOGGER.warning("%s: images of 16 bits, read as 0 to %d and scaled to bytes", folder, max(scales))
     return max(scales)
 
 
