@@ -8,7 +8,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
-from itertools import takewhile
 from pathlib import Path
 from time import monotonic
 from typing import Any, ClassVar
@@ -58,7 +57,7 @@ class LiveOptions(MachineOptions):
         source: a recording (folder, video, bag, tour:SEED), the number of a camera, or - for lines of JSON
         follow: the source is a folder to which images are added, named by their time
         speed: of a recording, 2 = twice as fast
-        seconds: end after so long
+        seconds: end after so long, counted from the first image
         idle: with --follow, end after so long without a new image [s]
         max_wait: for the poses after an image [s]
         state: file in which the state is kept, and from which it goes on
@@ -171,14 +170,16 @@ def _run(
     live = LiveDepth(model, on_result, K, state=options.state, save_every=options.save_every, **how)
     try:
         with _interrupted_by_sigterm(), live, suppress(KeyboardInterrupt):
-            for event in takewhile(lambda _: monotonic() < deadline, events):
+            for event in events:
+                if monotonic() >= deadline:
+                    break
                 if event.T_world_cam is not None:
                     live.push_pose(event.stamp, event.T_world_cam)
                 if event.image is not None:
                     if not warm:  # the first inference takes seconds; a recording's clock starts after it
                         height, width = event.image.shape[:2]
                         model.warm_up((height, width))
-                        warm = True
+                        warm, deadline = True, monotonic() + options.seconds
                     live.push_image(event.stamp, event.image, event.intrinsics)
             live.wait_idle()
     except (OSError, RuntimeError, TypeError, ValueError) as error:
