@@ -166,7 +166,8 @@ def test_from_an_evaluation_to_other_sequences(evaluated, tmp_path, capsys):
 
 def test_run_uses_the_map_beside_the_weights(evaluated, tmp_path, capsys):
     rooms, weights, out = evaluated
-    words = ["run", str(rooms / "cedar"), "--model", "trained", "--weights", str(weights), "--no-video", "--no-sheet"]
+    default = ["run", str(rooms / "cedar"), "--model", "trained", "--weights", str(weights), "--no-video", "--no-sheet"]
+    words = [*default, "--plain"]
     assert cli.main([*words, "--out", str(tmp_path / "plain")]) == 0
     file = recalibration_path(weights)
     assert cli.main(["recalibrate", str(out), "--row", "UfM*-DepthOnly", "--to", str(file)]) == 0
@@ -175,6 +176,10 @@ def test_run_uses_the_map_beside_the_weights(evaluated, tmp_path, capsys):
         assert cli.main([*words, "--out", str(tmp_path / "none"), "--recalibration", "none"]) == 0
         assert cli.main(["run", str(rooms / "ash"), *words[2:], "--out", str(tmp_path / "fitted")]) == 0
         capsys.readouterr()
+        assert cli.main([*default, "--out", str(tmp_path / "corrected"), "--frames", ":2"]) == 0
+        assert "is not used: it was fitted to UfM* alone, which --plain runs" in capsys.readouterr().err
+        assert cli.main([*default, "--out", str(tmp_path / "named"), "--recalibration", str(file)]) == 2
+        assert "anchors.half_life = None (now 30.0)" in capsys.readouterr().err
         assert cli.main([*words, "--out", str(tmp_path / "other"), "--ufm.ema_alpha", "0.7"]) == 2
         assert "ema_alpha = " in capsys.readouterr().err
         assert cli.main([*words, "--out", str(tmp_path / "plain"), "--resume"]) == 2

@@ -108,7 +108,7 @@ def test_a_run_reads_back_what_another_left_and_skips_what_it_skipped(path, tmp_
 
 
 def test_maps_of_some_frames_are_enough_where_only_those_are_run(path, tmp_path):
-    words = ["run", str(path), "--depth", str(tmp_path / "maps"), "--no-video", "--no-sheet", "--out"]
+    words = ["run", str(path), "--plain", "--depth", str(tmp_path / "maps"), "--no-video", "--no-sheet", "--out"]
     for name, value in (("first", 1.0), ("second", 2.0)):  # paired in order: file and frame names differ
         write_depth_png(tmp_path / "maps" / f"{name}.png", np.full((48, 64), value), 1000, scale_text="0.001")
     assert cli.main([*words, str(tmp_path / "out"), "--frames", "2:4"]) == 0

@@ -266,7 +266,7 @@ def ufmstar(capfd, scene, tmp_path):
 
     def call(*words, out="out"):
         capfd.readouterr()
-        quiet = ("--no-video", "--no-sheet", "--out", tmp_path / out)
+        quiet = ("--plain", "--no-video", "--no-sheet", "--out", tmp_path / out)
         code = cli.main([str(word) for word in ("run", scene, "--model", "trained", *words, *quiet)])
         captured = capfd.readouterr()
         return code, captured.out, captured.err

@@ -216,7 +216,7 @@ class UncertainDepth(NetworksInTurn):
         self._by_default = posterior and anchors is None
         if self._by_default and (missed := _missed(networks)):
             self._by_default, posterior = False, config.anchors is not None
-            if not posterior:
+            if networks is not None or not posterior:
                 LOGGER.warning(_MISSED, missed)
         anchors = "dense" if self._by_default else anchors
         if posterior or anchors is not None:

@@ -60,7 +60,7 @@ class LiveOptions(MachineOptions):
         source: a recording (folder, video, bag, tour:SEED), the number of a camera, or - for lines of JSON
         follow: the source is a folder to which images are added, named by their time
         speed: of a recording, 2 = twice as fast
-        seconds: end after so long
+        seconds: end after so long, counted from the first image
         idle: with --follow, end after so long without a new image [s]
         max_wait: for the poses after an image [s]
         state: file in which the state is kept, and from which it goes on
