@@ -236,7 +236,8 @@ PUBLIC = {
         lambda **k: network_of_zeros()(**k), IMAGE_GOOD | dict.fromkeys(("valid", "features", "anchors")),
     ),
     "update": (
-        lambda **k: network_of_zeros().update(**k), {"prediction": DepthPrediction(DEPTH), "pose": POSE, "intrinsics": K},
+        lambda **k: network_of_zeros().update(**k),
+        {"prediction": DepthPrediction(DEPTH), "pose": POSE, "intrinsics": K},
     ),
     "stream": (lambda **k: list(network_of_zeros().stream(**k)), {"frames": []}),
     "with_values": (UfMStarConfig().with_values, {"values": {}}),

@@ -232,9 +232,8 @@ class UncertainDepth(NetworksInTurn):
             TypeError, ValueError: see the class.
         """
         members = modules_of(networks)
-        return members, shared_preprocess(members) if isinstance(
-            preprocess, str
-        ) and preprocess == "own" else preprocess
+        own = isinstance(preprocess, str) and preprocess == "own"
+        return members, shared_preprocess(members) if own else preprocess
 
     def forward(
         self,
