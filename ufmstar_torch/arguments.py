@@ -100,13 +100,13 @@ def require_size(name: str, value: object) -> tuple[int, int]:
     return height, width
 
 
-def as_device(name: str, value: object, default: str = "cpu") -> torch.device:
+def as_device(name: str, value: Any, default: str = "cpu") -> torch.device:
     """The argument ``name`` as a device, ``default`` for None. Raises TypeError, ValueError: no device."""
     if value is None:
         return torch.device(default)
-    require_kind(name, value, (torch.device, str, int), "a torch.device, its name or None")
+    require_kind(name, value, (torch.device, str), "a torch.device, its name or None")
     try:
-        return torch.device(require_whole(name, value, 0) if isinstance(value, int) else value)
+        return torch.device(value)
     except RuntimeError as error:
         raise ValueError(f"{name} must be a device such as 'cpu' or 'cuda:0', got {value!r}: {error}") from error
 
