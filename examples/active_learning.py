@@ -65,8 +65,10 @@ def main(seeds: int = 4, frames: int = 160, labels: int = 12, steps: int = 60) -
             for x, truth, *_ in held_back:
                 rmse.update(torch.no_grad()(network)(x).depth, None, truth)
             rows.append(float(rmse.compute()["rmse"]))
+    print(f"{'choice':8} {'RMSE [m]':>9}  difference to random [m]{', 95 % interval' * (seeds > 1)}")
     for name, rows in results.items():
-        print(name, np.mean(rows).round(3), *np.round(mean_and_ci(np.subtract(rows, results["random"])), 3))
+        mean, interval = mean_and_ci(np.subtract(rows, results["random"]))
+        print(f"{name:8} {np.mean(rows):9.3f}  {mean:+.3f}{f' +- {interval:.3f}' * (seeds > 1)}")
     return results
 
 

@@ -56,8 +56,11 @@ def main(walks: int = 4, frames: int = 64, cost: float = 0.06) -> dict[str, list
         order = [*range(8), *np.random.default_rng(seed).permutation(range(8, frames)).tolist()]
         for name, count in (("random", results["decided"][-1][0]), ("all", frames), ("none", 0)):
             results[name].append(walk(images, deepcopy(start), set(order[:count])))
+    print(f"{'choice':8} {'updates':>8} {'RMSE [m]':>9}  difference to random [m]{', 95 % interval' * (walks > 1)}")
     for name, rows in results.items():
-        print(name, *np.mean(rows, 0).round(3), *np.round(mean_and_ci(np.subtract(rows, results["random"])[:, 1]), 3))
+        updates, rmse = np.mean(rows, 0)
+        mean, interval = mean_and_ci(np.subtract(rows, results["random"])[:, 1])
+        print(f"{name:8} {updates:8.1f} {rmse:9.3f}  {mean:+.3f}{f' +- {interval:.3f}' * (walks > 1)}")
     return results
 
 

@@ -1,8 +1,11 @@
 """Fuse a run's depth into a TSDF, with equal weights or with 1/sigma^2, and print the surface error [cm].
 
+
+The second argument is the run's recording, whose ground truth is compared; without it, the surface alone is counted.
+
     ufmstar run "tour:5?frames=60&size=120x160" --model trained --weights models/weights/demo.safetensors \\
         --out out/tour
-    python examples/tsdf.py out/tour
+    python examples/tsdf.py out/tour "tour:5?frames=60&size=120x160"
 """
 
 import sys
@@ -11,8 +14,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ufmstar_torch.eval.run.export import gated_frames, run_summary
+from ufmstar_torch.eval.run.export import gated_frames
 from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.limits import require_bytes
 
 VOXEL, TRUNCATION = 0.08, 0.4  # [m]; the truncation is about the posterior's mean sigma
 WEIGHTS = {"all alike": np.ones_like, "1/sigma^2": lambda sigma: 1 / np.maximum(sigma, 0.01) ** 2}
@@ -48,21 +52,36 @@ def surface(total, weight, low):
     return np.concatenate(points)[np.argsort(-np.concatenate(support))]
 
 
-def main(out):
-    """Print and return, by weights: mean error [cm] and share of the true surface within 10 cm, best half and all."""
-    frames, sequence, true = (
-        list(gated_frames(out, np.inf, np.inf)),
-        open_sequence(run_summary(out)["settings"]["sequence"]),
-        [],
-    )
-    for frame in (sequence[frame.index] for frame in frames):
-        v, u = (one[::4] for one in np.nonzero(frame.depth))
+def points_of(frames):
+    """[P, 3] every fourth point of the frames' depth maps [m]."""
+    points = [np.zeros((0, 3))]
+    for frame in frames:
+        v, u = (one[::4] for one in np.nonzero(frame.depth > 0))
         rays = np.linalg.inv(frame.intrinsics) @ np.stack([u, v, np.ones_like(u)])
-        true.append((rays * frame.depth[v, u]).T @ frame.T_world_cam[:3, :3].T + frame.T_world_cam[:3, 3])
-    tree, results = cKDTree(np.concatenate(true)), {}
-    low = tree.mins - 2 * VOXEL
-    for name, sums in fuse(frames, low, tuple(np.ceil((tree.maxes - low) / VOXEL).astype(int) + 2)).items():
+        points.append((rays * frame.depth[v, u]).T @ frame.T_world_cam[:3, :3].T + frame.T_world_cam[:3, 3])
+    return np.concatenate(points)
+
+
+def main(out, recording=None):
+    """Print and return, by weights: mean error [cm] and share of the true surface within 10 cm, best half and all;
+    without ground truth the number of points on the surface."""
+    frames, sequence = list(gated_frames(out, np.inf, np.inf)), recording and open_sequence(recording)
+    known = [sequence[frame.index] for frame in frames] if sequence else []
+    true = points_of([frame for frame in known if frame.depth is not None])
+    extent = true if len(true) else points_of(frames)
+    if not len(true):
+        print("no ground truth, so no error: the second argument names the run's recording" if not sequence else
+              f"{sequence.name} has no ground truth, so no error")  # fmt: skip
+    low, results = extent.min(0) - 2 * VOXEL, {}
+    shape = tuple(np.ceil((extent.max(0) - low) / VOXEL).astype(int) + 2)
+    require_bytes(f"a grid of {' x '.join(map(str, shape))} voxels", int(np.prod(shape, dtype=float)) * 8 * 12)
+    tree = cKDTree(true) if len(true) else None
+    for name, sums in fuse(frames, low, shape).items():
         points = surface(*sums, low)
+        if tree is None:
+            results[name] = len(points)
+            print(f"{name:10} {len(points)} points on the surface")
+            continue
         for part, chosen in (("best half", points[: len(points) // 2]), ("all", points)):
             covered = float(np.mean(cKDTree(chosen).query(tree.data[::40])[0] < 0.1))
             results[name, part] = 100 * float(tree.query(chosen)[0].mean()), covered
@@ -71,4 +90,4 @@ def main(out):
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), *sys.argv[2:3])

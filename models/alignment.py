@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ufmstar_torch.arguments import require_flag, require_float, require_mask, require_number, require_whole
 from ufmstar_torch.checked import Checked, number
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import as_map
@@ -63,7 +64,10 @@ class Alignment(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("scale", "shift"):
-            value = torch.as_tensor(getattr(self, name), dtype=torch.float64)
+            try:
+                value = torch.as_tensor(getattr(self, name), dtype=torch.float64)
+            except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+                raise TypeError(f"Alignment.{name} must be a number or [B], got {getattr(self, name)!r:.60}") from error
             object.__setattr__(self, name, value)
             if not value.isfinite().all():
                 raise ValueError(f"Alignment.{name} must be finite, got {value.tolist()}")
@@ -213,8 +217,14 @@ def _fit(
     min_points: int = 10,
     max_depth: float | None = None,
 ) -> AlignmentFit:
+    for name, value in (("prediction", prediction), ("depth", depth)):
+        require_float(name, value)
+    if valid is not None:
+        require_mask("valid", valid, [tuple(depth.shape)])
+    shift = None if shift is None else require_number("shift", shift)
+    pooled, robust = require_flag("pooled", pooled), require_flag("robust", robust)
     unknowns = 2 if shift is None else 1
-    if min_points < unknowns:
+    if require_whole("min_points", min_points) < unknowns:
         raise ValueError(f"min_points must be at least {unknowns}, got {min_points}")
     x, measured, use, weight = _points(prediction, depth, valid, weights, pooled)
     count = use.sum(1)

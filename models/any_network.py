@@ -13,6 +13,7 @@ from zipfile import BadZipFile
 import torch
 from torch import Tensor, nn
 
+from ufmstar_torch.arguments import require_flag
 from ufmstar_torch.models.hugging_face import from_hugging_face, of_transformers
 from ufmstar_torch.models.network import DeclaredNetwork, DepthNetwork
 from ufmstar_torch.models.outputs import METRIC, OutputSpec, PlainSpec, ProgramSpec, Spread
@@ -143,6 +144,8 @@ def wrap_network(
     """
     if isinstance(network, type) or not callable(network):
         raise TypeError(f"network must be an nn.Module or a function, got {_described(network)}")
+    for name, value in (("inverse", inverse), ("resize", resize), ("takes_intrinsics", takes_intrinsics)):
+        require_flag(name, value)
     refuse_relative(network)
     if isinstance(network, nn.Module):
         require_switchable(network)

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ufmstar_torch.arguments import as_path, require_kind
 from ufmstar_torch.atomic import write_atomic
 from ufmstar_torch.optional import optional
 from ufmstar_torch.tensor_files import DAMAGE as DAMAGE
@@ -139,7 +140,11 @@ def save_checkpoint(
         CheckpointError: another suffix.
         ModuleNotFoundError: .safetensors without the package safetensors.
     """
-    path = Path(path)
+    path = as_path("path", path)
+    require_kind("weights", weights, (nn.Module, Mapping), "a module or its state_dict")
+    metadata = {} if metadata is None else require_kind("metadata", metadata, Mapping, "a mapping")
+    if not isinstance(weights, nn.Module) and not all(isinstance(value, Tensor) for value in weights.values()):
+        raise TypeError("weights must be a module or its state_dict, tensors by name")
     state = weights.state_dict() if isinstance(weights, nn.Module) else dict(weights)
     state = {key: value.detach().cpu().contiguous() for key, value in state.items()}
     text = json.dumps(dict(metadata or {}))

@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ufmstar_torch.arguments import require_whole
 from ufmstar_torch.models.distribution import DepthDistribution, EvidentialDepth, GaussianDepth, PointDepth, images_of
 from ufmstar_torch.models.network import Backbone, DepthNetwork
 from ufmstar_torch.prediction import DepthPrediction
@@ -144,7 +145,8 @@ def with_head(backbone: Backbone, method: str, scales: int = 1) -> UncertaintyNe
     if not isinstance(backbone, Backbone):
         remedy = "train_module(NETWORK, ...) of ufmstar_torch.train puts a head on any network"
         raise TypeError(f"backbone must be a Backbone such as FastDepth, got {type(backbone).__name__}: {remedy}")
-    if method not in HEADS:
+    require_whole("scales", scales, 1)
+    if not isinstance(method, str) or method not in HEADS:
         raise ValueError(f"method must be one of {list(HEADS)}, got {method!r}")
     return UncertaintyNetwork(backbone, HEADS[method], scales)
 

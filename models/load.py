@@ -6,6 +6,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from ufmstar_torch.arguments import as_path
 from ufmstar_torch.models.network import DepthNetwork
 
 # Name -> module and function of its loader.
@@ -57,10 +58,11 @@ def load_network(name: str, weights: str | Path | None = None, **options: Any) -
         TypeError: an unknown option of this network.
         FileNotFoundError, ModuleNotFoundError: a file or an optional package is missing.
     """
-    if name not in _LOADERS:
-        raise ValueError(f"unknown network {name!r}, expected one of {list(_LOADERS)}")
+    if not isinstance(name, str) or name not in _LOADERS:
+        raise ValueError(f"name: unknown network {name!r:.60}, expected one of {list(_LOADERS)}")
     if weights is None:
         raise ValueError(f"network {name!r} needs weights: the file to load")
+    weights = as_path("weights", weights)
     module, loader = _LOADERS[name]
-    network: DepthNetwork = getattr(import_module(f"ufmstar_torch.models.{module}"), loader)(Path(weights), **options)
+    network: DepthNetwork = getattr(import_module(f"ufmstar_torch.models.{module}"), loader)(weights, **options)
     return network.eval()

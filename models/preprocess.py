@@ -81,14 +81,16 @@ class Preprocess(Checked):
         super().__post_init__()
         for name in ("crop", "size"):
             value = getattr(self, name)
-            if value is not None and (len(value) != 2 or min(value) < 1 or any(v != int(v) for v in value)):
-                raise ValueError(f"Preprocess.{name} must be (height, width) in pixels, got {value}")
+            whole = isinstance(value, tuple) and len(value) == 2 and all(_is_whole(side) for side in value)
+            if value is not None and not (whole and min(value) > 0):
+                raise ValueError(f"Preprocess.{name} must be (height, width) in pixels, got {value!r:.60}")
             require_pixels(f"Preprocess.{name}", value or (0, 0))
         require_pixels("Preprocess.resize_height", (self.resize_height or 0,) * 2)
         multiple = self.aspect_multiple
-        if multiple is not None and (multiple != int(multiple) or self.size is None):
+        if multiple is not None and (not _is_whole(multiple) or self.size is None):
             raise ValueError(f"Preprocess.aspect_multiple must be whole pixels and needs a size, got {multiple}")
-        if len(self.mean) != 3 or len(self.std) != 3 or not min(self.std) > 0:
+        numbers = all(isinstance(v, tuple) and len(v) == 3 and all(map(_is_number, v)) for v in (self.mean, self.std))
+        if not numbers or not min(self.std) > 0:
             raise ValueError(
                 f"Preprocess.mean and .std must be 3 numbers, std positive, got {self.mean} and {self.std}"
             )
@@ -201,6 +203,14 @@ class Preprocess(Checked):
         mode = "bicubic" if self.cubic else "bilinear"
         resized = F.interpolate(x, size, mode=mode, align_corners=False, antialias=self.antialias)
         return resized.clamp(0, 1) if self.cubic else resized
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < float("inf")
+
+
+def _is_whole(value: object) -> bool:
+    return _is_number(value) and value == int(value)  # type: ignore[call-overload]
 
 
 def _check(image: Tensor) -> None:

@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ufmstar_torch.arguments import as_path
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble
 from ufmstar_torch.models.checkpoints import (
     CheckpointError,
@@ -127,7 +128,8 @@ def load_trained(
         FileNotFoundError, CheckpointError, ModuleNotFoundError: as :func:`read_info`; and if weights are missing,
             unexpected, of another shape or not finite, with ``lazy`` at the first call.
     """
-    paths = [path] if isinstance(path, str | Path) else list(path)
+    several = isinstance(path, Iterable) and not isinstance(path, str | bytes)
+    paths = [as_path("path", one) for one in (path if several else [path])]
     members: list[DepthNetwork] = []
     for file in [_TrainedFile(Path(p), backbone) for p in paths]:
         if not lazy and not offload:

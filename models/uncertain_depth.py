@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
+import numpy as np
 from torch import Tensor, nn
 
 from ufmstar_torch import networks_in_turn, pipeline
@@ -23,7 +24,7 @@ class UncertainDepth(pipeline.UncertainDepth):
         """See the base class. Wraps functions, and models and pipelines of ``transformers``, whose ``preprocess`` may
         be a ``Preprocess`` or an image processor."""
         members: list[Any] = [networks]
-        if isinstance(networks, Iterable) and not isinstance(networks, nn.Module | str | Mapping):
+        if isinstance(networks, Iterable) and not isinstance(networks, nn.Module | str | Mapping | Tensor | np.ndarray):
             members = list(networks)
         for member in members:
             refuse_relative(member)

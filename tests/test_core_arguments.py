@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -18,7 +21,8 @@ from ufmstar_torch import (
     UncertainDepth,
     pipeline,
 )
-from ufmstar_torch.models import Preprocess, wrap_network
+from ufmstar_torch.camera import crop_intrinsics, resize_intrinsics
+from ufmstar_torch.models import Preprocess, load_network, save_checkpoint, wrap_network
 from ufmstar_torch.networks_in_turn import combine
 from ufmstar_torch.recalibrate import Recalibration
 
@@ -198,6 +202,135 @@ def far(dtype, metres=5e6):
     T = torch.eye(4, dtype=torch.float64)
     T[1, 3] = metres
     return T.to(dtype)
+
+
+WRONG = (
+    *(None, "text", b"bytes", 5, 3.5, float("nan"), True, [], {}, object(), ["a"], 10**400, nn.Conv2d(3, 1, 1)),
+    *(np.array("a"), np.zeros(3), torch.zeros(()), torch.zeros(2, 3, 4, 5, 6), torch.zeros(3, dtype=torch.bool)),
+    *(torch.zeros(1, H, W, device="meta"), UfMStarConfig()),
+)
+GOOD = {"depth": DEPTH, "pose": POSE, "intrinsics": K}
+IMAGE_GOOD = {"image": torch.zeros(1, 3, H, W), "pose": POSE, "intrinsics": K}
+SAMPLE = {"pixels": None, "fraction": None, "seed": 0, "average": False}
+
+
+def network_of_zeros():
+    return UncertainDepth(nn.Conv2d(3, 1, 1), check_poses=0)
+
+
+PUBLIC = {
+    "UfMStar": (UfMStar, {"config": None, "extensions": (), "dtype": torch.float32, "device": None}),
+    "forward": (
+        lambda **k: seen()(**k), GOOD | dict.fromkeys(("aleatoric", "epistemic", "valid", "features")),
+    ),
+    "mean_uncertainty": (lambda **k: seen().mean_uncertainty(**k), GOOD | SAMPLE),
+    "query": (lambda **k: seen().query(**k), {"points": torch.zeros(1, 1, 3), "frame": "world"}),
+    "reset": (lambda **k: seen().reset(**k), {"streams": None, "keep_evidence": False}),
+    "warm_up": (lambda **k: seen().warm_up(**k), {"size": (H, W), "streams": 1, "progress": None}),
+    "UncertainDepth": (
+        UncertainDepth,
+        {"networks": nn.Conv2d(3, 1, 1), "config": None, "mode": "alternate", "posterior": False, "samples": None,
+         "anchors": None, "recalibration": None, "check_poses": 0, "multiview_device": None},
+    ),
+    "UncertainDepth.forward": (
+        lambda **k: network_of_zeros()(**k), IMAGE_GOOD | dict.fromkeys(("valid", "features", "anchors")),
+    ),
+    "update": (
+        lambda **k: network_of_zeros().update(**k),
+        {"prediction": DepthPrediction(DEPTH), "pose": POSE, "intrinsics": K},
+    ),
+    "stream": (lambda **k: list(network_of_zeros().stream(**k)), {"frames": []}),
+    "with_values": (UfMStarConfig().with_values, {"values": {}}),
+    "from_dict": (UfMStarConfig.from_dict, {"values": {}}),
+    "from_json": (UfMStarConfig.from_json, {"path": "none"}),
+    "resize_intrinsics": (resize_intrinsics, {"intrinsics": K, "old": (4, 4), "new": (8, 8)}),
+    "crop_intrinsics": (crop_intrinsics, {"intrinsics": K, "top": 1, "left": 1}),
+    "wrap_network": (wrap_network, {"network": nn.Conv2d(3, 1, 1), "inverse": False, "resize": False, "scale": 1.0}),
+    "save_checkpoint": (save_checkpoint, {"path": "none/n.pth", "weights": nn.Conv2d(3, 1, 1), "metadata": None}),
+    "load_network": (load_network, {"name": "fastdepth", "weights": "none"}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_a_wrong_kind_of_argument_is_named(name, tmp_path, monkeypatch):
+    """A value of any kind in place of any argument is used, or refused by an error that names it."""
+    monkeypatch.chdir(tmp_path)
+    call, arguments = PUBLIC[name]
+    for argument in arguments:
+        names = {argument, argument.removesuffix("s"), "none", "text", *(["image"] if argument == "networks" else [])}
+        for value in () if argument == "progress" else WRONG:
+            with ExitStack() as stack:
+                stack.push(partial(refused, names, value))
+                call(**{**arguments, argument: value})
+
+
+def refused(names, value, kind, error, _):
+    """Suppress an error about an argument that names it."""
+    if kind is not None and issubclass(kind, (TypeError, ValueError, IndexError, FileNotFoundError)):
+        assert any(name in str(error) for name in names), (names, value, error)
+        return True
+    return False
+
+
+class Trainer(nn.Module):
+    """As Ultralytics' YOLO: its ``train`` starts a training."""
+
+    def __init__(self):
+        super().__init__()
+        self.model, self.started = nn.Conv2d(3, 1, 1), False
+
+    def train(self, trainer=None, **_):
+        self.started = True
+
+    def forward(self, x):
+        return self.model(x)
+
+
+class Freezes(nn.Module):
+    """A network with a mode of its own, in PyTorch's form."""
+
+    def __init__(self):
+        super().__init__()
+        self.model = nn.Conv2d(3, 1, 1)
+
+    def train(self, mode=True):
+        return super().train(False if mode else mode)
+
+    def forward(self, x):
+        return self.model(x)
+
+
+@pytest.mark.parametrize("place", ["alone", "in a list", "inside", "wrapped"])
+def test_a_network_whose_train_starts_a_training_is_refused(place):
+    network = Trainer()
+    call = {
+        "alone": lambda: UncertainDepth(network),
+        "in a list": lambda: UncertainDepth([nn.Conv2d(3, 1, 1), network]),
+        "inside": lambda: UncertainDepth(nn.Sequential(network)),
+        "wrapped": lambda: wrap_network(network),
+    }[place]
+    with pytest.raises(TypeError, match=r"a Trainer,? whose train\(trainer\) is not PyTorch's .*NETWORK.model"):
+        call()
+    assert not network.started
+    UncertainDepth(network.model)
+    UncertainDepth(Freezes())
+
+
+@pytest.mark.parametrize("name", ["depth", "aleatoric", "epistemic", "valid", "features"])
+def test_the_mask_of_an_array_is_valid(name):
+    """A masked entry is the same as False in ``valid``."""
+    masked = np.zeros((1, H, W), bool)
+    masked[:, :, W // 2 :] = True
+    config = UfMStarConfig(features=1)
+    maps = {name: np.full((1, H, W), value) for name, value in (("depth", 2.0), ("aleatoric", 0.1), ("epistemic", 0.1))}
+    maps |= {"valid": np.ones((1, H, W), bool), "features": np.ones((1, 1, H, W))}
+    expected = UfMStar(config)(pose=POSE, intrinsics=K, **{**maps, "valid": ~masked})
+    mask = masked[:, None] if name == "features" else masked
+    out = UfMStar(config)(pose=POSE, intrinsics=K, **{**maps, name: np.ma.masked_array(maps[name], mask)})
+    assert torch.equal(out.valid, expected.valid)
+    torch.testing.assert_close(out.variance[out.valid], expected.variance[out.valid], rtol=0, atol=0)
+    with pytest.raises(TypeError, match="image must not be masked"):
+        network_of_zeros()(np.ma.masked_array(np.zeros((H, W, 3), np.uint8), np.ones((H, W, 3), bool)), POSE, K)
 
 
 def test_numbers_of_numpy_are_numbers():

@@ -192,14 +192,18 @@ def test_lines_of_json(tmp_path):
         ('{"stamp": 1, "pose": [1, 2, 3]}', r"line 1: a pose has 7 \(x y z qx qy qz qw\) or 12"),
         ('{"stamp": 1, "pose": [1, 2, 3, 0, 0, 0, 2]}', "line 1: pose: the quaternion's norm is 2"),
         ('{"stamp": 1, "pose": [[1, 2], [3]]}', "line 1: "),
-        ('{"stamp": 1, "image": "none.png"}', r"line 1: .*none\.png"),
-        ('{"stamp": 1, "image": "data:;base64,%"}', "line 1: "),
+        (
+            '{"stamp": 1, "image": "none.png"}',
+            "line 1: an image needs intrinsics, in its line, an earlier",
+        ),
+        ('{"intrinsics": [1, 2]}', "line 1: intrinsics are fx, fy, cx, cy"),
+        ('{"stamp": 1, "image": "data:;base64,%", "intrinsics": [9, 9, 4, 4]}', "line 1: "),
         *(
             (f'{{"stamp": {stamp}, "pose": [1, 2, 3, 0, 0, 0, 1]}}', "line 1: .*(finite|too large)")
             for stamp in ("NaN", "1e999", 10**400)
         ),
         ("[" * 100000, "line 1: "),
-        ('{"stamp": 1, "image": 5}', "line 1: an image is the name of a file, got 5"),
+        ('{"stamp": 1, "image": 5, "intrinsics": [9, 9, 4, 4]}', "line 1: an image is the name of a file, got 5"),
     ],
 )
 def test_a_line_that_is_none_is_named(tmp_path, line, text):
@@ -283,6 +287,23 @@ def test_lines_on_standard_input_live(ufmstar, tmp_path, monkeypatch):
     code, _, err = ufmstar("-")
     assert code == 1
     assert "intrinsics of the image are needed" in err
+
+
+def test_intrinsics_hold_for_later_lines_and_images_may_be_missing(tmp_path, caplog):
+    (tmp_path / "a.png").write_bytes(content(np.full((8, 8, 3), 7, np.uint8)))
+    lines = [
+        {"intrinsics": [9, 9, 4, 4]},
+        {"stamp": 1, "image": "a.png"},
+        {"stamp": 2, "image": "none.png"},
+        {"stamp": 3, "image": "none.png", "pose": [0, 0, 0, 0, 0, 0, 1]},
+        {"stamp": 4, "image": "a.png", "intrinsics": [8, 8, 4, 4]},
+        {"stamp": 5, "image": "a.png"},
+    ]
+    events = list(json_lines(map(json.dumps, lines), tmp_path))
+    assert [(event.stamp, event.image is not None) for event in events] == [(1, True), (3, False), (4, True), (5, True)]
+    assert [event.intrinsics[0] for event in events] == [9, 9, 8, 8]
+    assert "line 3: the image is left out: " in caplog.text
+    assert "2 images could not be read" in caplog.text
 
 
 def test_a_folder_that_grows_live(ufmstar, tmp_path):

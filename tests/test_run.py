@@ -421,6 +421,22 @@ DAMAGED = {
 }
 
 
+@pytest.mark.parametrize("name", ["valid_pixels", "mean_sigma", "ground_truth", "ms"])
+def test_a_record_without_a_figure_is_named_when_a_run_is_resumed(path, tmp_path, name):
+    out = tmp_path / "out"
+    run(network_job(path, frames=slice(0, 2)), out)
+    first, second = (json.loads(line) for line in (out / "frames.jsonl").read_text().splitlines())
+    del second[name]
+    (out / "frames.jsonl").write_text(f"{json.dumps(first)}\n{json.dumps(second)}\n")
+    with pytest.raises(FolderError, match=rf"frames.jsonl, line 2 has no .*{name}"):
+        run(network_job(path, frames=slice(0, 2)), out, resume=True)
+    manifest = json.loads((out / "resume" / "run.json").read_text())
+    del manifest["identity"]
+    (out / "resume" / "run.json").write_text(json.dumps(manifest))
+    with pytest.raises(FolderError, match=r"run.json is damaged .*--overwrite starts again"):
+        run(network_job(path, frames=slice(0, 2)), out, resume=True)
+
+
 @pytest.mark.parametrize("name", DAMAGED)
 def test_a_damaged_run_says_so(path, tmp_path, name):
     out = tmp_path / "out"

@@ -17,6 +17,7 @@ from ufmstar_torch.eval.run.files import write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.machine import hardware, versions
 from ufmstar_torch.models.trained import load_for_training, save_trained
+from ufmstar_torch.train.checkpoints import ResumeError
 from ufmstar_torch.train.folder import SUMMARY, open_folder
 from ufmstar_torch.train.member import RESULT, WEIGHTS, make_trainer, quiet_lightning, train_member
 from ufmstar_torch.train.presets import text_table
@@ -82,7 +83,17 @@ def _meet(trainer: pl.Trainer, out: Path) -> None:
 def read_result(job: Job, member: int) -> dict[str, Any]:
     """The content of a member's result.json; empty if there is none."""
     file = job.folder(member) / RESULT
-    return dict(json.loads(file.read_text(encoding="utf-8"))) if file.is_file() else {}
+    if not file.is_file():
+        return {}
+    try:
+        result = json.loads(file.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ResumeError(f"{file} is not the result of a member: {error}; --overwrite starts again") from error
+    if not isinstance(result, dict):
+        raise ResumeError(
+            f"{file} is not the result of a member, but {type(result).__name__}; --overwrite starts again"
+        )
+    return result
 
 
 def train_members(job: Job, *, end: float | None = None, asked: Callable[[], bool] | None = None) -> str | None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Protocol, TypeAlias, cast
 
 import numpy as np
@@ -53,6 +55,65 @@ def _unmasked(name: str, value: np.ma.MaskedArray[Any, Any]) -> NDArray[Any]:
     if value.dtype.kind in "iu" and np.ma.is_masked(value):
         raise TypeError(f"{name} must not be masked, since {value.dtype} has no value that is not valid: pass floats")
     return np.asarray(value.filled(np.nan if value.dtype.kind == "f" else False))
+
+
+def require_kind(name: str, value: Any, kinds: type | tuple[type, ...], expected: str) -> Any:
+    """Return the argument ``name`` if it has one of the types. Raises TypeError; ``expected`` describes them."""
+    if not isinstance(value, kinds):
+        raise TypeError(f"{name} must be {expected}, got {type(value).__name__}")
+    return value
+
+
+def require_flag(name: str, value: object) -> bool:
+    """The argument ``name`` if it is True or False. Raises TypeError: another type."""
+    return bool(require_kind(name, value, (bool, np.bool_), "True or False"))
+
+
+def require_whole(name: str, value: object, least: int | None = None) -> int:
+    """The argument ``name`` if it is a whole number, of at least ``least``. Raises TypeError: another type; ValueError:
+    a smaller number, or one beyond 64 bits."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise TypeError(f"{name} must be a whole number, got {type(value).__name__}")
+    if (least is not None and value < least) or not -(2**63) <= value < 2**63:
+        raise ValueError(f"{name} must be a whole number of at least {least or 0}, got {value}")
+    return int(value)
+
+
+def require_number(name: str, value: object) -> float:
+    """The argument ``name`` as a float. Raises TypeError: no number; ValueError: beyond the range of floats."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        raise TypeError(f"{name} must be a number, got {type(value).__name__}")
+    try:
+        return float(value)
+    except OverflowError:
+        raise ValueError(
+            f"{name} must be a number within the range of floats, got one of {len(str(value))} digits"
+        ) from None
+
+
+def require_size(name: str, value: object) -> tuple[int, int]:
+    """The argument ``name`` if it is (H, W), two positive whole numbers [px]. Raises TypeError, ValueError."""
+    if not isinstance(value, tuple | list | torch.Size) or len(value) != 2:
+        kind = f"{len(value)} values" if isinstance(value, tuple | list) else type(value).__name__
+        raise TypeError(f"{name} must be (H, W), positive whole numbers, got {kind}")
+    height, width = (require_whole(name, side, 1) for side in value)
+    return height, width
+
+
+def as_device(name: str, value: Any, default: str = "cpu") -> torch.device:
+    """The argument ``name`` as a device, ``default`` for None. Raises TypeError, ValueError: no device."""
+    if value is None:
+        return torch.device(default)
+    require_kind(name, value, (torch.device, str), "a torch.device, its name or None")
+    try:
+        return torch.device(value)
+    except RuntimeError as error:
+        raise ValueError(f"{name} must be a device such as 'cpu' or 'cuda:0', got {value!r}: {error}") from error
+
+
+def as_path(name: str, value: object) -> Path:
+    """The argument ``name`` as a path. Raises TypeError: no text and no path."""
+    return Path(require_kind(name, value, (str, os.PathLike), "a file name or path"))
 
 
 def as_image(image: ImageLike) -> Tensor:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ufmstar_torch.arguments import require_float, require_number, require_size
 from ufmstar_torch.fixed_order import apply, congruence, product
 
 # Newton-Schulz contracts a deviation e of R^T R from I to about 0.75 e^2. From the largest tolerance, 0.1, it reaches
@@ -116,10 +117,10 @@ def resize_intrinsics(intrinsics: Tensor, old: tuple[int, int], new: tuple[int, 
     ``interpolate(align_corners=False)`` resample this way.
 
     Raises:
-        ValueError: a size is not positive.
+        TypeError, ValueError: no tensor, or a size is not (H, W) in positive numbers.
     """
-    if min(*old, *new) <= 0:
-        raise ValueError(f"old and new must be positive sizes (H, W), got {old} and {new}")
+    _require_matrix(intrinsics)
+    old, new = require_size("old", old), require_size("new", new)
     sy, sx = new[0] / old[0], new[1] / old[1]
     scale = intrinsics.new_tensor([[sx, sx, sx], [sy, sy, sy], [1.0, 1.0, 1.0]])
     shift = intrinsics.new_tensor([[0.0, 0.0, (sx - 1) / 2], [0.0, 0.0, (sy - 1) / 2], [0.0, 0.0, 0.0]])
@@ -128,5 +129,13 @@ def resize_intrinsics(intrinsics: Tensor, old: tuple[int, int], new: tuple[int, 
 
 def crop_intrinsics(intrinsics: Tensor, top: int, left: int) -> Tensor:
     """Intrinsics [..., 3, 3] after ``top`` rows and ``left`` columns [px] were cut off (negative: padded)."""
+    _require_matrix(intrinsics)
+    top, left = require_number("top", top), require_number("left", left)
     shift = intrinsics.new_tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
     return intrinsics - shift
+
+
+def _require_matrix(intrinsics: Tensor) -> None:
+    """Raises TypeError, ValueError: no floating-point tensor [..., 3, 3]."""
+    if require_float("intrinsics", intrinsics).shape[-2:] != (3, 3):
+        raise ValueError(f"intrinsics must be [..., 3, 3], got {tuple(intrinsics.shape)}")

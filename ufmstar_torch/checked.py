@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import MISSING, Field, asdict, field, fields, replace
 from pathlib import Path
@@ -60,7 +61,7 @@ class Checked:
                 _check_number(f"{owner}.{f.name}", value, f.metadata)
                 if isinstance(f.default, int) and not isinstance(value, int):
                     raise ValueError(f"{owner}.{f.name} must be a whole number, got {value!r}")
-            if "choices" in f.metadata and value not in f.metadata["choices"]:
+            if "choices" in f.metadata and not (isinstance(value, str | int) and value in f.metadata["choices"]):
                 raise ValueError(f"{owner}.{f.name} must be one of {f.metadata['choices']}, got {value!r}")
             kind = f.metadata.get("section")
             if kind is not None and not isinstance(value, kind) and not (value is None and f.metadata["optional"]):
@@ -76,6 +77,8 @@ class Checked:
             ValueError: an unknown key, a missing field without a default, or an invalid value.
         """
         by_name = {f.name: f for f in fields(cls)}
+        if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
+            raise ValueError(f"values must be a mapping of {cls.__name__}'s fields by name, got {values!r:.60}")
         if unknown := sorted(set(values) - set(by_name)):
             raise ValueError(f"{cls.__name__} has no {unknown}; it has {list(by_name)}")
         needed = [n for n, f in by_name.items() if f.default is MISSING and f.default_factory is MISSING]
@@ -91,6 +94,8 @@ class Checked:
             FileNotFoundError: there is no such file.
             ValueError: the file holds no JSON object, or as :meth:`from_dict`; the message names the file.
         """
+        if not isinstance(path, str | Path):
+            raise TypeError(f"path must be a file name or path, got {type(path).__name__}")
         try:
             values = json.loads(Path(path).read_text(encoding="utf-8"))
         except (ValueError, RecursionError) as error:
@@ -116,6 +121,8 @@ class Checked:
         Raises:
             ValueError: an unknown name, or an invalid value.
         """
+        if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
+            raise ValueError(f"values must be a mapping of {type(self).__name__}'s fields by name, got {values!r:.60}")
         changes: dict[str, Any] = {}
         within: dict[str, dict[str, Any]] = {}
         for name, value in values.items():
@@ -154,6 +161,8 @@ def _rich(owner: type, name: str, value: Any) -> Any:
 
 def _check_number(name: str, value: object, metadata: Mapping[str, Any]) -> None:
     low, high, open_low = metadata["range"]
+    if isinstance(value, int) and abs(value) > sys.float_info.max:
+        raise ValueError(f"{name} must be within the range of floats, got a number of {value.bit_length()} bits")
     if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
         raise ValueError(f"{name} must be a number, got {value!r}")
     outside = value < low or value > high or (open_low and value == low) or (metadata["open_high"] and value == high)

@@ -96,6 +96,8 @@ class SPGFConfig(Checked):
         Raises:
             ValueError: another name.
         """
+        if not isinstance(name, str):
+            raise ValueError(f"name must be that of a preset, got {name!r:.60}")
         tartanair = {"adaptive_thresh_scale": 0.70, "min_rows": 8, "reference_focal": 320.0}
         outdoor = {"noise_floor": 0.25, "noise_thresh": 0.5, "min_gaussian_length": 0.6}
         presets: dict[str, dict[str, Any]] = {

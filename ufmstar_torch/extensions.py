@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ufmstar_torch.anchors.extension import AnchorExtension
+from ufmstar_torch.arguments import require_kind
 from ufmstar_torch.confidence import ConfidenceExtension
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Extension, Extensions
@@ -19,6 +20,8 @@ def extensions_of(config: UfMStarConfig, further: Sequence[Extension] = ()) -> E
     Raises:
         ValueError: an extension does not fit the config.
     """
+    for extension in require_kind("extensions", further, (list, tuple), "a list of extensions"):
+        require_kind("extensions", extension, Extension, "a list of extensions")
     each: list[Extension] = []
     if config.anchors is not None:
         each.append(AnchorExtension(config, select_anchors))

@@ -19,7 +19,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.arguments import CameraLike, ImageLike, as_image, as_intrinsics, as_pose
+from ufmstar_torch.arguments import (
+    CameraLike,
+    ImageLike,
+    as_image,
+    as_intrinsics,
+    as_path,
+    as_pose,
+    require_number,
+)
 from ufmstar_torch.atomic import remove_temporaries, write_atomic
 from ufmstar_torch.camera import rotation_deviation
 from ufmstar_torch.file_lock import hold
@@ -129,13 +137,13 @@ class LiveDepth:
         save_every: float = 10.0,
     ) -> None:
         for name, value in (("max_wait", max_wait), ("max_gap", max_gap), ("save_every", save_every)):
-            if not 0 <= value < math.inf:
+            if not 0 <= require_number(name, value) < math.inf:
                 raise ValueError(f"{name} must be a number of seconds of at least 0, got {value}")
         if not hasattr(model, "ufm"):
             raise TypeError(f"model must be an UncertainDepth, got {type(model).__name__}: UncertainDepth(network)")
         if not callable(on_result):
             raise TypeError(f"on_result must be callable, got {type(on_result).__name__}")
-        self._state = None if state is None else Path(state)
+        self._state = None if state is None else as_path("state", state)
         if self._state is not None and not self._state.parent.is_dir():
             raise FileNotFoundError(f"state: no such folder: {self._state.parent}")
         if self._state is not None and self._state.is_dir():
@@ -284,6 +292,7 @@ class LiveDepth:
     def wait_idle(self, timeout: float | None = None) -> bool:
         """Wait at most ``timeout`` [s] until no image waits or is processed (not in ``on_result``). Returns False after
         a timeout. Raises BaseException: the model or ``on_result`` failed."""
+        timeout = None if timeout is None else require_number("timeout", timeout)
         with self._changed:
             idle = self._changed.wait_for(lambda: not (self._waiting or self._busy) or self._ended, timeout)
         self._raise()

@@ -9,6 +9,7 @@ from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Any, Literal, Self
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -16,7 +17,19 @@ from ufmstar_torch.anchors import landmarks
 from ufmstar_torch.anchors.anchors import Anchors, require_anchors
 from ufmstar_torch.anchors.pose_check import PoseCheck
 from ufmstar_torch.anchors.streams import SourceLike, StreamLandmarks, as_bytes
-from ufmstar_torch.arguments import Array, CameraLike, ImageLike, as_image, as_intrinsics, as_pose, as_tensor
+from ufmstar_torch.arguments import (
+    Array,
+    CameraLike,
+    ImageLike,
+    as_device,
+    as_image,
+    as_intrinsics,
+    as_pose,
+    as_tensor,
+    require_flag,
+    require_kind,
+    require_whole,
+)
 from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
 from ufmstar_torch.image_check import ImageCheck
 from ufmstar_torch.networks_in_turn import (
@@ -198,10 +211,10 @@ class UncertainDepth(NetworksInTurn):
         multiview_device: torch.device | str | None = None,
     ) -> None:
         members, preprocess = ([], None) if networks is None else self.accepted(networks, preprocess)
-        single = len(members) == 1
-        if mode not in ("alternate", "full"):
+        single, posterior = len(members) == 1, require_flag("posterior", posterior)
+        if not isinstance(mode, str) or mode not in ("alternate", "full"):
             raise ValueError(f"mode must be 'alternate' or 'full', got {mode!r}")
-        if samples is not None and (samples < 2 or not single or mode != "full"):
+        if samples is not None and (require_whole("samples", samples) < 2 or not single or mode != "full"):
             raise ValueError("samples must be at least 2 and goes with one network in mode 'full'")
         if mode == "full" and single and samples is None:
             raise ValueError("mode 'full' needs several networks, or samples for a stochastic one")
@@ -230,12 +243,12 @@ class UncertainDepth(NetworksInTurn):
         self._searched = False  # whether the source of anchors has processed the current image
         # A source that searches the images compares their poses itself, but does not name the mistake.
         searching = self.landmarks is not None and self.landmarks.searching and not self._by_default
-        if not isinstance(check_poses, int) or check_poses < 0:
+        if isinstance(check_poses, bool) or not isinstance(check_poses, int) or check_poses < 0:
             raise ValueError(f"check_poses must be a number of images of at least 0, got {check_poses!r}")
         self._pose_check = PoseCheck(0 if searching else check_poses, self.ufm.config.rotation_tolerance)
         self._image_check = ImageCheck()
         self.mode = mode
-        self.multiview_device = None if multiview_device is None else torch.device(multiview_device)
+        self.multiview_device = None if multiview_device is None else as_device("multiview_device", multiview_device)
         self.register_buffer("image_index", torch.zeros((), dtype=torch.int64))
         self._next = 0
         self.register_state_dict_post_hook(_without_weights)
@@ -249,7 +262,8 @@ class UncertainDepth(NetworksInTurn):
             TypeError, ValueError: see the class.
         """
         members = modules_of(networks)
-        return members, shared_preprocess(members) if preprocess == "own" else preprocess
+        own = isinstance(preprocess, str) and preprocess == "own"
+        return members, shared_preprocess(members) if own else preprocess
 
     def forward(
         self,
@@ -294,7 +308,11 @@ class UncertainDepth(NetworksInTurn):
             ValueError, TypeError: as :meth:`forward`.
         """
         waiting: _Predicted | None = None
-        for frame in frames:
+        if isinstance(frames, Tensor | np.ndarray):
+            raise TypeError(f"frames must be an iterable of (image, pose, intrinsics), got {type(frames).__name__}")
+        for frame in require_kind("frames", frames, Iterable, "an iterable of (image, pose, intrinsics)"):
+            if not isinstance(frame, tuple | list) or len(frame) != 3:
+                raise TypeError(f"frames must yield (image, pose, intrinsics), got {type(frame).__name__}")
             ahead = self._predicted(*frame, ahead=waiting is not None)
             if waiting is not None:
                 yield self._fused(waiting)
@@ -324,6 +342,7 @@ class UncertainDepth(NetworksInTurn):
         Raises:
             ValueError, TypeError: as :meth:`UfMStar.forward`; the image is then not counted.
         """
+        require_kind("prediction", prediction, DepthPrediction, "a DepthPrediction")
         maps = maps_of(prediction, self.ufm)
         ufm = self.ufm(pose=pose, intrinsics=intrinsics, valid=valid, features=features, anchors=anchors, **maps)
         self._count(self._next + 1)

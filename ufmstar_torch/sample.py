@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch import unmeasured
+from ufmstar_torch.arguments import require_number, require_whole
 from ufmstar_torch.fixed_order import total
 from ufmstar_torch.output import MeanUncertainty, SampleStatistics, StepOutput
 
@@ -53,7 +54,7 @@ def sample_size(size: tuple[int, int], pixels: int | None, fraction: float | Non
     if pixels is not None and fraction is not None:
         raise ValueError("pass pixels or fraction, not both")
     if fraction is not None:
-        if not 0 < fraction <= 1:
+        if not 0 < require_number("fraction", fraction) <= 1:
             raise ValueError(f"fraction must lie in (0, 1], got {fraction}")
         return max(1, round(fraction * every))
     if pixels is None:
@@ -78,7 +79,7 @@ def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]
         index [B, count] into the flattened image and used [B, count]; with fewer than ``count`` valid pixels the rest
         of ``used`` is False.
     """
-    flat = valid.flatten(1)
+    seed, flat = require_whole("seed", seed), valid.flatten(1)
     pixels, on_cpu = flat.shape[1], valid.device.type == "cpu"
     requested = 2 * count if on_cpu else pixels  # elsewhere, counting the valid ones would synchronise
     while True:

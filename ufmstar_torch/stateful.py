@@ -52,10 +52,17 @@ class StatefulModule(nn.Module):
         """Convert stream indices or a mask to a bool mask [count] on the state's device. Raises IndexError: an index is
         out of range; ValueError: a mask of the wrong length."""
         device = getattr(self, self.STATE[0]).device
-        indices = torch.as_tensor(streams, device=device)
+        try:
+            indices = torch.as_tensor(streams, device=device)
+        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+            raise TypeError(f"streams must be indices or a bool mask [B], got {streams!r:.60}") from error
+        if indices.dtype not in (torch.bool, torch.int64, torch.int32) and indices.numel():
+            raise TypeError(f"streams must be indices or a bool mask [B], got {indices.dtype}")
         if indices.dtype == torch.bool and indices.shape != (count,):
             raise ValueError(f"streams as a mask must have shape ({count},), got {tuple(indices.shape)}")
         chosen = torch.zeros(count, dtype=torch.bool, device=device)
+        if indices.dtype != torch.bool and bool(((indices < -count) | (indices >= count)).any()):
+            raise IndexError(f"streams must be indices below {count}, got {indices.tolist()}")
         chosen[indices if indices.numel() else indices.long()] = True
         return chosen
 

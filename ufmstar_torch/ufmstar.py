@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch import unmeasured
-from ufmstar_torch.arguments import Array, CameraLike, as_tensor
+from ufmstar_torch.arguments import Array, CameraLike, as_device, as_tensor, require_flag
 from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Extension
@@ -72,11 +72,11 @@ class UfMStar(StatefulModule):
         super().__init__()
         if config is not None and not isinstance(config, UfMStarConfig):
             raise TypeError(f"config must be a UfMStarConfig or None, got {type(config).__name__}")
-        if dtype not in (torch.float32, torch.float64):
+        if not isinstance(dtype, torch.dtype) or dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         self.config = config if config is not None else UfMStarConfig()
         self._extensions, self._warnings = extensions_of(self.config, extensions), StreamWarnings()
-        self._empty = self._extensions.initial(0, self.config, dtype, device or "cpu")
+        self._empty = self._extensions.initial(0, self.config, dtype, as_device("device", device))
         self.STATE = tuple(self._empty.tensors())
         self.ALWAYS_FLOAT64 = (*UfMStar.ALWAYS_FLOAT64, *self._extensions.always_float64)
         for name, value in self._empty.tensors().items():
@@ -180,7 +180,7 @@ class UfMStar(StatefulModule):
         optional, view = (aleatoric, epistemic, valid, features), {"member": member, "informative": informative}
         frame = self._checked(depth, pose, intrinsics, *optional, **view)
         index, used = sample_pixels(frame.valid, sample_size(frame.size, pixels, fraction), seed)
-        out, maps = self._observe(frame, inputs, index, average=average)
+        out, maps = self._observe(frame, inputs, index, average=require_flag("average", average))
         return mean_uncertainty(out, maps | {"depth": torch.gather(frame.depth.flatten(1), 1, index)}, used)
 
     def warm_up(
@@ -210,7 +210,7 @@ class UfMStar(StatefulModule):
         Raises:
             ValueError: wrong shape or frame, or there was no frame yet.
         """
-        if frame not in ("world", "first"):
+        if not isinstance(frame, str) or frame not in ("world", "first"):
             raise ValueError(f"frame must be 'world' or 'first', got {frame!r}")
         points, streams = as_tensor("points", points), self.mean.shape[0]
         if streams == 0:
@@ -250,7 +250,7 @@ class UfMStar(StatefulModule):
             IndexError: an index is out of range.
             ValueError: a mask of the wrong length; ``keep_evidence`` without an extension that has statistics.
         """
-        if keep_evidence and not self._empty.by_stream:
+        if require_flag("keep_evidence", keep_evidence) and not self._empty.by_stream:
             raise ValueError("keep_evidence needs UfMStarConfig with an extension that learns, got one without")
         with outliving(), torch.no_grad():  # buffers must outlive the caller's inference mode
             old, b = self.state, self.mean.shape[0]

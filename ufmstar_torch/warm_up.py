@@ -12,9 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ufmstar_torch import arguments
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.anchors.tracker import LandmarkTracker
+from ufmstar_torch.arguments import require_whole
 
 _DISTANCE = 2.0  # [m]
 _WALL, _SQUARE = (96, 128), 4  # [px] images of a wall, and its squares, by one of which the camera moves
@@ -55,6 +57,8 @@ def warm_up(
         ValueError: a size or number of streams that is not positive.
     """
     require_size(size, streams)
+    if progress is not None and not callable(progress):
+        raise TypeError(f"progress must be a function of two numbers or None, got {type(progress).__name__}")
     height, width = size
     config, device = module.config, module.mean.device
     distance = min(_DISTANCE, config.segment.depth_limit)
@@ -80,9 +84,9 @@ def warm_up(
 
 
 def require_size(size: tuple[int, int], streams: int) -> None:
-    """Raise a ValueError unless ``size`` is (H, W) and all three numbers are positive."""
-    if np.shape(size) != (2,) or min(*size, streams) < 1:
-        raise ValueError(f"size and streams must be positive, (H, W) and B, got {size!r} and {streams}")
+    """Raise a TypeError or ValueError unless ``size`` is (H, W) and all three numbers are positive."""
+    arguments.require_size("size", size)
+    require_whole("streams", streams, 1)
 
 
 def camera_of(size: tuple[int, int]) -> Tensor:

@@ -53,18 +53,19 @@ class LiveOptions(MachineOptions):
     Depths that are searched in earlier images correct the network's; --plain is UfM* alone. A recording is replayed at
     its pace. A camera, and a folder with --follow, take their poses from the file --trajectory, to which another
     program adds lines. On standard input, a line is
-    {"stamp": s, "pose": [x, y, z, qx, qy, qz, qw], "image": "file", "intrinsics": [fx, fy, cx, cy]} or a part of it.
+    {"stamp": s, "pose": [x, y, z, qx, qy, qz, qw], "image": "file", "intrinsics": [fx, fy, cx, cy]} or a part of it;
+    intrinsics hold for later lines too.
     Ends with its source, or with Ctrl-C.
 
     Attributes:
         source: a recording (folder, video, bag, tour:SEED), the number of a camera, or - for lines of JSON
-        follow: the source is a folder to which images are added, named by their time
-        speed: of a recording, 2 = twice as fast
-        seconds: end after so long, counted from the first image
-        idle: with --follow, end after so long without a new image [s]
-        max_wait: for the poses after an image [s]
-        state: file in which the state is kept, and from which it goes on
-        save_every: of the state [s]
+        follow: the source is a folder to which another program adds images, which are named by their time
+        speed: replays a recording this many times as fast
+        seconds: ends the command so many seconds after the first image
+        idle: ends --follow after so many seconds without a new image
+        max_wait: longest time that an image waits for a pose after it [s]
+        state: file to which the state is saved, and from which the next command continues
+        save_every: time between two savings of the state [s]
         out: folder for realtime.json and, for each image, a .npz with depth and variance (corrected unless --plain),
             network_depth and ufm_variance before the correction, disagreement, pose and intrinsics
         overwrite: replace the results in --out
@@ -129,7 +130,7 @@ def main(options: LiveOptions) -> int:
             if options.out is not None:
                 kind.earlier(options.out, resume=False, overwrite=options.overwrite)
             K = None if (intrinsics := options.opening.intrinsics) is None else read_intrinsics(intrinsics)
-            events = _events(options)
+            events = _events(options, K)
             model = _model(options)
             view = RerunLog(open_viewer()[0]) if options.view else None
             if options.out is not None:
@@ -191,8 +192,8 @@ def _run(
     return live.statistics, None
 
 
-def _events(options: LiveOptions) -> Iterator[LiveEvent]:
-    """The source's images and poses; errors as ``open_sequence``."""
+def _events(options: LiveOptions, K: NDArray[np.float64] | None) -> Iterator[LiveEvent]:
+    """The source's images and poses; errors as ``open_sequence``. ``K``: intrinsics of the option."""
     opening = options.opening
     if options.recorded:
         sequence = open_sequence(options.source, **opening.changed())
@@ -203,7 +204,7 @@ def _events(options: LiveOptions) -> Iterator[LiveEvent]:
         return sources.replay(sequence, options.speed)
     scale = 1.0 if opening.pose_scale is None else opening.pose_scale
     if options.source == _STANDARD_INPUT:
-        return sources.json_lines(sys.stdin, ".", opening.poses, scale)
+        return sources.json_lines(sys.stdin, ".", opening.poses, scale, K)
     poses = sources.PoseFile(str(opening.trajectory), opening.poses, scale)
     if options.follow:
         return sources.growing_folder(options.source, poses, options.idle)

@@ -131,6 +131,12 @@ def _about(out: Path) -> dict[str, Any]:
     about = _read_json(path)
     if not isinstance(about, dict) or about.get("format") != FORMAT or not isinstance(about.get("suite"), str):
         raise ResultsError(f"{path} is not the description of an evaluation of format {FORMAT}")
+    sequences = about.get("sequences", [])
+    named = ("dataset", "sequence")
+    if not isinstance(sequences, list) or not all(
+        isinstance(one, dict) and all(isinstance(one.get(name), str) for name in named) for one in sequences
+    ):
+        raise ResultsError(f"{path} lists sequences that cannot be: each has a dataset and a sequence")
     try:
         listed_rows(about)
     except (AttributeError, KeyError, TypeError, ValueError) as error:

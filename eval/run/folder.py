@@ -163,7 +163,11 @@ def output_folder(
         manifest: dict[str, Any] = to_json({"program": kind.program, **started, **content})
         if resumed:
             earlier = kind.read_manifest(out)
-            changed = differences(kind.identity(earlier, manifest), kind.identity(manifest, earlier))
+            try:
+                changed = differences(kind.identity(earlier, manifest), kind.identity(manifest, earlier))
+            except (LookupError, TypeError, AttributeError) as error:
+                text = f"{out / kind.manifest} is damaged ({error!r}); --overwrite starts again"
+                raise FolderError(f"--resume: {text}") from error
             if changed:
                 raise FolderError(f"--resume: the {kind.noun} in {out} was started with other input: {changed}")
             manifest = dict(kind.merge(earlier, manifest))

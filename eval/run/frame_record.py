@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,17 @@ def frame_record(result: FrameResult, key: str, writing: float, saving: float) -
     row = result.rows[key]
     times = {"ms": _times(result, row, writing, saving)}
     return {**about, "state": "done", **_figures(row), **times, **_anchor_figures(row)}
+
+
+def missing_figure(record: Mapping[str, Any]) -> str | None:
+    """The first figure that the record of a finished frame lacks, or that is no number, or None."""
+    means = ("mean_disagreement", "mean_sigma", "mean_network_sigma")
+    for name in (*_COUNTS, "near_zero", *means):
+        value = record.get(name, "none")
+        if not (isinstance(value, int | float) or (value is None and name in means)):
+            return name
+    complete = isinstance(record.get("ground_truth"), bool) and isinstance(record.get("ms"), Mapping)
+    return None if complete and isinstance(record.get("size"), list) else "ground_truth, ms or size"
 
 
 def _figures(row: RowResult) -> dict[str, Any]:

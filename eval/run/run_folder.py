@@ -25,7 +25,7 @@ from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
 from ufmstar_torch.eval.run.files import to_json, write_atomic, write_bytes_atomic
 from ufmstar_torch.eval.run.folder import FolderError, FolderKind
-from ufmstar_torch.eval.run.frame_record import frame_arrays, frame_record
+from ufmstar_torch.eval.run.frame_record import frame_arrays, frame_record, missing_figure
 from ufmstar_torch.eval.run.job import Checkpoint, RunJob
 from ufmstar_torch.eval.run.writers import (
     FRAMES,
@@ -139,6 +139,9 @@ def _load(out: Path) -> tuple[Checkpoint, list[dict[str, Any]]]:
         checkpoint = Checkpoint(metrics=sums, **stored)
         content = b"".join(lines.read_bytes().splitlines(keepends=True)[: checkpoint.position])
         records = read_records(content, lines)
+        for number, record in enumerate(records, start=1):
+            if record["state"] == "done" and (figure := missing_figure(record)) is not None:
+                raise ValueError(f"{lines}, line {number} has no {figure}")
     except (OSError, RuntimeError, LookupError, TypeError, ValueError) as e:
         raise FolderError(f"--resume: the state in {out} cannot be read ({e}); --overwrite starts again") from e
     if len(records) != checkpoint.position:

@@ -175,16 +175,21 @@ def _changed(path: Path) -> int | None:
 
 
 def json_lines(
-    lines: Iterable[str], folder: str | Path = ".", convention: str = OURS, scale: float = 1.0
+    lines: Iterable[str],
+    folder: str | Path = ".",
+    convention: str = OURS,
+    scale: float = 1.0,
+    intrinsics: NDArray[np.float64] | None = None,
 ) -> Iterator[LiveEvent]:
     """Events from lines such as ``{"stamp": 1.5, "pose": [x, y, z, qx, qy, qz, qw], "image": "a.jpg"}``.
 
     ``pose`` has 7 numbers, or the 12 or 16 of a matrix (nested or not). ``image`` is a file, or its content as
-    ``"data:;base64,..."``. ``intrinsics`` are fx, fy, cx, cy. A line has a stamp and at least one of pose and image.
-    Relative files are in ``folder``; poses are as in :class:`PoseFile`. Raises ValueError: a line has another form; the
-    message has its number.
+    ``"data:;base64,..."``. ``intrinsics`` are fx, fy, cx, cy; they hold for later lines too, and may stand alone in a
+    line. Another line has a stamp and at least one of pose and image. Relative files are in ``folder``; poses are as in
+    :class:`PoseFile`. An image that cannot be read is left out; the first one and their number are logged. Raises
+    ValueError: a line has another form, or an image is without intrinsics; the message has its number.
     """
-    convert = CONVENTIONS[convention].convert
+    convert, unreadable, K = CONVENTIONS[convention].convert, 0, intrinsics
     for number, line in enumerate(lines, start=1):
         if not line.strip():
             continue
@@ -195,6 +200,10 @@ def json_lines(
                 raise ValueError(f"no JSON: {line.strip():.60}") from None
             if not isinstance(event, dict) or event.keys() - {"stamp", "pose", "image", "intrinsics"}:
                 raise ValueError('expected {"stamp": s, "pose": [...], "image": "file", "intrinsics": [...]}')
+            if "intrinsics" in event:
+                K = _intrinsics(event["intrinsics"])
+                if len(event) == 1:
+                    continue
             if "stamp" not in event or not event.keys() & {"pose", "image"}:
                 raise ValueError("a stamp and a pose or an image are needed")
             if not isinstance(stamp := event["stamp"], int | float):
@@ -202,11 +211,27 @@ def json_lines(
             if not math.isfinite(stamp := float(stamp)):
                 raise ValueError(f"stamp must be finite [s], got {stamp}")
             pose = _pose(event["pose"], convert, scale) if "pose" in event else None
-            image = _image(event["image"], Path(folder)) if "image" in event else None
-            K = None if "intrinsics" not in event else np.array(event["intrinsics"], dtype=np.float64)
-        except (ValueError, TypeError, OverflowError, RecursionError, FrameError, binascii.Error) as error:
+            if "image" in event and K is None:
+                raise ValueError("an image needs intrinsics, in its line, an earlier one or --intrinsics fx fy cx cy")
+            try:
+                image = _image(event["image"], Path(folder)) if "image" in event else None
+            except FrameError as error:
+                image, unreadable = None, unreadable + 1
+                if unreadable == 1:
+                    LOGGER.warning("line %d: the image is left out: %s (logged once)", number, error)
+        except (ValueError, TypeError, OverflowError, RecursionError, binascii.Error) as error:
             raise ValueError(f"line {number}: {error}") from error
-        yield LiveEvent(stamp, image, pose, K)
+        if image is not None or pose is not None:
+            yield LiveEvent(stamp, image, pose, K)
+    if unreadable:
+        LOGGER.warning("%d images could not be read", unreadable)
+
+
+def _intrinsics(values: Any) -> NDArray[np.float64]:
+    numbers = np.array(values, dtype=np.float64)
+    if numbers.shape not in ((4,), (3, 3)) or not np.isfinite(numbers).all():
+        raise ValueError(f"intrinsics are fx, fy, cx, cy [px], got {values!r:.60}")
+    return numbers
 
 
 def _pose(values: Any, convert: Callable[[np.ndarray], np.ndarray], scale: float) -> NDArray[np.float64]:

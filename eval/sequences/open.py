@@ -8,6 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from ufmstar_torch.arguments import as_path
 from ufmstar_torch.conventions import CONVENTIONS, OURS
 from ufmstar_torch.eval.sequences.assemble import undistort
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence
@@ -57,7 +58,7 @@ def open_sequence(path: str | Path, layout: str = "auto", **options: Any) -> Fra
             raise ValueError(f"{path!r} takes no {', '.join(refused)}: a tour's options stand in its name")
         # Imported here, because that package imports this one.
         return convert_poses(import_module("ufmstar_torch.eval.tour.sequence").open_tour(str(path)), chosen.poses)
-    path = Path(path)
+    path = as_path("path", path)
     if not path.exists():
         raise FileNotFoundError(f"path: no such file or folder: {path}")
     explicit = chosen.images is not None or chosen.trajectory is not None

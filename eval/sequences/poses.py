@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ufmstar_torch.arguments import as_path
 from ufmstar_torch.trajectory import Trajectory
 
 # TUM writes quaternions with four decimals, so the norm is within 2e-4 of 1; an error of a hundred times that means
@@ -43,7 +44,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
     """Read a trajectory in any of the formats of this module; ``#`` starts a comment. Samples are sorted by time; the
     first of equal poses with the same timestamp is used. Raises ValueError: a line (named by file and number) is no
     pose of a known format, or contradicts another one; or there is no pose."""
-    rows, lines = _numbers(path)
+    rows, lines = _numbers(as_path("path", path))
     for row, where in zip(rows, lines, strict=True):
         if len(row) not in (7, 8, 12, 13, 16, 17):
             raise ValueError(

@@ -112,11 +112,19 @@ class EvalFolder:
         return f"{item.label}: failed: {reason}"
 
     def failures(self) -> dict[tuple[str, str], str]:
-        """By data set and sequence, the reasons for failures, as stored by :meth:`fail`."""
-        stored = [
-            json.loads(path.read_text(encoding="utf-8")) for path in sorted(self.path.glob(f"records/*/*/{FAILED}"))
-        ]
-        return {(one["dataset"], one["sequence"]): one["reason"] for one in stored}
+        """By data set and sequence, the reasons for failures, as stored by :meth:`fail`. Raises ResultsError: a file
+        has another form."""
+        reasons = {}
+        for path in sorted(self.path.glob(f"records/*/*/{FAILED}")):
+            try:
+                stored = json.loads(path.read_text(encoding="utf-8"))
+                dataset, sequence, reason = (stored[name] for name in ("dataset", "sequence", "reason"))
+                if not all(isinstance(text, str) for text in (dataset, sequence, reason)):
+                    raise TypeError("a data set, a sequence and a reason are texts")
+            except (ValueError, LookupError, TypeError, RecursionError) as error:
+                raise ResultsError(f"{path} is not the record of a failure: {error}") from error
+            reasons[dataset, sequence] = reason
+        return reasons
 
     def succeeded(self, item: WorkItem) -> None:
         """Remove the record of an earlier failure."""

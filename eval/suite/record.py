@@ -94,9 +94,15 @@ class Record:
         names = {f.name for f in fields(cls)} - {"path"}
         if not isinstance(values, dict) or values.pop("format", None) != FORMAT or values.keys() != names:
             raise ResultsError(f"{path} is not a record of format {FORMAT}")
+        texts = ("suite", "dataset", "sequence", "network", "method")
+        for name, value in values.items():
+            if not isinstance(value, str if name in texts else dict):
+                raise ResultsError(f"{path} is not a record: {name} is {type(value).__name__}")
+        if wrong := [name for name, v in values["figures"].items() if not isinstance(v, int | float | None)]:
+            raise ResultsError(f"{path} is not a record: figure {wrong[0]} is no number")
         record = cls(**values, path=path)
         try:
             _ = record.row
-        except ValueError as error:
+        except (ValueError, TypeError, LookupError, AttributeError) as error:
             raise ResultsError(f"{path}: {error}") from error
         return record

@@ -17,7 +17,7 @@ from ufmstar_torch.eval.tour.path import tour_path
 from ufmstar_torch.eval.tour.style import STYLES
 from ufmstar_torch.eval.tour.tour import Tour, make_tour
 from ufmstar_torch.eval.tour.view import TourView, intrinsics, render
-from ufmstar_torch.limits import require_bytes, require_pixels
+from ufmstar_torch.limits import MOST_PIXELS, require_bytes, require_pixels
 
 PREFIX = "tour:"
 _FORM = (
@@ -168,7 +168,7 @@ def _whole(text: str, least: int = 0) -> int:
 _OPTIONS: dict[str, tuple[str, Callable[[str], Any], str]] = {
     "style": ("style", {style: style for style in STYLES}.__getitem__, f"one of {', '.join(STYLES)}"),
     "frames": ("frames", partial(_whole, least=1), "a number of at least 1"),
-    "size": ("size", parse_size, "HxW in pixels, 160x224 say"),
+    "size": ("size", parse_size, f"HxW in pixels, 160x224 say, and at most {MOST_PIXELS:,} pixels"),
     "fov": ("fov", float, "a number of degrees, 20 to 120"),
     "path": ("path_seed", _whole, "a number of at least 0"),
     "pan": ("pan", {"0": False, "1": True}.__getitem__, "0 or 1"),

@@ -1,0 +1,133 @@
+"""Sizes that small files, names and settings state are refused before memory is allocated."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from ufmstar_torch import UfMStarConfig
+from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.sequences.frame import FrameError, parse_size
+from ufmstar_torch.eval.sequences.images import image_size, read_color, read_depth
+from ufmstar_torch.limits import MOST_BYTES, MOST_PIXELS
+from ufmstar_torch.models import CheckpointError, NetworkSpec, OnnxNetwork, Preprocess, load_trained
+from ufmstar_torch.models.checkpoints import load_state_dict_file
+
+LIMIT = r"more than the limit of [\d,]+"
+
+
+def png(width: int, height: int, kind: int) -> bytes:
+    """A PNG of a few bytes that states a size; ``kind``: 2 RGB, 0 grey of 16 bits."""
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8 if kind == 2 else 16, kind, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
+
+
+@pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
+@pytest.mark.parametrize("size", [(12_000, 12_000), (100_000, 100_000), (MOST_PIXELS + 1, 1)])
+def test_an_image(tmp_path, size):
+    """Below Pillow's limit, too, which is twice as large."""
+    colour, depth = tmp_path / "a.png", tmp_path / "d.png"
+    colour.write_bytes(png(*size, 2))
+    depth.write_bytes(png(*size, 0))
+    for read in (lambda: read_color(colour), lambda: read_color("a", png(*size, 2)), lambda: image_size(colour)):
+        with pytest.raises(FrameError, match=f"({LIMIT})|DecompressionBomb|exceeds limit"):
+            read()
+    with pytest.raises(FrameError, match=f"({LIMIT})|exceeds limit"):
+        read_depth(depth)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "tour:1?frames=1000000000",
+        "tour:1?frames=99999999999999999999",
+        "tour:1?size=20000x20000",
+        "tour:1?size=8x99999999999",
+    ],
+)
+def test_a_tour(name):
+    with pytest.raises(ValueError, match=rf"(frames would .*{LIMIT})|(size must be HxW .* at most [\d,]+ pixels)"):
+        open_sequence(name)
+
+
+def test_sizes_of_networks_and_settings():
+    for refused in (
+        lambda: Preprocess(size=(10**6, 10**6)),
+        lambda: Preprocess(size=(8, 8), crop=(10**6, 10**6)),
+        lambda: Preprocess(resize_height=10**6),
+        lambda: Preprocess(resize_height=9000)(torch.zeros(1, 3, 2, 1000), torch.eye(3)),
+        lambda: NetworkSpec(size=(32 * 10**5, 32 * 10**5)),
+        lambda: parse_size("1000000x1000000"),
+        lambda: UfMStarConfig(initial_capacity=10**9),
+        lambda: UfMStarConfig(features=10**9),
+    ):
+        with pytest.raises(ValueError, match=LIMIT):
+            refused()
+    with pytest.raises(ValueError, match="members must lie in"):
+        NetworkSpec(method="batch_ensemble", members=1_000_000)
+    assert UfMStarConfig(initial_capacity=10**6).initial_capacity == 10**6
+    assert 4 * 3 * MOST_PIXELS <= MOST_BYTES
+
+
+def test_an_onnx_input(tmp_path):
+    onnx = pytest.importorskip("onnx")
+    from onnx import TensorProto, helper
+
+    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, 10**6, 10**6])
+    depth = helper.make_tensor_value_info("depth", TensorProto.FLOAT, [1, 3, 10**6, 10**6])
+    graph = helper.make_graph([helper.make_node("Relu", ["image"], ["depth"])], "g", [image], [depth])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), tmp_path / "n.onnx")
+    with pytest.raises(ValueError, match=LIMIT):
+        OnnxNetwork(tmp_path / "n.onnx", {"outputs": {"kind": "metric"}})
+
+
+@pytest.mark.parametrize("changes", [{"widths": 1000.0}, {"method": "batch_ensemble", "members": 900}])
+def test_trained_weights(tmp_path, changes):
+    """The shapes in the file are compared with those of the spec without allocating the network."""
+    weights = Path(__file__).resolve().parents[1] / "models" / "weights" / "demo.safetensors"
+    data = weights.read_bytes()
+    length = struct.unpack("<Q", data[:8])[0]
+    header = json.loads(data[8 : 8 + length])
+    metadata = json.loads(header["__metadata__"]["metadata"])
+    metadata["spec"] |= changes
+    header["__metadata__"]["metadata"] = json.dumps(metadata)
+    text = json.dumps(header).encode()
+    (tmp_path / "n.safetensors").write_bytes(struct.pack("<Q", len(text)) + text + data[8 + length :])
+    with pytest.raises(CheckpointError, match="member 0, does not fit"):
+        load_trained(tmp_path / "n.safetensors")
+
+
+def test_a_checkpoint_that_expands(tmp_path):
+    """A tensor that repeats a stored value, and a compressed archive."""
+    torch.save({"w": torch.zeros(1).expand(10**10)}, tmp_path / "a.pth")
+    with pytest.raises(CheckpointError, match=f"repeats its stored values would take .*{LIMIT}"):
+        load_state_dict_file(tmp_path / "a.pth")
+    torch.save(nn.Conv2d(3, 1, 1).state_dict(), tmp_path / "b.pth")
+    with (
+        zipfile.ZipFile(tmp_path / "b.pth") as source,
+        zipfile.ZipFile(tmp_path / "c.pth", "w", zipfile.ZIP_DEFLATED) as target,
+    ):
+        for entry in source.namelist():
+            target.writestr(entry, source.read(entry))
+    with pytest.raises(CheckpointError, match="has compressed files"):
+        load_state_dict_file(tmp_path / "c.pth")
+
+
+def test_an_array(tmp_path):
+    header = np.lib.format.header_data_from_array_1_0(np.zeros(1)) | {"shape": (10**6, 10**6)}
+    with (tmp_path / "d.npy").open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)
+    with pytest.raises(FrameError, match=LIMIT):
+        read_depth(tmp_path / "d.npy")
