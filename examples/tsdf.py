@@ -1,6 +1,5 @@
 """Fuse a run's depth into a TSDF, with equal weights or with 1/sigma^2, and print the surface error [cm].
 
-
 The second argument is the run's recording, whose ground truth is compared; without it, the surface alone is counted.
 
     ufmstar run "tour:5?frames=60&size=120x160" --model trained --weights models/weights/demo.safetensors \\

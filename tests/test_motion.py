@@ -94,15 +94,15 @@ def moving_tour():
 
 
 def test_tests_fail_on_things_that_move_and_their_anchors_are_withheld_and_counted(moving_tour):
-    on, beside = [], []
+    moving, still = [], []
     for frame, landmarks in list(zip(*moving_tour, strict=True))[10:]:
         u, v = np.rint(landmarks.motion[:, :2]).astype(int).T
-        on.append(landmarks.motion[frame.moving[v, u], 2])
-        beside.append(landmarks.motion[~frame.moving[v, u], 2])
-    on, beside = np.concatenate(on), np.concatenate(beside)
-    assert on.mean() > beside.mean() + 0.5
-    assert np.mean(on > 1.9) > 5 * np.mean(beside > 1.9)
-    assert np.mean(beside > 1.9) < 0.04
+        moving.append(landmarks.motion[frame.moving[v, u], 2])
+        still.append(landmarks.motion[~frame.moving[v, u], 2])
+    moving, still = np.concatenate(moving), np.concatenate(still)
+    assert moving.mean() > still.mean() + 0.5
+    assert np.mean(moving > 1.9) > 5 * np.mean(still > 1.9)
+    assert np.mean(still > 1.9) < 0.04
     assert sum(landmarks.moving for landmarks in moving_tour[1]) > 50
 
 

@@ -42,10 +42,10 @@ _SIGMA, _HALF, _CONTRAST = 1.5, 3, 0.3
 def tests_at(motion: Floats, height: int, width: int, rows: int, cols: int) -> Floats:
     """[rows cols] log likelihood ratios of motion at the nodes of a map: means of the points ``motion`` [M, 3] (u, v,
     ratio) around them, with bilinear weights; 0 where there is none."""
-    known = motion[np.isfinite(motion).all(1)]
+    finite = motion[np.isfinite(motion).all(1)]
     sums, weights = np.zeros((2, rows, cols))
-    u, v = (known[:, 0] + 0.5) / width * cols - 0.5, (known[:, 1] + 0.5) / height * rows - 0.5
-    _spread(u, v, known[:, 2], sums, weights)
+    u, v = (finite[:, 0] + 0.5) / width * cols - 0.5, (finite[:, 1] + 0.5) / height * rows - 0.5
+    _spread(u, v, finite[:, 2], sums, weights)
     mean: Floats = (sums / np.maximum(weights, 1e-9)).ravel()
     return mean
 
