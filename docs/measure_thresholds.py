@@ -3,13 +3,14 @@
     python docs/measure_thresholds.py --weights fastdepth_nyu.onnx SEQUENCE ... [--figure FILE]
     python docs/measure_thresholds.py --weights fastdepth_nyu.onnx            (ten rendered tours)
 
-FastDepth with dense anchors and the posterior. For every sequence it prints the share of the pixels with ground truth
-in central intervals, from frame 30 on (in a shorter sequence: in its last ten frames), and the pixels that gates on
-sigma / depth keep, plain and with the posterior. Over all sequences it prints false and missed stops: the truth is a
-stop if more than 1 % of the middle of the image is nearer than ``--nearer``; a rule stops if it says so of more than
-1 % of these pixels. ``--noise``: rotation noise of every pose [degrees]. ``--fit`` also prints the factors of
-``posterior.conformal.TRANSFER`` with which the mean coverage is that of ``TARGETS``. ``--figure``
-writes coverage and gates as pictures, ``--picture`` the maps of the first sequence's last frame.
+FastDepth, or without ``--weights`` the demo's first network, with dense anchors and the posterior. For every sequence
+it prints the share of the pixels with ground truth in central intervals, from frame 30 on (in a shorter sequence: in
+its last ten frames), and the pixels that gates on sigma / depth keep, plain and with the posterior. Over all sequences
+it prints false and missed stops: the truth is a stop if more than 1 % of the middle of the image is nearer than
+``--nearer``; a rule stops if it says so of more than 1 % of these pixels. ``--noise``: rotation noise of every pose
+[degrees]. ``--fit`` also prints the factors of ``posterior.conformal.TRANSFER`` with which the mean coverage is that of
+``TARGETS``; the factors in use are the means of both networks'. ``--figure`` writes coverage and gates as pictures,
+``--picture`` the maps of the first sequence's last frame.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from importlib.resources import as_file, files
 from itertools import pairwise
 from pathlib import Path
 
@@ -35,6 +37,7 @@ from ufmstar_torch.eval.report.style import new_figure
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.models.load import load_network
+from ufmstar_torch.models.trained import load_trained
 from ufmstar_torch.output import UfMStarOutput
 from ufmstar_torch.posterior.conformal import LEVELS, TRANSFER
 
@@ -79,9 +82,14 @@ class Stops:
         self.counts[:] += [truth, not truth, truth and not stop, stop and not truth]
 
 
-def frames_of(source: str, weights: Path, noise: float) -> Iterator[Frame]:
-    """UfM* on a sequence with truth."""
-    model = UncertainDepth(load_network("fastdepth", weights).eval(), posterior=True, check_poses=0)
+def frames_of(source: str, weights: Path | None, noise: float) -> Iterator[Frame]:
+    """UfM* on a sequence with truth, with FastDepth or (None) the demo's first network."""
+    if weights is not None:
+        network = load_network("fastdepth", weights).eval()
+    else:
+        with as_file(files("ufmstar_torch.models") / "weights" / "demo.safetensors") as demo:
+            network = load_trained([demo])[0].eval()
+    model = UncertainDepth(network, posterior=True, check_poses=0)
     for index, frame in enumerate(open_sequence(source).readable(print)):
         if frame.image is None or not np.isfinite(frame.T_world_cam).all():
             continue
@@ -143,7 +151,7 @@ def middle_of(values: Tensor) -> Tensor:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequences", nargs="*", metavar="SEQUENCE", help="default: ten tours, with --fit ten others")
-    parser.add_argument("--weights", type=Path, required=True, help="FastDepth's")
+    parser.add_argument("--weights", type=Path, help="FastDepth's; default: the demo's first network")
     parser.add_argument("--nearer", type=float, default=1.0, help="distance of a stop [m]")
     parser.add_argument("--noise", type=float, default=0.0, help="rotation noise of every pose [degrees]")
     parser.add_argument("--fit", action="store_true", help="fit TRANSFER; on tours only")

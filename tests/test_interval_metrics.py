@@ -60,14 +60,14 @@ def test_a_gate_keeps_the_pixels_below_it():
     curves = {name: np.array(values) for name, values in metrics.curves().items() if name.startswith("gate")}
     d, v, g, c = (x.numpy() for x in (depth, variance, truth, level))
     used = (g > 0) & np.isfinite(d)
-    for i in (0, 40, 90, 180):
+    for i in (0, 20, 45, 90):
         below = used & (np.sqrt(v) / np.where(used, d, 1) <= curves["gate_threshold"][i])
         error = np.abs(d - g)[below] / g[below]
         assert curves["gate_kept"][i] == pytest.approx(below.sum() / used.sum())
         if not below.any():
             assert np.isnan(curves["gate_error"][i])
             continue
-        assert curves["gate_error"][i] == pytest.approx(np.median(error), rel=0.07)
+        assert curves["gate_error"][i] == pytest.approx(np.median(error), rel=0.05)
         assert curves["gate_delta1"][i] == pytest.approx((error <= 0.25).mean())
         leveled = below & np.isfinite(c)
         assert curves["gate_coverage"][i] == pytest.approx((c[leveled] <= 0.9).mean())

@@ -27,7 +27,7 @@ _AUTHORS: dict[type[SumMetric], dict[str, Any]] = {ECEDelta: {"bins": 100}, ECEQ
 class SequenceMetrics(nn.Module):
     """delta1, AbsRel, RMSE and, with a variance, NLL, ECE_delta, ECE_q, entropy, AUSE, AURG, Spearman of one sequence.
 
-    Memory is 2.6 MB for any number of frames. ``state_dict`` saves the sums; ``merge_state`` adds those of another part
+    Memory is 2.4 MB for any number of frames. ``state_dict`` saves the sums; ``merge_state`` adds those of another part
     of the sequence.
 
     Args:
