@@ -44,8 +44,9 @@ def test_public_names():
 def test_signatures():
     observation = ["depth", "pose", "intrinsics", "aleatoric", "epistemic", "valid", "features"]
     assert names(UfMStar.__init__) == ["config", "extensions", "dtype", "device"]
-    assert names(UfMStar.forward) == [*observation, "inputs"]
-    assert names(UfMStar.mean_uncertainty) == [*observation, "pixels", "fraction", "seed", "average", "inputs"]
+    view = ["member", "informative"]
+    assert names(UfMStar.forward) == [*observation, *view, "inputs"]
+    assert names(UfMStar.mean_uncertainty) == [*observation, *view, "pixels", "fraction", "seed", "average", "inputs"]
     assert names(UfMStar.query) == ["points", "frame"]
     assert names(UfMStar.reset) == ["streams", "keep_evidence"]
     made_of = [

@@ -129,7 +129,9 @@ def test_the_mean_uncertainty_of_images():
         with pytest.raises(ValueError, match="pixels or fraction"):
             model.mean_uncertainty(image(i), POSES[i], K, pixels=5, fraction=0.5)
         got = model.mean_uncertainty(image(i), POSES[i], K, pixels=200, seed=i)
-        want = ufm.mean_uncertainty(image(i)[:, 0] * factor, POSES[i], K, torch.full((1, H, W), a), pixels=200, seed=i)
+        want = ufm.mean_uncertainty(
+            image(i)[:, 0] * factor, POSES[i], K, torch.full((1, H, W), a), member=i % 2, pixels=200, seed=i
+        )
         assert torch.equal(got.mean, want.mean)
         assert int(got.pixels) == 200
     assert model(image(4), POSES[4], K).member == 0

@@ -76,11 +76,16 @@ class TestContactSheet:
 
     def test_a_small_sigma_of_the_posterior_is_not_black_beside_the_networks_errors(self) -> None:
         one = panel()
-        small = {name: one.maps[of] / 10 for name, of in (("posterior_sigma", "sigma"), ("posterior_error", "error"))}
-        both = FramePanel("a", one.image, {**one.maps, "posterior": one.maps["depth"], **small})
+        small = {name: one.maps[name] / 10 for name in ("sigma", "error")}
+        before = {
+            "network_depth": one.maps["depth"],
+            "ufm_sigma": one.maps["sigma"],
+            "network_error": one.maps["error"],
+        }
+        both = FramePanel("a", one.image, {**one.maps, **before, **small})
         columns = {c.field: c for c in map_columns([both])}
-        assert columns["posterior_sigma"].scale == columns["posterior_error"].scale == columns["sigma"].scale
-        ends = [columns[name].rgb(both)[-1, -1].astype(int).sum() for name in ("posterior_sigma", "sigma")]
+        assert columns["sigma"].scale == columns["error"].scale == columns["ufm_sigma"].scale
+        ends = [columns[name].rgb(both)[-1, -1].astype(int).sum() for name in ("sigma", "ufm_sigma")]
         assert 100 < ends[0] < ends[1]
 
     def test_equal_factors_are_equal_steps_of_a_logarithmic_scale(self) -> None:

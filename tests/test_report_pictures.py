@@ -205,7 +205,7 @@ class TestRooms:
     def test_snapshots_are_found_in_order(self, tmp_path: Path) -> None:
         (tmp_path / "room").mkdir()
         maps = {"mean_world": np.zeros((0, 3)), "covariance_world": np.zeros((0, 3, 3)), "disagreement": np.zeros(0)}
-        maps["count"] = np.zeros(0)
+        maps["views"] = np.zeros(0)
         for name in ("UfMstar-Ensemble_frame_10", "UfMstar-Ensemble_frame_9", "UfMstar-MCD@ab_frame_1"):
             path = np.zeros((int(name.rpartition("_")[2]), 3))
             np.savez(tmp_path / "room" / f"{name}.npz", **maps, T_world_cam=np.eye(4), path=path)

@@ -41,7 +41,7 @@ class Seen(torch.nn.Module):
 @pytest.fixture(scope="module")
 def model():
     """Compiled once; the module is reset before every test."""
-    model = UncertainDepth(Seen(), check_poses=0)
+    model = UncertainDepth(Seen(), posterior=False, check_poses=0)
     model(np.zeros((48, 64, 3), np.uint8), np.eye(4), (50.0, 50.0, 31.5, 23.5))
     return model
 

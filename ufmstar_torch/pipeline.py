@@ -262,8 +262,7 @@ class UncertainDepth(NetworksInTurn):
             TypeError, ValueError: see the class.
         """
         members = modules_of(networks)
-        own = isinstance(preprocess, str) and preprocess == "own"
-        return members, shared_preprocess(members) if own else preprocess
+        return members, shared_preprocess(members) if isinstance(preprocess, str) else preprocess
 
     def forward(
         self,
