@@ -30,9 +30,9 @@ _FACTORS = _FACTORS[np.abs(np.log2(_FACTORS)) > 0.3]
 # correct input is at .2 to .4 px and no reading halves it; a trajectory one frame late is at 1.1 px or more, four times
 # the correct one's distance.
 _HALVES, _APART = 2.0, 0.2
-# Pairs of frames from which a delay or a factor of the intrinsics is inferred. One or two pairs of good recordings fit
-# such a reading by chance, as the error of a single pose does; another convention they do not.
-_SEVERAL = 3
+# Number of frames from which a delay or a factor of the intrinsics is inferred. The errors of a few successive poses of
+# good recordings look like such a reading (in a tenth of all parts of 4 to 8 frames); they do not like a convention.
+_SPAN = 12
 # Largest distance of right poses, as a share of the width, and at least [px].
 _LARGEST, _FINE = 0.005, 1.0
 
@@ -155,7 +155,8 @@ def pose_fit(cameras: Cameras, width: float, corners: Sequence[FollowedCorners])
     far = list({one.first: one for one in corners}.values())
     fits = [_errors(cameras, pairs) for pairs in (near, far)]
     reading, error, best = UNCHANGED, fits[0][0], fits[0][0]
-    tried = len(_OTHERS) if len(near) >= _SEVERAL else len(_CONVENTIONS)
+    span = max(one.last for one in corners) - min(one.first for one in corners) + 1
+    tried = len(_OTHERS) if span >= _SPAN else len(_CONVENTIONS)
     for baseline, *others in fits:
         least = min(others[:tried])
         if reading == UNCHANGED and baseline > _HALVES * least and baseline - least > _APART and least <= limit:
