@@ -9,7 +9,7 @@ its last ten frames), and the pixels that gates on sigma / depth keep, plain and
 it prints false and missed stops: the truth is a stop if more than 1 % of the middle of the image is nearer than
 ``--nearer``; a rule stops if it says so of more than 1 % of these pixels. ``--noise``: rotation noise of every pose
 [degrees]. ``--fit`` also prints the factors of ``posterior.conformal.TRANSFER`` with which the mean coverage is that of
-``TARGETS``; the factors in use are the means of both networks'. ``--figure`` writes coverage and gates as pictures,
+``TARGETS``; those in use are FastDepth's. ``--figure`` writes coverage and gates as pictures,
 ``--picture`` the maps of the first sequence's last frame.
 """
 
