@@ -284,7 +284,7 @@ def by_hand(scene, members, mode="alternate"):
     """The depths of a run, computed by hand."""
     from ufmstar_torch.eval.sequences import open_sequence
 
-    pipeline = UncertainDepth(members, mode=mode, preprocess=members[0].preprocess)
+    pipeline = UncertainDepth(members, mode=mode, posterior=False, preprocess=members[0].preprocess)
     depth = []
     for frame in open_sequence(scene):
         image = torch.from_numpy(frame.image).permute(2, 0, 1)[None]
