@@ -31,7 +31,10 @@ def test_the_loop_chooses_trains_and_judges(capsys):
     assert list(results) == ["before", "random", *active_learning.PARTS]
     assert all(len(rows) == 1 and math.isfinite(rows[0]) for rows in results.values())
     assert len({rows[0] for rows in results.values()}) > 2, "training and the choice change the error"
-    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["before", "random", *["mean"] * 3]
+    heading, *lines = capsys.readouterr().out.splitlines()
+    assert "RMSE [m]" in heading
+    assert [line.split()[0] for line in lines] == ["before", "random", *["mean"] * 3]
+    assert all("nan" not in line for line in lines), "of one seed"
 
 
 def test_a_wrapped_network_has_a_better_posterior():

@@ -93,6 +93,18 @@ MISTAKES = {
     "frames": ("ufmstar run /nowhere --depth self --out {out} --frames 3", "START:STOP"),
     "no frames": ("--depth self --frames 9:", "selects none of the 6"),
     "size": ("--depth self --size 24", "--size must be HxW"),
+    "plug-in in a configuration": (
+        '--depth self --config {{"plugin":["a.py"]}}',
+        "--plugin allows code to run: type it on the command line",
+    ),
+    "trust in a configuration": (
+        '--depth self --config {{"trust_code":true}}',
+        "--trust-code allows code to run: type it on the command line",
+    ),
+    "trust without a program": (
+        "--model fastdepth --weights a --trust-code",
+        "--trust-code goes with --model exported",
+    ),
     "size beyond memory": (
         "--depth self --size 99999999x99999999",
         "--size would have 99999999 x 99999999 pixels, more than the limit of 89,478,485 pixels",

@@ -286,7 +286,7 @@ def test_lines_on_standard_input_live(ufmstar, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.StringIO(lines[1]))
     code, _, err = ufmstar("-")
     assert code == 1
-    assert "intrinsics of the image are needed" in err
+    assert "line 1: an image needs intrinsics, in its line, an earlier one or --intrinsics" in err
 
 
 def test_intrinsics_hold_for_later_lines_and_images_may_be_missing(tmp_path, caplog):

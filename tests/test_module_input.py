@@ -33,7 +33,7 @@ settings, segment = UfMStarConfig.from_dict, SPGFConfig.from_dict
 REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: begun().reset([7]), "7"),
     (lambda: begun().reset(torch.tensor([True, False])), "mask"),
-    (lambda: UfMStar().warm_up((0, 4)), "size and streams must be positive"),
+    (lambda: UfMStar().warm_up((0, 4)), r"size must be \(H, W\), positive whole numbers, got \(0, 4\)"),
     (lambda: settings({"eta": 0.0}), "eta"),
     (lambda: settings({"eta": 1.5}), "eta"),
     (lambda: settings({"eta_occlusion": -1.0}), "eta_occlusion"),
@@ -61,7 +61,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: segment({"noise_floor": 0.5}), "noise_floor"),
     (lambda: SPGFConfig.preset("kitti"), "tum, tartanair_indoor, tartanair_outdoor, got 'kitti'"),
     (lambda: SegmentInput.of(D, K1, SPGFConfig(min_gaussian_length=1e-6)), "config.min_gaussian_length = 1e-06 m"),
-    (lambda: resize_intrinsics(K1, (0, 4), (5, 6)), "positive sizes"),
+    (lambda: resize_intrinsics(K1, (0, 4), (5, 6)), r"old must be \(H, W\), positive whole numbers"),
     (lambda: barycenter(torch.zeros(2, 3), torch.eye(3).expand(2, 3, 3), -torch.ones(2)), "weight must be non-neg"),
 ]
 

@@ -116,4 +116,7 @@ def test_the_example_counts_its_updates(capsys):
     assert {name: row[0] for name, [row] in results.items()} == {"decided": 8, "random": 8, "all": 10, "none": 0}
     assert results["random"] == results["decided"], "the same images give the same error"
     assert len({row[1] for [row] in results.values()}) == 3
-    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(results)
+    heading, *lines = capsys.readouterr().out.splitlines()
+    assert "RMSE [m]" in heading
+    assert [line.split()[0] for line in lines] == list(results)
+    assert all("nan" not in line for line in lines), "of one walk"

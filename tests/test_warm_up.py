@@ -152,7 +152,7 @@ def test_warm_up_leaves_networks_images_and_state_as_they_are():
     assert torch.equal(torch.get_rng_state(), random)
     assert all(same(v, before[k]) for k, v in model.state_dict().items())
     UncertainDepth(None).warm_up((32, 48))
-    with pytest.raises(ValueError, match=r"\(H, W\) and B, got 224"):
+    with pytest.raises(TypeError, match=r"size must be \(H, W\), positive whole numbers, got int"):
         model.warm_up(224)
 
 

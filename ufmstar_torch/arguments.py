@@ -96,7 +96,9 @@ def require_size(name: str, value: object) -> tuple[int, int]:
     if not isinstance(value, tuple | list | torch.Size) or len(value) != 2:
         kind = f"{len(value)} values" if isinstance(value, tuple | list) else type(value).__name__
         raise TypeError(f"{name} must be (H, W), positive whole numbers, got {kind}")
-    height, width = (require_whole(name, side, 1) for side in value)
+    height, width = (require_whole(name, side) for side in value)
+    if min(height, width) < 1:
+        raise ValueError(f"{name} must be (H, W), positive whole numbers, got {tuple(value)}")
     return height, width
 
 

@@ -130,8 +130,8 @@ def resize_intrinsics(intrinsics: Tensor, old: tuple[int, int], new: tuple[int, 
 def crop_intrinsics(intrinsics: Tensor, top: int, left: int) -> Tensor:
     """Intrinsics [..., 3, 3] after ``top`` rows and ``left`` columns [px] were cut off (negative: padded)."""
     _require_matrix(intrinsics)
-    v, u = require_number("top", top), require_number("left", left)
-    shift = intrinsics.new_tensor([[0.0, 0.0, u], [0.0, 0.0, v], [0.0, 0.0, 0.0]])
+    x, y = require_number("left", left), require_number("top", top)
+    shift = intrinsics.new_tensor([[0.0, 0.0, x], [0.0, 0.0, y], [0.0, 0.0, 0.0]])
     return intrinsics - shift
 
 

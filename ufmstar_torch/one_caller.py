@@ -69,8 +69,9 @@ def _guarded(method: Callable[..., Any]) -> Callable[..., Any]:
     # As torch.compiler.disable, which imports the compiler (6 s): torch.compile runs the method as it is.
     frames = torch._C._dynamo.eval_frame
     skip = frames._FrameAction.SKIP
-    frames.set_code_exec_strategy(guarded.__code__, frames._FrameExecStrategy(skip, skip))
-    guarded._torchdynamo_disable = True
+    function: Any = guarded
+    frames.set_code_exec_strategy(function.__code__, frames._FrameExecStrategy(skip, skip))
+    function._torchdynamo_disable = True
     return guarded
 
 

@@ -263,7 +263,7 @@ class UncertainDepth(NetworksInTurn):
         """
         members = modules_of(networks)
         if isinstance(preprocess, str) and preprocess != "own":
-            raise TypeError(f"preprocess must be a Preprocess, 'own' or None, got {preprocess!r}")
+            raise TypeError(f"preprocess must be a Preprocess, a function or None, got {preprocess!r}")
         return members, shared_preprocess(members) if isinstance(preprocess, str) else preprocess
 
     def forward(
