@@ -16,7 +16,6 @@ from ufmstar_torch.eval.tour.shade import shade
 from ufmstar_torch.eval.tour.tour import Tour
 from ufmstar_torch.eval.tour.visibility import Window, surface_windows
 
-
 _SKY = torch.tensor([[0.55], [0.7], [0.9]])  # linear RGB
 
 
