@@ -196,12 +196,12 @@ def update(state, depth, claimed, pixel, g, variance, motion=None):
     offset, share = HX[:, 4:] @ mean[4:], away / REACH
     around = y_variance(logs.shape, node, y, noise, np.ones(N, bool), mean[0])
     p = np.minimum(ratio(after, "wrong") * wrong_factor(share, scale), 0.5)
+    wide = [elsewhere(*each) for each in zip(around, away * ratio(after, "unseen"), strict=True)]
+    unmeasured = min(C[0, 0] / PRIOR[0], 1) ** 2
+    p = np.where(p < 0.1, p + unmeasured * (0.1 - p), p)
+    wide = [each + unmeasured * (2 - each) for each in wide]
     if motion is not None:
         p = 1 - (1 - p) * (1 - moving(motion, depth.shape, logs, offset, share, ratio(after, "between")))
-    wide = [elsewhere(*each) for each in zip(around, away * ratio(after, "unseen"), strict=True)]
-    unmeasured = min(C[0, 0] / PRIOR[0], 1)
-    p = np.where(p < 0.1, p + unmeasured**2 * (0.1 - p), p)
-    wide = [each + unmeasured * (2 - each) for each in wide]
     alone = [second_moment(0.0, *each) for each in zip(spread, offset, wide, strict=True)]
     spread = [second_moment(*each) for each in zip(p, spread, offset, wide, strict=True)]
     posterior, variance, outlier = read(depth, np.nan_to_num(claimed), logs, mean[:4], offset, spread, p, share)

@@ -63,7 +63,8 @@ def _drive(tour: Tour, frames: int, rng: np.random.Generator) -> Array:
     pace = min(float(rng.uniform(*_PACE)) * width, SPACING * (len(way) - 1) / frames)
     start = float(rng.uniform(0, SPACING * (len(way) - 1) - pace * frames))
     metres = start + pace * np.arange(frames)
-    x, yaw, pitch, roll = (_waves(metres / width, rng, 0.1, 0.4) for _ in range(4))
+    widths = np.asarray(metres / width, np.float64)
+    x, yaw, pitch, roll = (_waves(widths, rng, 0.1, 0.4) for _ in range(4))
     poses = np.tile(np.eye(4), (frames, 1, 1))
     for i in range(frames):
         heading = np.pi * backwards + _STEERING * yaw[i]

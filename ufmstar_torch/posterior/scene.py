@@ -225,9 +225,9 @@ def wrong_factor(config: PosteriorConfig, away: Floats, scale: Floats) -> Floats
 
 def misscaled(config: PosteriorConfig, variance: float, p: Floats, wide: Floats) -> tuple[Floats, Floats]:
     """The probabilities [n] of another surface and the variances [n] of y there, raised towards ``misscaled`` and
-    ``widest`` as far as the ``variance`` of b's constant is that before the first anchor."""
-    unmeasured = min(variance / config.prior_sigma**2, 1.0)
-    return p + unmeasured**2 * np.maximum(config.misscaled - p, 0), wide + unmeasured * (config.widest - wide)
+    ``widest`` by the squared share of the ``variance`` of b's constant in that before the first anchor."""
+    unmeasured = min(variance / config.prior_sigma**2, 1.0) ** 2
+    return p + unmeasured * np.maximum(config.misscaled - p, 0), wide + unmeasured * (config.widest - wide)
 
 
 def inlier_factor(running: Running, away: Floats) -> Floats:

@@ -31,7 +31,7 @@ steepness), and share = min(1, distance/reach):
 - The ratios include the held-out anchors of this frame.
 
 Before the first anchor the network may be off by any factor: p is raised towards ``misscaled``, and w towards
-``widest``, as far as the variance of b's constant is that before the first anchor (p by the square of that share).
+``widest``, by the squared share of the variance of b's constant in that before the first anchor.
 
 The distance from evidence is geodesic, in image widths, and differences of log d lengthen it: on tours the variance of
 the error is proportional to it. ``learn`` estimates ``unseen``, ``wrong`` and the other ratios (``running``).
