@@ -47,8 +47,10 @@ KINDS_OF_TOURS = ("711?style=home", "713?style=home", "712?style=hall", "721?sty
                   "732?style=blank&pan=1")  # fmt: skip
 TOURS = [f"tour:{kind}&frames=40&size=240x320" for kind in KINDS_OF_TOURS]
 MIXTURE = ("mixture_nll", "mixture_ece_delta", "mixture_ece_q", "mixture_coverage")
-# The last one: share of frames whose RMSE exceeds 1.1 times the network's.
-FIGURES = ("delta1", "rmse", "ece_delta", "ece_q", "nll", "spearman", *MIXTURE, "worse_frames")
+# Mean probability of another surface at pixels beyond and within 3 standard deviations of it; share of frames whose
+# RMSE exceeds 1.1 times the network's.
+LAST = ("outlier_beyond", "outlier_within", "worse_frames")
+FIGURES = ("delta1", "rmse", "ece_delta", "ece_q", "nll", "spearman", *MIXTURE, *LAST)
 KINDS = DENSE, CORNERS, NEAR = "dense", "corners", "near"
 NEAREST = 0.4  # share of the image that evidence of NEAR covers
 STRIDE = 4  # metrics use every fourth pixel of every fourth row
@@ -117,7 +119,7 @@ def made(frame: Frame, edges: bool) -> tuple[Tensor, Tensor]:
 def figures(prepared: list[Prepared], kind: str, config: PosteriorConfig) -> list[float]:
     """``FIGURES`` of the posterior with one kind of evidence."""
     metrics, packed = SequenceMetrics(), torch.zeros(1, SIZE, dtype=torch.float64)
-    worse = []
+    worse, outliers = [], []
     for one in prepared:
         packed, out = update(packed, one.frame, one.anchors[kind], one.claimed, config)
         common = common_error(one.anchors[kind], out.depth, config.prior_sigma**2)
@@ -128,7 +130,10 @@ def figures(prepared: list[Prepared], kind: str, config: PosteriorConfig) -> lis
         measured = (truth > 0) & (network > 0)
         error, before = (truth - depth)[measured], (truth - network)[measured]
         worse.append((error.square().mean() > 1.21 * before.square().mean()).double())
-    row = metrics.compute() | {"worse_frames": float(torch.stack(worse).nanmean())}
+        outliers.append(torch.stack([mixture[1][measured], error.square() / variance[measured]]))
+    p, z2 = torch.cat(outliers, 1)
+    of_outliers = float(p[z2 > 9].nanmean()), float(p[z2 <= 9].nanmean())
+    row = metrics.compute() | dict(zip(LAST, (*of_outliers, float(torch.stack(worse).nanmean())), strict=True))
     return [row[name] for name in FIGURES]
 
 

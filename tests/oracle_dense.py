@@ -63,6 +63,21 @@ def along_line(image, view, pixel, H, b, low, high):
     return (at[axis] * rays[2] - rays[axis]) / (b[axis] - at[axis] * b[2]), best
 
 
+def centre_of_texture(image, pixel, rho, H, b):
+    """[2] mean position of the squared gradients along the line of a pixel's window, from the pixel, in its image."""
+    reference = patch(image, pixel, rho, H, b)
+    ahead, behind = project(pixel, rho + 1e-4, H, b), project(pixel, rho - 1e-4, H, b)
+    direction = (ahead - behind) / np.linalg.norm(ahead - behind)
+    down, right = np.gradient(reference)
+    inside = reference[1:-1, 1:-1]
+    contrast = np.linalg.norm(inside - inside.mean())
+    right, down = (g[1:-1, 1:-1] / contrast for g in (right, down))
+    weight = (direction[0] * (right - right.mean()) + direction[1] * (down - down.mean())) ** 2
+    row, column = np.mgrid[:SIDE, :SIDE] + FIRST
+    mean = np.array([(weight * column).sum(), (weight * row).sum()]) / weight.sum()
+    return warp(np.asarray(pixel, float), rho, H, b) @ mean
+
+
 def displaced(pixel, rho, H, b, K, error):
     """Projection into a view whose pose and camera have the ``error`` [10]: w, s, f, cx, cy, k."""
     w, s, (focal, cu, cv, k) = error[:3], error[3:6], error[6:]

@@ -19,7 +19,7 @@ START = {
     "between": (0.04, 20.0, 9e-4, 1.0),
     "calibration": (0.0, 0.0, 0.0, 1e6),
 }
-PRIOR, DRIFT, MEMORY = np.array([0.5, 0.5, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
+PRIOR, DRIFT, MEMORY = np.array([0.5, 0.2, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
 REACH, RADIUS, NEAR, WEAK, CLIP, APART = 1.0, 0.15, 0.05, 0.25**2, 9.0, 0.5
 
 
@@ -56,7 +56,7 @@ def links(logs):
         for c in range(cols):
             for dr, dc, n in ((0, 1, cols), (1, 0, rows)):
                 if r + dr < rows and c + dc < cols:
-                    d = abs(logs[r + dr, c + dc] - logs[r, c])
+                    d = 1.67 * abs(logs[r + dr, c + dc] - logs[r, c])
                     i = r * cols + c
                     yield i, i + dr * cols + dc, 0.0015 + 6 * d * d, 1 / n + d
 
@@ -76,11 +76,11 @@ def node_features(logs):
 def joint_prior(logs, state):
     """Mean and precision of (b, f)."""
     n, m0, q, amplitude = logs.size, logs.mean(), FEATURES, ratio(state, "amplitude")
-    T = np.eye(4)
-    T[0, 1] = m0 - state["m0"] if state["frames"] else 0.0
-    C = T @ state["C"] @ T.T
+    T, C = np.eye(4), state["C"]
     if state["frames"]:
-        C = C + np.diag(DRIFT * np.clip(1 - np.diag(C) / PRIOR, 0, 1))
+        T = np.diag([1, 0.8, 0.8, 0.8]) @ np.array([[1, m0 - state["m0"], 0, 0], *np.eye(4)[1:]])
+        C = T @ C @ T.T
+        C = C + np.diag([DRIFT * min(max(1 - C[0, 0] / PRIOR[0], 0), 1), *(0.36 * PRIOR[1:])])
     Q = np.zeros((q + n, q + n))
     Q[:4, :4] = np.linalg.inv(C)
     Q[q:, q:] = np.eye(n) * 0.5 / amplitude
@@ -196,9 +196,12 @@ def update(state, depth, claimed, pixel, g, variance, motion=None):
     offset, share = HX[:, 4:] @ mean[4:], away / REACH
     around = y_variance(logs.shape, node, y, noise, np.ones(N, bool), mean[0])
     p = np.minimum(ratio(after, "wrong") * wrong_factor(share, scale), 0.5)
+    wide = [elsewhere(*each) for each in zip(around, away * ratio(after, "unseen"), strict=True)]
+    unmeasured = min(C[0, 0] / PRIOR[0], 1) ** 2
+    p = np.where(p < 0.1, p + unmeasured * (0.1 - p), p)
+    wide = [each + unmeasured * (2 - each) for each in wide]
     if motion is not None:
         p = 1 - (1 - p) * (1 - moving(motion, depth.shape, logs, offset, share, ratio(after, "between")))
-    wide = [elsewhere(*each) for each in zip(around, away * ratio(after, "unseen"), strict=True)]
     alone = [second_moment(0.0, *each) for each in zip(spread, offset, wide, strict=True)]
     spread = [second_moment(*each) for each in zip(p, spread, offset, wide, strict=True)]
     posterior, variance, outlier = read(depth, np.nan_to_num(claimed), logs, mean[:4], offset, spread, p, share)

@@ -72,6 +72,28 @@ def test_one_view_agrees_with_the_loops(scene):
             assert abs(result.rho[n] - rho) * speed < 0.1, "a tenth of a pixel"
 
 
+def test_the_centre_of_the_texture_agrees_with_the_loops(scene):
+    image, pixel, others = scene
+    view = views(others[1:2], MOVED[1:2], np.eye(4))
+    search = Search(0.5, 0.4, 0.6, 3.5, 0.85, 1.0, 1.0)
+    result = measure(image, pixel, view, search)
+    chosen = np.flatnonzero(result.agreed == 1)[:8]
+    expected = [oracle_dense.centre_of_texture(image, pixel[n], 0.5, view.H[0], view.b[0]) for n in chosen]
+    np.testing.assert_allclose(result.centre[chosen], expected, atol=0.02)
+    assert np.linalg.norm(expected, axis=1).max() > 0.5
+
+
+def test_a_blank_pixel_beside_an_edge_measures_the_edge():
+    """Two pixels to the right of a vertical edge, the mean of the matched texture lies to the left."""
+    u = np.arange(96.0)
+    image, shifted = (np.tile(np.clip(60 + 100 / (1 + np.exp((u - at) * 3)), 0, 255), (72, 1)) for at in (40.5, 36.0))
+    image, other = image.round().astype(np.uint8), shifted.round().astype(np.uint8)
+    result = measure(image, np.array([[42.5, 36.0]]), views([other], [pose(0.1)], np.eye(4)), SEARCH)
+    assert result.agreed[0] == 1
+    assert -2.3 < result.centre[0, 0] < -0.7
+    assert abs(result.centre[0, 1]) < 0.3
+
+
 def test_a_plane_is_where_it_is_and_as_uncertain_as_stated(scene):
     image, pixel, others = scene
     result = measure(image, pixel, views(others, MOVED, np.eye(4)), SEARCH)

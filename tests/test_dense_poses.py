@@ -50,7 +50,7 @@ def measured(pixel, rho, views, error, noise, rng):
     n = len(rho)
     return Measured(
         value.mean(1), np.ones(n), np.full(n, 3), np.zeros(n, np.int64), value, same, along, speed,
-        np.zeros(speed.shape), (off * normal).sum(-1), same,
+        np.zeros(speed.shape), (off * normal).sum(-1), same, np.zeros((n, 2)),
     )  # fmt: skip
 
 
@@ -198,7 +198,7 @@ def test_matches_of_one_view_hold_where_the_oracle_finds_support():
         variance = np.square(rho * rng.choice([0.01, 0.05, 0.3], n, p=[0.5, 0.48, 0.02]))
         agreed, contradicted = rng.choice([0, 1, 1, 2, 3], n), rng.choice([0, 0, 0, 0, 1], n)
         each = np.full((n, 3), np.nan)
-        result = confirmed(pixel, Measured(rho, variance, agreed, contradicted, *[each] * 7), 10)
+        result = confirmed(pixel, Measured(rho, variance, agreed, contradicted, *[each] * 8), 10)
         expected = oracle_dense.confirmed(pixel, rho, variance, agreed, contradicted, 10)
         np.testing.assert_array_equal(result, expected)
         seen.append([np.mean(result[agreed == 1]), np.mean(~result[(agreed == 1) & (contradicted == 0)])])
@@ -215,5 +215,5 @@ def test_pixels_far_from_all_others(count):
 
 def test_nothing_is_confirmed_where_nothing_was_measured():
     none = np.zeros(0)
-    empty = Measured(none, none, none.astype(int), none.astype(int), *[np.zeros((0, 3))] * 7)
+    empty = Measured(none, none, none.astype(int), none.astype(int), *[np.zeros((0, 3))] * 8)
     assert len(confirmed(np.zeros((0, 2)), empty, 10)) == 0

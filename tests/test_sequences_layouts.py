@@ -69,6 +69,26 @@ def test_seven_scenes_registers_depth_to_colour(tmp_path):
         assert 0.65 < valid.mean() < 0.9  # the colour camera sees further to all sides: (525 / 585)^2 = 0.8
 
 
+@pytest.mark.parametrize("name", ["intrinsics.K.txt", "camera-intrinsics.txt"])
+def test_the_camera_in_the_folder_wins_over_the_one_of_the_layout(tmp_path, name):
+    path, _, of_depth = layouts.write_seven_scenes(tmp_path)
+    np.savetxt(path / name, of_depth.K)  # one registered camera, as in other recordings with these file names
+    sequence = open_sequence(path)
+    np.testing.assert_allclose(sequence.intrinsics, of_depth.K, atol=1e-12)
+    for i, frame in enumerate(sequence):
+        np.testing.assert_allclose(frame.T_world_cam, of_depth.T_world_cam[i], atol=1e-9)
+        np.testing.assert_allclose(frame.depth, of_depth.depths[i], atol=1e-3)
+    chosen = open_sequence(path, intrinsics=[100, 101, 32, 24])
+    np.testing.assert_array_equal(chosen.intrinsics[[0, 1], [0, 1]], [100, 101])
+
+
+@pytest.mark.parametrize("write", [layouts.write_tum, layouts.write_tartanair])
+def test_intrinsics_in_the_folder_of_a_layout_with_a_default_camera(tmp_path, write):
+    path = write(tmp_path)[0]
+    np.savetxt(path / "K.txt", [[100, 0, 32], [0, 101, 24], [0, 0, 1]])
+    np.testing.assert_array_equal(open_sequence(path).intrinsics[[0, 1], [0, 1]], [100, 101])
+
+
 def test_register_depth_closed_form():
     K = np.array([[10.0, 0, 2], [0, 10.0, 1], [0, 0, 1]])
     T = np.eye(4)

@@ -23,7 +23,7 @@ from ufmstar_torch.eval.tour.view import cast, intrinsics
 K = torch.from_numpy(intrinsics(24, 32))
 
 
-SEEDS = {"home": 2, "hall": 3, "mixed": 1}
+SEEDS = {"home": 2, "hall": 3, "mixed": 1, "close": 1}
 
 
 @pytest.fixture(scope="module")
@@ -294,6 +294,31 @@ def test_a_pan_turns_in_place_and_a_blank_home_is_plain():
     turned = poses[0, :3, :3].T @ poses[-1, :3, :3]
     assert np.degrees(np.arccos((np.trace(turned) - 1) / 2)) > 30
     assert set(HOME_TEXTURES) - set(STYLES["blank"].textures) >= {"wood", "tiles", "bricks", "plaster"}
+
+
+@pytest.mark.parametrize("style", ["corridor", "street"])
+@pytest.mark.parametrize("path_seed", [None, 0, 1])
+def test_a_drive_follows_the_axis_clear_of_everything(style, path_seed):
+    tour = make_tour(4, style)
+    poses = tour_path(tour, 60, path_seed)
+    motion = poses[1:, :3, 3] - poses[:-1, :3, 3]
+    ahead = (motion * poses[:-1, :3, 2]).sum(1) / motion.norm(dim=1)
+    assert ahead.min() > np.cos(np.radians(10))
+    assert motion[:, 2].abs().sum() > 2
+    lower, upper = tour.rooms[0]
+    assert ((lower < poses[:, :3, 3]) & (poses[:, :3, 3] < upper)).all()
+    assert to_surfaces(tour, poses[:, :3, 3]).min() >= 0.3
+
+
+def test_a_street_has_a_sky_without_depth_and_a_close_tour_is_near():
+    street = open_sequence("tour:1?style=street&frames=3&size=48x64")[1]
+    sky = street.depth == 0
+    assert 0.02 < sky.mean() < 0.5
+    assert street.image[sky].mean() > 120
+    assert not sky[-16:].any()
+    close = np.stack([frame.depth for frame in open_sequence("tour:1?style=close&frames=8&size=48x64")])
+    assert close.min() > 0.2
+    assert np.median(close) < 2
 
 
 def test_an_exported_tour_reads_as_a_generic_sequence(tmp_path):

@@ -24,7 +24,7 @@ from ufmstar_torch.eval.sequences.images import (
     list_files,
     read_color,
 )
-from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
+from ufmstar_torch.eval.sequences.intrinsics import FILES, read_intrinsics
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.poses import associate, read_trajectory
@@ -39,7 +39,7 @@ TRAJECTORIES = (
     *("CameraTrajectory.txt", "KeyFrameTrajectory.txt", "cam0_to_world.txt"),
 )
 _KITTI = "calib.txt"  # of KITTI's odometry benchmark; read if there is none of the others
-INTRINSICS = ("K.txt", "intrinsics.txt", "intrinsic.txt", "camera.txt", _KITTI)
+INTRINSICS = (*FILES, _KITTI)
 LOOKED_FOR = (
     f"images ({', '.join(IMAGES)}/ or a video), a trajectory ({', '.join(TRAJECTORIES)}; "
     f"`ufmstar poses` computes one from images alone), {INTRINSICS[0]}"

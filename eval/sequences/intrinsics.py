@@ -16,6 +16,13 @@ from ufmstar_torch.eval.sequences.poses import numbered_lines, read_matrix
 # A file's path, a matrix [3, 3] (or ScanNet's [4, 4]), or the numbers fx, fy, cx, cy [px].
 IntrinsicsLike = str | Path | np.ndarray | Sequence[float]
 
+# Names of files with the camera of the images, and of the depth maps.
+FILES = (
+    *("K.txt", "intrinsics.txt", "intrinsic.txt", "camera.txt", "intrinsics.K.txt"),
+    *("camera-intrinsics.txt", "camera_intrinsics.txt"),
+)
+DEPTH_FILES = ("K_depth.txt", "depth_K.txt", "intrinsics_depth.txt", "depth_intrinsics.txt", "depth.intrinsics.K.txt")
+
 # Sizes whose aspect ratios differ by more than this were cropped, not resized.
 _ASPECT_TOLERANCE = 0.02
 _PROJECTION = re.compile(r"P(?:_rect_0)?\d\s*:(.*)")
@@ -51,6 +58,11 @@ def _projections(path: Path) -> np.ndarray | None:
     if found and not all(np.array_equal(K, found[0]) for K in found):
         raise ValueError(f"{path}: the intrinsics of its cameras differ: pass intrinsics as fx fy cx cy")
     return found[0] if found else None
+
+
+def camera_file(folder: Path, names: Sequence[str]) -> Path | None:
+    """The first file of these names in a folder."""
+    return next((folder / name for name in names if (folder / name).is_file()), None)
 
 
 def parse_intrinsics(words: Sequence[str], option: str) -> str | list[float] | None:

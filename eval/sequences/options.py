@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from ufmstar_torch.conventions import CONVENTIONS, OURS
 from ufmstar_torch.eval.sequences.images import check_scale
-from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, parse_intrinsics
+from ufmstar_torch.eval.sequences.intrinsics import DEPTH_FILES, FILES, IntrinsicsLike, camera_file, parse_intrinsics
 
 _WORD, _WORDS = {"type": str | None}, {"type": tuple[str, ...]}  # types on the command line
 
@@ -102,6 +102,16 @@ class Options:
             if name in self.changed():
                 other = "use layout='generic' to combine images, depth and a trajectory freely"
                 raise ValueError(f"layout {layout!r} takes no {name}: its files hold that; {other}")
+
+
+def with_camera_files(options: Options, folder: Path) -> Options:
+    """The options with the cameras of files in a sequence's folder, which win over a layout's default cameras."""
+    color, depth = camera_file(folder, FILES), camera_file(folder, DEPTH_FILES)
+    if options.intrinsics is None and color is not None:
+        options = replace(options, intrinsics=color)
+    if options.depth_intrinsics is None and depth is not None:
+        options = replace(options, depth_intrinsics=depth)
+    return options
 
 
 def resolve(root: Path, name: str | Path) -> Path:

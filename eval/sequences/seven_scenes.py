@@ -3,7 +3,8 @@
 The authors publish the depth camera's K = 585, 585, 320, 240, and state that colour and depth were not calibrated to
 each other. The poses are the depth camera's (KinectFusion tracks it). The colour camera is a Kinect's: K = 525, 525,
 320, 240 and a baseline of 2.5 cm along x are customary in the literature, accurate to a few pixels. Pass ``intrinsics``
-and ``T_color_depth`` if better values are known.
+and ``T_color_depth`` if better values are known. Other recordings have the same file names and a file of intrinsics in
+the folder: there, depth has the camera of the images, unless another file or an option names its camera.
 https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/
 """
 
@@ -24,7 +25,7 @@ from ufmstar_torch.eval.sequences.ground_truth import register_depth
 from ufmstar_torch.eval.sequences.images import first_depth_size, first_image_size, natural_key, read_map
 from ufmstar_torch.eval.sequences.intrinsics import camera_matrix, pinhole
 from ufmstar_torch.eval.sequences.lens import Lens
-from ufmstar_torch.eval.sequences.options import Options, resolve
+from ufmstar_torch.eval.sequences.options import Options, resolve, with_camera_files
 from ufmstar_torch.eval.sequences.poses import read_pose
 
 LOOKED_FOR = "frame-NNNNNN.pose.txt files"
@@ -48,6 +49,12 @@ def read(path: Path, options: Options) -> FrameSequence:
 
     Depth is warped into the colour camera, and ``T_world_cam`` is the colour camera's, as must be ``trajectory``.
     """
+    others = with_camera_files(options, path)
+    if options.intrinsics is None and others.intrinsics is not None:
+        registered = others.intrinsics if others.depth_intrinsics is None else others.depth_intrinsics
+        one_camera = np.eye(4) if options.T_color_depth is None else options.T_color_depth
+        others = replace(others, depth_intrinsics=registered, T_color_depth=one_camera)
+    options = others
     files: dict[str, dict[str, Path]] = {}
     for file in sorted(path.iterdir(), key=natural_key):
         found = _FRAME.fullmatch(file.name)

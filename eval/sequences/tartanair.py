@@ -14,7 +14,7 @@ from ufmstar_torch.eval.sequences.attach import frame_of_image
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size, list_files
 from ufmstar_torch.eval.sequences.lens import Lens
-from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.options import Options, with_camera_files
 from ufmstar_torch.eval.sequences.poses import read_trajectory
 
 LOOKED_FOR = "pose_left.txt and image_left/ (also in a single sub-folder P000)"
@@ -34,6 +34,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     if len(folders) > 1:
         raise ValueError(f"{path} holds the trajectories {[folder.name for folder in folders]}: open one of them")
     folder = folders[0]
+    options = with_camera_files(options, folder)
     trajectory = read_trajectory(folder / "pose_left.txt")
     if trajectory.timestamps is not None:
         raise ValueError(f"{folder / 'pose_left.txt'}: expected 7 numbers in a line, tx ty tz qx qy qz qw")

@@ -17,7 +17,7 @@ from ufmstar_torch.eval.sequences.attach import frame_of_image
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size, listed_path
 from ufmstar_torch.eval.sequences.lens import Lens
-from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.options import Options, with_camera_files
 from ufmstar_torch.eval.sequences.poses import associate, numbered_lines, read_trajectory
 
 LOOKED_FOR = "rgb.txt and groundtruth.txt"
@@ -39,8 +39,9 @@ def detect(path: Path) -> bool:
 def read(path: Path, options: Options) -> FrameSequence:
     """Open a TUM RGB-D sequence. An image without a depth map within ``max_time_difference`` stays, with ``depth``
     None. Images and depth are undistorted with the lens's published coefficients, unless ``distortion`` or
-    ``intrinsics`` is set. Raises ValueError: no usable frame; neither the folder nor the files name the camera
-    (``freiburgN``) and ``intrinsics`` is None; a malformed line."""
+    ``intrinsics`` is set or the folder has a file of intrinsics. Raises ValueError: no usable frame; neither the folder
+    nor the files name the camera (``freiburgN``) and there are no intrinsics; a malformed line."""
+    options = with_camera_files(options, path)
     times, files = read_file_list(path / "rgb.txt")
     depth_files = _paired_depth(path, times, options.max_time_difference)
     loaders = [depth_loader(depth_files.get(i), options.truth_scale, SCALE) for i in range(len(files))]

@@ -26,7 +26,10 @@ def furnish(room: Room, doors: list[Door], way: Array, palette: Palette, rng: np
     near = way[((way > room.lower - 1) & (way < room.upper + 1)).all(1)]
     stock = Furnished(room, near, palette, rng)
     stock.occupied += [door.box(0.15, 0.5, 0.1, 0.0) for door in doors]
-    stock.hang_ceiling_lamps()
+    if room.style.outdoors:
+        stock.add_sun()
+    else:
+        stock.hang_ceiling_lamps()
     if rng.random() < 0.7:
         stock.lay_rug()
     stock.place_furniture()
@@ -55,7 +58,7 @@ class Furnished:
         """Add furniture at the walls and in the middle, and chairs around tables."""
         room, rng = self.room, self.rng
         size = room.upper - room.lower
-        large = size.max() >= _HALL_FROM
+        large = size.min() >= _HALL_FROM
         wanted, placed = round(float(room.style.furniture * size.prod())), 0
         scale = float(rng.uniform(*room.style.scale))
         for _ in range(12 * wanted):
@@ -109,6 +112,14 @@ class Furnished:
                 self.parts.append(tube((x, -room.height + drop / 2, z), 0.012, drop / 2, metal))
             power = float(rng.uniform(*style.brightness)) / count**0.7
             self.lights.append([x, -room.height + drop + 0.16, z, *color * power, 0.5 * size.mean(), 0.25])
+
+    def add_sun(self) -> None:
+        """Add one light far above the room."""
+        (x, z), size, style = self.room.centre, self.room.upper - self.room.lower, self.room.style
+        warm, far = float(self.rng.uniform(*style.warmth)), 2 * float(size.max())
+        color = np.array([1.0 + 0.18 * warm, 1.0 + 0.02 * warm, 1.0 - 0.28 * warm])
+        x, z = (x, z) + far * self.rng.uniform(-0.5, 0.5, 2)
+        self.lights.append([x, -far, z, *color * float(self.rng.uniform(*style.brightness)), far, 0.25])
 
     def lay_rug(self) -> None:
         """Add a round or rectangular rug near the middle."""

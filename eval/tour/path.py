@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ufmstar_torch.eval.tour.route import SPACING
 from ufmstar_torch.eval.tour.shapes import rotation
+from ufmstar_torch.eval.tour.style import style_of
 from ufmstar_torch.eval.tour.tour import Tour
 
 Array = NDArray[np.float64]
@@ -18,6 +19,9 @@ _SLOWEST, _FASTEST = 0.5, 1.3  # limits of the pace as shares of that motion; wi
 # Shares of a way after which the camera has seen its last room, is back at its start, and has repeated the first views.
 _ENOUGH_TO_SEE, _ENOUGH_TO_RETURN, _ONCE_MORE = 0.6, 0.95, 1.12
 _LOOKAHEAD, _SMOOTH = 0.7, 0.4  # distance of the point that the camera looks at, and smoothing of its direction [m]
+# Pace of a drive per frame as shares of the room's width, from the slowest to the fastest, and its largest yaw, pitch
+# and roll about the axis [rad].
+_PACE, _STEERING = (0.02, 0.06), np.radians(3.0)
 SWAY = 0.04  # largest sway of the hand on each axis [m]
 _GLANCE, _PITCH, _ROLL = np.radians(22.0), np.radians(4.0), np.radians(1.2)
 
@@ -27,27 +31,48 @@ def tour_path(tour: Tour, frames: int, seed: int | None = None, *, pan: bool = F
 
     Without ``seed``, the camera starts in the first room, walks to the farthest room that the frames allow and back,
     and repeats the start. (If the last room has another style, the camera always goes there, and returns only if the
-    frames allow.) With ``seed``, it starts anywhere on the longest way, in either direction. With ``pan``, it stays at
-    the start and turns; the sway of the hand is its only baseline. Raises ValueError: no frame, or a negative seed.
+    frames allow.) With ``seed``, it starts anywhere on the longest way, in either direction. In a corridor or a street
+    it drives along the axis at a pace that the seed determines. With ``pan``, it stays at the start and turns; the sway
+    of the hand is its only baseline. Raises ValueError: no frame, or a negative seed.
     """
     if frames < 1:
         raise ValueError(f"frames must be at least 1, got {frames}")
     if seed is not None and seed < 0:
         raise ValueError(f"seed must be None or at least 0, got {seed}")
     rng = np.random.default_rng([tour.seed, 101] if seed is None else [tour.seed, 102, seed])
-    if seed is None:
+    if style_of(tour.room_styles[0]).length is not None:
+        poses = _drive(tour, frames, rng)
+    elif seed is None:
         way, share = _way_within(tour, frames)
-        s = _samples(way, frames, share)
+        poses = _poses(tour, way, _samples(way, frames, share), rng)
     else:
         way = tour.ways[-1] if rng.random() < 0.5 else tour.ways[-1][::-1].copy()
         way = np.roll(way, -int(rng.integers(len(way))), axis=0)
-        s = _samples(way, frames, min(1.0, frames / _effort(way)[-1]))
-    poses = _poses(tour, way, s, rng)
+        poses = _poses(tour, way, _samples(way, frames, min(1.0, frames / _effort(way)[-1])), rng)
     if pan:
         sway = np.stack([_waves(_STEP * np.arange(frames, dtype=np.float64), rng, 0.35, 1.1) for _ in range(3)], 1)
         poses[:, :3, 3] = poses[0, :3, 3] + 0.7 * SWAY * sway
         poses[:, :3, :3] = np.stack([rotation(1, i * _TURN / 2) @ poses[0, :3, :3] for i in range(frames)])
     return torch.from_numpy(poses)
+
+
+def _drive(tour: Tour, frames: int, rng: np.random.Generator) -> Array:
+    """Poses along the axis of a long room, in either direction, with a vehicle's small motions."""
+    way, width = tour.ways[0], float(tour.rooms[0, 1, 0] - tour.rooms[0, 0, 0])
+    backwards = bool(rng.random() < 0.5)
+    pace = min(float(rng.uniform(*_PACE)) * width, SPACING * (len(way) - 1) / frames)
+    start = float(rng.uniform(0, SPACING * (len(way) - 1) - pace * frames))
+    metres = start + pace * np.arange(frames)
+    widths = np.asarray(metres / width, np.float64)
+    x, yaw, pitch, roll = (_waves(widths, rng, 0.1, 0.4) for _ in range(4))
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    for i in range(frames):
+        heading = np.pi * backwards + _STEERING * yaw[i]
+        turned = rotation(1, heading) @ rotation(0, _STEERING * (pitch[i] / 3 - 1))
+        poses[i, :3, :3] = turned @ rotation(2, _STEERING / 3 * roll[i])
+        z = way[-1, 1] - metres[i] if backwards else way[0, 1] + metres[i]
+        poses[i, :3, 3] = way[0, 0] + SWAY * x[i], -tour.camera_height, z
+    return poses
 
 
 def _way_within(tour: Tour, frames: int) -> tuple[Array, float]:

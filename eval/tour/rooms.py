@@ -91,6 +91,8 @@ def lay_out(style: TourStyle, rng: np.random.Generator) -> tuple[list[Room], lis
 
 def _room(style: TourStyle, rng: np.random.Generator) -> Room:
     size = rng.uniform(style.room_size[0], style.room_size[1], size=2)
+    if style.length is not None:
+        size[1] = size[0] * rng.uniform(*style.length)
     return Room(np.zeros(2), size, float(rng.uniform(*style.ceiling)), style)
 
 
@@ -123,8 +125,9 @@ def shell(room: Room, doors: list[Door], palette: Palette) -> Iterator[Part]:
     x, z = room.centre
     half = (room.upper - room.lower) / 2 + _OVERLAP
     yield part(QUAD, (x, 0, z), (half[0], 1, half[1]), palette.finish("floor"), label="floor")
-    over = np.diag([1.0, -1.0, -1.0])
-    yield part(QUAD, (x, -room.height, z), (half[0], 1, half[1]), palette.finish("ceiling"), over, label="ceiling")
+    over, ceiling = np.diag([1.0, -1.0, -1.0]), palette.finish("ceiling")
+    if not room.style.outdoors:
+        yield part(QUAD, (x, -room.height, z), (half[0], 1, half[1]), ceiling, over, label="ceiling")
     usual, special, board = palette.finish("wall"), palette.finish("wall"), palette.finish("paint")
     accent = int(room.lower.sum() * 1000) % 4
     for number, (axis, sign) in enumerate(((0, -1), (0, 1), (1, -1), (1, 1))):

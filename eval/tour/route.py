@@ -36,6 +36,13 @@ def ways(rooms: list[Room], doors: list[Door]) -> tuple[Array, ...]:
     return tuple(routes)
 
 
+def drive(room: Room) -> Array:
+    """[M, 2] x and z of the straight line along a long room's axis [m], ``SPACING`` apart."""
+    start = room.lower[1] + _WALL_TO_RING
+    z = np.arange(start, room.upper[1] - _WALL_TO_RING, SPACING)
+    return np.stack([np.full(len(z), room.centre[0]), z], axis=1)
+
+
 def ring_radii(room: Room) -> Array:
     """[2] half axes of the ellipse on which the camera goes around in a room [m]."""
     half = (room.upper - room.lower) / 2

@@ -3,7 +3,9 @@
 ``home`` is the distribution for training networks. ``hall`` is outside of it: larger rooms and objects, darker and
 colder light, and textures that no home has. ``mixed`` begins in a home and ends in a hall. ``blank`` is a home of plain
 surfaces, full of furniture: most walls and floors have no features. ``scales`` is a hall with furniture from a doll's
-size to the usual one.
+size to the usual one. In ``corridor`` and ``street`` the camera drives along the axis of one long room; a street is
+outdoors: facades without a ceiling, under a sky without depth. ``close`` is a small place full of things at the range
+of a depth camera or an arm, .3 to 2 m.
 """
 
 from __future__ import annotations
@@ -35,6 +37,8 @@ class TourStyle:
     brightness: Range = (0.8, 1.2)  # of the lights, 1 = a lit living room
     warmth: Range = (0.1, 0.9)  # -1 (cold, blue) to 1 (warm, yellow) of the lights
     last: TourStyle | None = None  # style of the last room; None = as the others
+    length: Range | None = None  # of one long room in multiples of its width, along which the camera drives
+    outdoors: bool = False  # no ceiling and no lamps; the sun is far above
 
 
 HOME = TourStyle()
@@ -56,7 +60,22 @@ MIXED = TourStyle(
 )
 BLANK = replace(HOME, name="blank", textures=("plain",) * 4 + ("stripes", "books", "painting", "window"), furniture=0.9)
 SCALES = replace(HALL, name="scales", scale=(0.25, 1.2), furniture=0.4)
-STYLES = {"home": HOME, "hall": HALL, "mixed": MIXED, "blank": BLANK, "scales": SCALES}
+CORRIDOR = replace(
+    HOME, name="corridor", textures=("plain",) * 2 + HOME_TEXTURES + HALL_TEXTURES, rooms=(1, 1), room_size=(2.0, 3.2),
+    length=(5.0, 8.0), camera_height=(0.4, 1.4), furniture=0.6, brightness=(0.6, 1.1),
+)  # fmt: skip
+STREET = replace(
+    HALL, name="street", textures=("plain",) * 3 + HOME_TEXTURES + HALL_TEXTURES, rooms=(1, 1), room_size=(7.0, 12.0),
+    ceiling=(4.0, 8.0), length=(5.0, 7.0), camera_height=(1.0, 1.7), furniture=0.1, brightness=(0.7, 1.2),
+    warmth=(-0.3, 0.5), outdoors=True,
+)  # fmt: skip
+CLOSE = replace(
+    HOME, name="close", rooms=(1, 2), room_size=(1.7, 2.6), camera_height=(0.3, 0.6), scale=(0.2, 0.5), furniture=4.0
+)
+STYLES = {
+    "home": HOME, "hall": HALL, "mixed": MIXED, "blank": BLANK, "scales": SCALES,
+    "corridor": CORRIDOR, "street": STREET, "close": CLOSE,
+}  # fmt: skip
 
 
 def style_of(style: str) -> TourStyle:

@@ -13,7 +13,7 @@ from torch import Tensor
 from ufmstar_torch.eval.tour.furnish import LIGHTS, furnish
 from ufmstar_torch.eval.tour.palette import Palette
 from ufmstar_torch.eval.tour.rooms import Door, Room, frame, lay_out, shell
-from ufmstar_torch.eval.tour.route import ways
+from ufmstar_torch.eval.tour.route import drive, ways
 from ufmstar_torch.eval.tour.shapes import NOBODY, QUAD, Part, Surfaces, surfaces
 from ufmstar_torch.eval.tour.style import style_of
 from ufmstar_torch.eval.tour.texture import noise_table
@@ -39,7 +39,8 @@ class Tour:
     lights: Tensor  # [R, L, 7] float32: position [m], linear RGB, reach [m]; unused ones are dark
     volumes: Tensor  # [R, L, Y, Z, X] float32 share of each light that reaches a grid of points in the room
     noise: Tensor  # of the textures, see ``texture.noise_table``
-    ways: tuple[Array, ...]  # [M, 2] float64 closed ways of x and z [m], see ``route.ways``
+    # [M, 2] float64 x and z [m]: closed ways, see ``route.ways``; in a style with a length, one line to drive along.
+    ways: tuple[Array, ...]
     camera_height: float  # above the floor [m]
 
 
@@ -53,7 +54,7 @@ def make_tour(seed: int, style: str = "home") -> Tour:
     # Each part of a tour has a separate generator, so that it can change without the others.
     plan, height, looks, things, shifts = (np.random.default_rng([seed, number]) for number in range(5))
     rooms, doors = lay_out(chosen, plan)
-    routes = ways(rooms, doors)
+    routes = ways(rooms, doors) if chosen.length is None else (drive(rooms[0]),)
     parts, lights = _fill(rooms, doors, np.concatenate(routes), looks, things)
     table = surfaces(parts, shifts)
     corners = torch.tensor(np.array([room.box for room in rooms]))

@@ -16,14 +16,16 @@ from ufmstar_torch.eval.tour.shade import shade
 from ufmstar_torch.eval.tour.tour import Tour
 from ufmstar_torch.eval.tour.visibility import Window, surface_windows
 
+_SKY = torch.tensor([[0.55], [0.7], [0.9]])  # linear RGB
+
 
 @dataclass(frozen=True, eq=False)
 class TourView:
     """A rendered image with its depth."""
 
     image: Tensor  # [H, W, 3] uint8 RGB
-    depth: Tensor  # [H, W] float64 along z [m]
-    surface: Tensor  # [H, W] int64 index of the primitive, -1 = none (which does not occur inside a room)
+    depth: Tensor  # [H, W] float64 along z [m], 0 in the sky
+    surface: Tensor  # [H, W] int64 index of the primitive, -1 = none: the sky
 
 
 def intrinsics(height: int, width: int, fov_degrees: float = 70.0) -> NDArray[np.float64]:
@@ -48,7 +50,7 @@ def render(
     flat = surface.flatten().clamp_min(0)
     near = torch.where(valid, depth, 0.0).flatten().float()
     color = shade(tour, flat, near, direction, pose[:3, 3].float(), (fx * fy) ** -0.5)
-    image = develop((color * valid.flatten()).view(3, height, width), frame_seed)
+    image = develop(torch.where(valid.flatten(), color, _SKY).view(3, height, width), frame_seed)
     return TourView(image, torch.where(valid, depth, 0.0), surface)
 
 

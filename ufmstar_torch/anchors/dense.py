@@ -324,9 +324,13 @@ class DenseEvidence(SavedState):
 
     def _coarse(self, small: NDArray[np.uint8], occupied: NDArray[np.float64], views: Views, cell: int) -> Depths:
         """Search the cells without a pixel of ``occupied`` [N, 2] with windows of twice the width, in images of half
-        the size."""
+        the size.
+
+        On a blank surface beside an edge, such a window measures the edge. The anchor is moved to the texture that was
+        matched.
+        """
         from ufmstar_torch.kernels.anchor_check_cpu import confirmed
-        from ufmstar_torch.kernels.dense_cpu import Views, measure
+        from ufmstar_torch.kernels.dense_cpu import MARGIN, Views, measure
 
         half = _halved(small)
         S = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
@@ -338,7 +342,9 @@ class DenseEvidence(SavedState):
         found = measure(half, pixel, reduced, self._search())
         variance = _COARSE_NOISE * found.variance + np.square(_SCALE * found.rho)
         fine = confirmed(pixel, found, cell // 2) & (found.rho > np.sqrt(variance))
-        return Depths(2 * pixel[fine] + 0.5, found.rho[fine], variance[fine])
+        matched = 2 * (pixel[fine] + found.centre[fine]) + 0.5
+        matched = matched.clip(MARGIN, np.array(small.shape[::-1]) - 1.0 - MARGIN)
+        return Depths(matched, found.rho[fine], variance[fine])
 
     def _apart(self, corners: Landmarks, occupied: NDArray[np.float64], width: int) -> NDArray[np.int64]:
         """Indices of the corners that become anchors: precise ones, away from the ``occupied`` positions [N, 2]."""

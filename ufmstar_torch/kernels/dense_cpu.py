@@ -25,6 +25,9 @@ COUNT = SIDE * SIDE
 WIDE = SIDE + 2
 _RIGHT = np.tile(np.arange(WIDE, dtype=np.float32) + np.float32(FIRST - 1), WIDE)
 _DOWN = np.repeat(np.arange(WIDE, dtype=np.float32) + np.float32(FIRST - 1), WIDE)
+# The same for the pixels of the window.
+_INSIDE_RIGHT = np.tile(np.arange(SIDE, dtype=np.float32) + np.float32(FIRST), SIDE)
+_INSIDE_DOWN = np.repeat(np.arange(SIDE, dtype=np.float32) + np.float32(FIRST), SIDE)
 # [gray levels] Least standard deviation of a compared window: below it there is only noise.
 LEAST_CONTRAST = 2.0
 # [px] Pixels nearer to the border are not measured.
@@ -99,6 +102,8 @@ class Measured:
         slope: [N, V] shift of the match along the line per unit of error across it.
         across: [N, V] position across the line [px], NaN where the patch does not determine it.
         across_noise: [N, V] variance of ``across`` from the match alone [px^2].
+        centre: [N, 2] (u, v) from the pixel to the mean position of the texture that determines the match: the squared
+            gradients along the line. On a blank surface beside an edge, the match measures the edge.
     """
 
     rho: NDArray[np.float64]
@@ -112,6 +117,7 @@ class Measured:
     slope: NDArray[np.float64]
     across: NDArray[np.float64]
     across_noise: NDArray[np.float64]
+    centre: NDArray[np.float64]
 
     def only(self, chosen: NDArray[np.int64]) -> Measured:
         """The pixels with the indices ``chosen``."""
@@ -130,11 +136,13 @@ def measure(image: NDArray[np.uint8], pixel: NDArray[np.float64], views: Views, 
     n, v = len(pixel), len(views.image)
     rho, variance, agreed, contradicted = np.zeros(n), np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.int64)
     each = np.full((n, v, 8), np.nan)
-    outputs = rho, variance, agreed, contradicted, each
+    centre = np.zeros((n, 2))
+    outputs = rho, variance, agreed, contradicted, each, centre
     _measure(image, pixel, eights(views.image), views.H, views.b, views.noise, search, *outputs)
     value, noise, _, _, speed, slope, across, across_noise = np.moveaxis(each, 2, 0)
     along = each[:, :, 2:4]
-    return Measured(rho, variance, agreed, contradicted, value, noise, along, speed, slope, across, across_noise)
+    columns = value, noise, along, speed, slope, across, across_noise, centre
+    return Measured(rho, variance, agreed, contradicted, *columns)
 
 
 def eights(images: NDArray[np.uint8]) -> NDArray[np.uint64]:
@@ -163,15 +171,16 @@ def best_pixels(image, cell, pixel, strength):
 
 
 @reordered
-def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, contradicted, each):
+def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, contradicted, each, centre):
     start, first_low, first_high, sigmas, least_score, least_rival, match = search
     height, width = image.shape
     flat = image.reshape(image.size)
     corner, share = np.empty(WIDE * WIDE, np.uint32), np.empty((2, WIDE * WIDE), np.float32)
     template, patch = np.empty(WIDE * WIDE, np.float32), np.empty(COUNT, np.float32)
     along_u, along_v = np.empty(COUNT, np.float32), np.empty(COUNT, np.float32)
+    warp = np.empty(4)
     rows, windows = np.empty((2, SIDE + 1), np.uint64), np.empty((LONGEST + 1, SIDE), np.uint64)
-    scores, best, out = np.empty(LONGEST + 1, np.float32), np.empty(4), np.empty(6)
+    scores, best, out = np.empty(LONGEST + 1, np.float32), np.empty(4), np.empty(8)
     for n in range(len(pixel)):
         u, v, weight = pixel[n, 0], pixel[n, 1], 0.0
         for k in range(len(keys)):
@@ -190,7 +199,7 @@ def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, con
                 half = max(sigmas * np.sqrt(variance[n] + noise[k] / speed**2), 1 / speed)
                 low, high = at - half, at + half
             if not (
-                _warped(flat, width, height, u, v, H[k], b[k], at, corner, share, template)
+                _warped(flat, width, height, u, v, H[k], b[k], at, corner, share, template, warp)
                 and normalised(template, patch, along_u, along_v)
                 and _search(patch, key, width, height, x, y, z, b[k], low, high, windows, scores, best)
             ):
@@ -218,7 +227,10 @@ def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, con
             each[n, k, 4], each[n, k, 5] = speed, slope
             if schur > 0 and pixel_noise < SHOWS * SHOWS * schur:
                 each[n, k, 6], each[n, k, 7] = -out[4] / schur, pixel_noise / schur
-            variance[n] = spread if first else min(variance[n], spread)
+            if first or spread < variance[n]:
+                variance[n] = spread
+                centre[n, 0] = warp[0] * out[6] + warp[1] * out[7]
+                centre[n, 1] = warp[2] * out[6] + warp[3] * out[7]
             rho[n] = (rho[n] * weight + value / spread) / (weight + 1 / spread)
             weight += 1 / spread
 
@@ -251,9 +263,9 @@ def _inverse_depth(x, y, z, b, u, v):
 
 
 @reordered_leaf
-def _warped(flat, width, height, u, v, H, b, rho, corner, share, template):
-    """The template around (u, v) as a view sees it at inverse depth rho; see :func:`sampled`. False where it leaves the
-    image or changes its scale too much."""
+def _warped(flat, width, height, u, v, H, b, rho, corner, share, template, warp):
+    """The template around (u, v) as a view sees it at inverse depth rho; see :func:`sampled`, which has the meaning of
+    the four numbers ``warp``. False where it leaves the image or changes its scale too much."""
     z = H[2, 0] * u + H[2, 1] * v + H[2, 2] + rho * b[2]
     if z <= 1e-6:
         return False
@@ -264,7 +276,8 @@ def _warped(flat, width, height, u, v, H, b, rho, corner, share, template):
     if not z * z / LARGEST_SCALE**2 < determinant < z * z * LARGEST_SCALE**2:
         return False
     over = z / determinant
-    return sampled(flat, width, height, u, v, d * over, -b_ * over, -c * over, a * over, corner, share, template)
+    warp[0], warp[1], warp[2], warp[3] = d * over, -b_ * over, -c * over, a * over
+    return sampled(flat, width, height, u, v, warp[0], warp[1], warp[2], warp[3], corner, share, template)
 
 
 @reordered_leaf
@@ -386,13 +399,16 @@ def zncc(patch, window):
 @reordered_leaf
 def _refined(patch, along_u, along_v, key, width, height, u, v, eu, ev, rows, out):
     """Gauss-Newton steps along (eu, ev) from the centre (u, v). ``out``: the displacement [px]; G along, between and
-    across the line [1/px^2]; gradient across times residual [1/px]; ZNCC. False where the window leaves the image or
+    across the line [1/px^2]; gradient across times residual [1/px]; ZNCC; mean position (u, v) of the squared gradient
+    along the line, from the centre [px]. False where the window leaves the image or
     the match."""
     cu, cv = np.float32(eu), np.float32(ev)
-    g_ee = g_ep = g_pp = patch_e = patch_p = np.float32(0)
+    g_ee = g_ep = g_pp = patch_e = patch_p = mean_u = mean_v = np.float32(0)
     for k in range(COUNT):
         e, p = cu * along_u[k] + cv * along_v[k], cu * along_v[k] - cv * along_u[k]
         g_ee += e * e
+        mean_u += e * e * _INSIDE_RIGHT[k]
+        mean_v += e * e * _INSIDE_DOWN[k]
         g_ep += e * p
         g_pp += p * p
         patch_e += e * patch[k]
@@ -436,4 +452,5 @@ def _refined(patch, along_u, along_v, key, width, height, u, v, eu, ev, rows, ou
             return False
     right_p = (cu * down_v - cv * down_u) * over - score * patch_p
     out[0], out[1], out[2], out[3], out[4], out[5] = displacement, g_ee, g_ep, g_pp, right_p, score
+    out[6], out[7] = mean_u / g_ee, mean_v / g_ee
     return True

@@ -16,11 +16,14 @@ class PosteriorConfig(Checked):
 
     Attributes:
         link_variance: variance of f's difference between neighbouring nodes of equal predicted depth
-        edge_variance: additional variance per squared difference of log d between the two nodes
+        edge_variance: additional variance per squared difference of log d between the two nodes, times ``jump``
+        jump: factor on that difference: networks smooth depth edges
         precision: precision of f at a node
-        prior_sigma: standard deviation of b's constant and of its slope in log d before the first anchor
-        tilt_sigma: standard deviation of b's slopes in u and v before the first anchor
-        drift: standard deviation of b's change from frame to frame
+        prior_sigma: standard deviation of b's constant before the first anchor
+        tilt_sigma: standard deviation of b's slopes in log d, u and v without anchors
+        drift: standard deviation of the change of b's constant from frame to frame
+        reversion: share of b's slopes that a frame forgets
+        misscaled: probability that b's constant lies beyond its prior before the first anchor
         degrees_of_freedom: of the Student-t distributions of an anchor's residual and of f's difference across a link
         alone: each of a frame's N anchors has the additional variance alone/N of y
         roughness: initial value of the standard deviation of y between neighbouring pixels
@@ -43,10 +46,13 @@ class PosteriorConfig(Checked):
 
     link_variance: float = number(0.0015, "v_0", "1", 0.0, open_low=True)
     edge_variance: float = number(6.0, "v_1", "1", 0.0, open_low=True)
+    jump: float = number(1.67, "c_j", "1", 0.0, open_low=True)
     precision: float = number(0.5, "kappa", "1", 0.0, open_low=True)
     prior_sigma: float = number(0.5, "sigma_b", "1", 0.0, open_low=True)
     tilt_sigma: float = number(0.2, "sigma_t", "1", 0.0, open_low=True)
     drift: float = number(0.05, "tau", "1/frame^.5", 0.0)
+    reversion: float = number(0.2, "rho", "1/frame", 0.0, 1.0)
+    misscaled: float = number(0.1, "p_1", "1", 0.0, 0.5)
     degrees_of_freedom: float = number(2.0, "nu", "1", 0.0, open_low=True)
     alone: float = number(1.0, "sigma_1^2", "1", 0.0)
     roughness: float = number(0.05, "sigma_0", "1", 0.0, open_low=True)
@@ -68,4 +74,4 @@ class PosteriorConfig(Checked):
     @property
     def prior_variance(self) -> tuple[float, float, float, float]:
         """The variances of the coefficients b before the first anchor."""
-        return (self.prior_sigma**2, self.prior_sigma**2, self.tilt_sigma**2, self.tilt_sigma**2)
+        return (self.prior_sigma**2, *(self.tilt_sigma**2,) * 3)

@@ -134,15 +134,21 @@ class Running(NamedTuple):
         return np.concatenate([[self.frames, mean], self.above, self.below, b, covariance.ravel()])
 
     def expected(self, mean: float) -> tuple[Floats, Floats]:
-        """Predict coefficients [4] and covariance [4, 4] for a frame whose m_0 is ``mean``: a random walk from the last
-        frame. The walk stops adding variance at the prior's."""
-        T = np.eye(FEATURES)
-        T[0, 1] = mean - self.mean if self.frames else 0.0
+        """Predict coefficients [4] and covariance [4, 4] for a frame whose m_0 is ``mean``.
+
+        The constant follows a random walk from the last frame, which stops adding variance at the prior's. The slopes
+        revert to 0 and the variance before the first anchor: what anchors showed of one surface is no evidence of the
+        network's shape on another.
+        """
+        if not self.frames:
+            return self.coefficients, self.covariance
+        T, (constant, *slopes) = np.eye(FEATURES), self.config.prior_variance
+        T[0, 1] = mean - self.mean
+        T[1:] *= 1 - self.config.reversion
         transformed = T @ self.covariance @ T.T
-        if self.frames:
-            remaining = (1 - transformed.diagonal() / self.config.prior_variance).clip(0, 1)
-            transformed = transformed + np.diag(self.config.drift**2 * remaining)
-        return T @ self.coefficients, transformed
+        grown = self.config.drift**2 * min(max(1 - transformed[0, 0] / constant, 0), 1)
+        added = (1 - (1 - self.config.reversion) ** 2) * np.array(slopes)
+        return T @ self.coefficients, transformed + np.diag([grown, *added])
 
 
 @functools.lru_cache(maxsize=4)  # a posterior has the same config in every frame

@@ -55,7 +55,7 @@ class Grid(NamedTuple):
         mean: m_0, mean of ``log_depth``.
         right, down: [R C] variance of the difference of y to the next node in the row, in the column; infinite at the
             border.
-        far_right, far_down: [R C] lengths of the same links: size of a cell plus difference of log d.
+        far_right, far_down: [R C] lengths of the same links: size of a cell plus difference of log d times ``jump``.
     """
 
     rows: int
@@ -71,8 +71,8 @@ class Grid(NamedTuple):
     def of(cls, log_depth: Floats, rows: int, cols: int, config: PosteriorConfig) -> Grid:
         """The links between cells of mean ``log_depth`` [R C]."""
         across, along = np.full((2, rows, cols), np.inf)
-        across[:, :-1] = np.abs(np.diff(log_depth.reshape(rows, cols), axis=1))
-        along[:-1] = np.abs(np.diff(log_depth.reshape(rows, cols), axis=0))
+        across[:, :-1] = config.jump * np.abs(np.diff(log_depth.reshape(rows, cols), axis=1))
+        along[:-1] = config.jump * np.abs(np.diff(log_depth.reshape(rows, cols), axis=0))
         edges = across.ravel(), along.ravel()
         right, down = (config.link_variance + config.edge_variance * x**2 for x in edges)
         far = (1 / n + edge for n, edge in zip((cols, rows), edges, strict=True))
@@ -221,6 +221,13 @@ def wrong_factor(config: PosteriorConfig, away: Floats, scale: Floats) -> Floats
     ``away`` [n] is the distance."""
     factor: Floats = scale ** np.maximum(1 - away / config.radius, 0)
     return factor
+
+
+def misscaled(config: PosteriorConfig, variance: float, p: Floats, wide: Floats) -> tuple[Floats, Floats]:
+    """The probabilities [n] of another surface and the variances [n] of y there, raised towards ``misscaled`` and
+    ``widest`` by the squared share of the ``variance`` of b's constant in that before the first anchor."""
+    unmeasured = min(variance / config.prior_sigma**2, 1.0) ** 2
+    return p + unmeasured * np.maximum(config.misscaled - p, 0), wide + unmeasured * (config.widest - wide)
 
 
 def inlier_factor(running: Running, away: Floats) -> Floats:

@@ -4,7 +4,8 @@ At an anchor of depth g the network's error is y = log(g/d). Its model over the 
 
     y = b . (1, log d - m_0, u, v) + f.
 
-b follows a random walk from frame to frame. f is a Gaussian field on a grid whose links are weaker across edges of the
+b's constant follows a random walk from frame to frame; its slopes revert to 0, so that without evidence the depth fades
+to the network's shape at the stream's scale. f is a Gaussian field on a grid whose links are weaker across edges of the
 predicted depth (``grid``, ``field``). An anchor of standard deviation s observes y with the variance
 
     n = roughness + blur^2 + noise s^2/g^2 + alone/N.
@@ -28,6 +29,9 @@ steepness), and share = min(1, distance/reach):
 - m exceeds v where v is large, because the error of the depth is log-normal. The output ``inlier`` is m(v).
 - p is the probability that the depth is of another surface than its evidence: the output ``outlier``.
 - The ratios include the held-out anchors of this frame.
+
+Before the first anchor the network may be off by any factor: p is raised towards ``misscaled``, and w towards
+``widest``, by the squared share of the variance of b's constant in that before the first anchor.
 
 The distance from evidence is geodesic, in image widths, and differences of log d lengthen it: on tours the variance of
 the error is proportional to it. ``learn`` estimates ``unseen``, ``wrong`` and the other ratios (``running``).
@@ -79,6 +83,7 @@ from ufmstar_torch.posterior.scene import (
     fitted,
     inlier_factor,
     local_scale,
+    misscaled,
     scene_of,
     second_moments,
     spread_around,
@@ -188,6 +193,7 @@ def _of_stream(
     wide = elsewhere_variance(config, spread_around(scene, all_anchors, b[0]), unseen)
     scale = local_scale(scene, left_out, all_anchors)
     p = np.minimum(updated.ratios["wrong"] * wrong_factor(config, away, scale), MOST_WRONG)
+    p, wide = misscaled(config, field.covariance[0, 0], p, wide)
     if anchors.motion is not None:
         tests, share = tests_at(anchors.motion, depth.shape[0], depth.shape[1], rows, cols), away / config.reach
         P = probability(offset, grid.log_depth, share, tests, updated.ratios["between"], (rows, cols))
