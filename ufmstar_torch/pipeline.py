@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self, cast
 
 import numpy as np
 import torch
@@ -233,7 +233,7 @@ class UncertainDepth(NetworksInTurn):
         """
         members = modules_of(networks)
         shared = isinstance(preprocess, str) and preprocess == "own"
-        return members, shared_preprocess(members) if shared else preprocess
+        return members, shared_preprocess(members) if shared else cast("Preprocess | None", preprocess)
 
     def forward(
         self,

@@ -77,7 +77,7 @@ class NetworkChoice:
         specs = [file for file in listed if file.endswith(".json")]
         if len(specs) > 1:
             raise ValueError(f"{base}={model} takes one spec, got {specs}")
-        return cls(base, model, tuple(file for file in listed if file not in specs), *specs)
+        return cls(base, model, tuple(file for file in listed if file not in specs), next(iter(specs), None))
 
     def with_spec(self, spec: str | None) -> NetworkChoice:
         """The choice with that spec, unless it has one or is the sequence's depth."""
