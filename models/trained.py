@@ -128,8 +128,8 @@ def load_trained(
         FileNotFoundError, CheckpointError, ModuleNotFoundError: as :func:`read_info`; and if weights are missing,
             unexpected, of another shape or not finite, with ``lazy`` at the first call.
     """
-    several = list(path) if isinstance(path, Iterable) and not isinstance(path, str) else [path]
-    paths = [as_path("path", one) for one in several]
+    files = list(path) if isinstance(path, Iterable) and not isinstance(path, str | bytes) else [path]
+    paths = [as_path("path", file) for file in files]
     members: list[DepthNetwork] = []
     for file in [_TrainedFile(Path(p), backbone) for p in paths]:
         if not lazy and not offload:

@@ -105,9 +105,8 @@ class UfMStar(StatefulModule):
                 (``statistics.beyond``) or otherwise outside (``out_of_range``), NaN, infinity and masked are not valid.
             pose: [B, 4, 4] or [4, 4] camera-to-world (T_world_cam) [m], or without its last row; coordinates up to
                 1e9 m. Rotations within ``config.rotation_tolerance`` are projected onto SO(3).
-            intrinsics: [B, 3, 3] or [3, 3], or fx, fy, cx, cy, in pixels of this depth map (not of the image:
-                ``resize_intrinsics``), first pixel's centre at (0, 0); a focal length of 0.01 to 1e7 px, and the
-                principal point on the map.
+            intrinsics: [B, 3, 3] or [3, 3], or fx, fy, cx, cy, of this depth map [px] (``resize_intrinsics``), first
+                pixel's centre at (0, 0); a focal length of 0.01 to 1e7 px, and the principal point on the map.
             aleatoric: like ``depth``, the network's variance A [m^2]; pixels outside [0, 1e12] are not valid.
             epistemic: likewise E [m^2].
             valid: like ``depth``, bool, True = use.
@@ -243,8 +242,7 @@ class UfMStar(StatefulModule):
 
         Args:
             streams: indices, or a bool mask [B]; None = all, after which the batch size may change.
-            keep_evidence: keep the extensions' statistics per stream, for a robot that starts again in the same place.
-                Statistics per component are dropped with the components. The batch size stays.
+            keep_evidence: keep the extensions' statistics per stream, to start again in the same place with B streams.
 
         Raises:
             IndexError: an index is out of range.
