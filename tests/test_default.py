@@ -61,7 +61,7 @@ def test_depth_and_std_are_the_posteriors_and_the_networks_stay_where_they_were(
         torch.testing.assert_close(out.depth, same.depth, rtol=0, atol=0, equal_nan=True)
         assert torch.equal(out.prediction.depth, out.ufm.depth)
     assert error(outs[-1].prediction.depth, walk()[-1]) == pytest.approx(BIAS - 1, abs=1e-3)
-    assert error(outs[-1].depth, walk()[-1]) < 0.05
+    assert error(outs[-1].depth, walk()[-1]) < 0.06
     assert not alone(caplog)
 
 

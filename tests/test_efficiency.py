@@ -157,7 +157,7 @@ def test_a_row_states_its_latency_and_memory(unpowered):
     assert ensemble["ratios_to_depth"]["network_uncertainty"]["count"] == QUICK.frames
     memory, state = star["memory"], star["memory"]["multiview"]
     assert state["smoothing_bytes"] == 4 * SIZE[0] * SIZE[1]
-    assert state["bytes_end"] == 64 * state["count_end"] > 0
+    assert state["bytes_end"] == 84 * state["count_end"] > 0
     uncertainty = memory["network_uncertainty_bytes"] + state["bytes_end"]
     assert memory["overhead_percent"] == pytest.approx(100 * uncertainty / (memory["depth_bytes"] + uncertainty))
 

@@ -73,7 +73,8 @@ def through(estimator, members, sequence, *, aleatoric=True, poses=None, indices
             p = members[i % len(members)](x)
         pose = pose if poses is None else torch.from_numpy(poses(frame))[None]
         a, e = (p.aleatoric_variance, p.epistemic_variance) if aleatoric else (None, None)
-        out = estimator(p.depth, pose, K, a, e)
+        view = {"member": i % len(members)} if isinstance(estimator, UfMStar) else {}
+        out = estimator(p.depth, pose, K, a, e, **view)
         yield p.depth, out.variance, out.valid, K
 
 
@@ -91,7 +92,7 @@ def test_a_row_equals_a_loop_by_hand(base, network_files, networks, sequence):
     ufm, components = hands[2], int(hands[0].mixture.components)
     assert result[rows[2].slug].state["bytes_end"] == 40 * len(ufm.cloud.count) == 40_000
     assert result[rows[0].slug].state["count_end"] == components
-    assert result[rows[0].slug].state["bytes_end"] == 64 * components
+    assert result[rows[0].slug].state["bytes_end"] == 84 * components
     assert result[rows[0].slug].state["smoothing_bytes"] == 4 * 32 * 64
 
 
@@ -177,7 +178,8 @@ def test_mc_dropout_equals_seeded_passes_by_hand(network_files, networks, sequen
             if ufm is None:
                 yield p.depth, p.variance, torch.ones_like(p.depth, dtype=torch.bool), K
             else:
-                out = ufm(p.depth, pose, K, p.aleatoric_variance, p.epistemic_variance)
+                view = {"member": frame.index if samples == 1 else 0}  # each image has its own sample
+                out = ufm(p.depth, pose, K, p.aleatoric_variance, p.epistemic_variance, **view)
                 yield p.depth, out.variance, out.valid, K
 
     assert agrees(result["UfMstar-MCD"].figures, judged(sequence, by_hand(1, UfMStar(SKIP))))

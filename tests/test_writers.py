@@ -24,7 +24,9 @@ from ufmstar_torch.eval.sequences.images import read_depth
 def frame(seed=0, far=8.0):
     rng = np.random.default_rng(seed)
     depth, variance = (rng.uniform(low, high, (12, 17)).astype(np.float32) for low, high in ((0.2, far), (0, 0.5)))
-    return {"depth": depth, "variance": variance, "valid": rng.random((12, 17)) > 0.2}
+    pose = {"T_world_cam": np.eye(4), "intrinsics": np.eye(3)}
+    valid = rng.random((12, 17)) > 0.2
+    return {"depth": depth, "variance": variance, "disagreement": variance / 2, "valid": valid, **pose}
 
 
 def tree(folder):

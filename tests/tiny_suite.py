@@ -129,7 +129,7 @@ class Biased:
     """A minimal ``DepthSource``: the true depth, but 40 % too far beyond 2 m."""
 
     digest, passes, needs_image, cacheable, networks, runtime = "biased", 1, False, False, (), None
-    max_depth, states_confidence = None, False
+    max_depth, states_confidence, stochastic = None, False, False
 
     def prepared(self, how):
         return self

@@ -61,7 +61,7 @@ class Checked:
                 _check_number(f"{owner}.{f.name}", value, f.metadata)
                 if isinstance(f.default, int) and not isinstance(value, int):
                     raise ValueError(f"{owner}.{f.name} must be a whole number, got {value!r}")
-            if "choices" in f.metadata and not (isinstance(value, str | int) and value in f.metadata["choices"]):
+            if "choices" in f.metadata and not (isinstance(value, str | int | None) and value in f.metadata["choices"]):
                 raise ValueError(f"{owner}.{f.name} must be one of {f.metadata['choices']}, got {value!r}")
             kind = f.metadata.get("section")
             if kind is not None and not isinstance(value, kind) and not (value is None and f.metadata["optional"]):

@@ -8,6 +8,7 @@ the same as the last one although the camera moved. The depth of such an image i
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -45,6 +46,38 @@ def shows_something(grey: Tensor) -> Tensor:
     return (detail >= _DETAIL) & (exposed >= _SHARE)
 
 
+class _Seen(NamedTuple):
+    """The last image of B streams, and what they have shown.
+
+    Attributes:
+        grey: [B, 1, h, w] of the last image (``reduced``); NaN before it.
+        pose: [B, 4, 4] of the last image.
+        first: [B, 1, h, w] of the first image of the present pose.
+        still: [B] number of images since then.
+        empty: [B] number of images in a row that show nothing.
+        frozen: [B] number of images in a row that are the same as the one before under another pose.
+    """
+
+    grey: Tensor
+    pose: Tensor
+    first: Tensor
+    still: Tensor
+    empty: Tensor
+    frozen: Tensor
+
+    @classmethod
+    def before(cls, grey: Tensor, pose: Tensor) -> _Seen:
+        """The streams before their first image."""
+        zero = torch.zeros(len(grey), dtype=torch.int64, device=grey.device)
+        nothing = torch.full_like(grey, torch.nan)
+        return cls(nothing, torch.full_like(pose, torch.nan), nothing, zero, zero, zero)
+
+    def where(self, mask: Tensor, other: _Seen) -> _Seen:
+        """This for the streams of ``mask`` [B], ``other`` for the rest."""
+        pairs = zip(self, other, strict=True)
+        return _Seen(*(torch.where(mask.view(-1, *[1] * (a.dim() - 1)), a, b) for a, b in pairs))
+
+
 class ImageCheck:
     """Compares every image with the one before, and logs each finding once per stream."""
 
@@ -52,14 +85,23 @@ class ImageCheck:
         self.reset()
 
     def reset(self, streams: Sequence[int] | None = None) -> None:
-        """Forget the last images of all streams, because other videos begin, or of some."""
+        """Forget the images of all streams, because other videos begin, or of some."""
         if streams is None:
-            self._last: tuple[Tensor, Tensor] | None = None
-            self._empty: Tensor | None = None
+            self._seen: _Seen | None = None
+            self._undone: _Seen | None = None
             self._logged = set[tuple[int, str]]()
-        elif self._last is not None:
-            self._last[0][list(streams)] = torch.nan  # equal to no image
-            self._still[list(streams)] = 0
+        elif self._seen is not None:
+            self._undone = _Seen.before(self._seen.grey, self._seen.pose)
+            self.undo(streams)
+
+    def undo(self, streams: Sequence[int] | None = None) -> None:
+        """Forget the last image of all streams, or of some, because UfM* refused or skipped it; once an image."""
+        if self._seen is not None and self._undone is not None:
+            mask = torch.full((len(self._seen.still),), streams is None)
+            mask[list(streams or ())] = True
+            if self._undone.grey.shape == self._seen.grey.shape:
+                self._seen = self._undone.where(mask.to(self._seen.still.device), self._seen)
+        self._undone = None
 
     def informative(self, image: Tensor, pose: Tensor) -> Tensor | None:
         """[B] False where the image shows nothing; None for an image of normalised floats, or on a device without
@@ -69,54 +111,49 @@ class ImageCheck:
             image: [B, 3, H, W].
             pose: [B, 4, 4] or [4, 4] camera-to-world [m].
         """
-        if image.is_meta or not (image.dtype == torch.uint8 or _in_unit_range(image)):
+        fits = pose.dim() == 2 or len(pose) in (1, len(image))  # if not, UfM* names it
+        if image.is_meta or not fits or not (image.dtype == torch.uint8 or _in_unit_range(image)):
             return None
         grey = reduced(image.detach())
-        T = pose.detach().to(grey.device).double().expand(len(grey), *pose.shape[-2:])
-        if self._last is None or self._last[0].shape != grey.shape or self._empty is None:
-            self._first, self._still = grey.clone(), torch.zeros(len(grey), dtype=torch.int64, device=grey.device)
-            self._empty, self._frozen = self._still.clone(), self._still.clone()
-            moved = same = torch.zeros_like(self._still, dtype=torch.bool)
-        else:
-            moved = (self._last[1] != T).flatten(1).any(1)
-            same = (grey == self._last[0]).flatten(1).all(1)
-        shows = shows_something(grey)
-        frozen = same & moved
-        self._still = torch.where(moved, 0, self._still + 1)
-        self._first = torch.where((self._still <= 1)[:, None, None, None], grey, self._first)
-        self._empty = torch.where(shows, 0, self._empty + 1)
-        self._frozen = torch.where(moved, torch.where(same, self._frozen + 1, 0), self._frozen)
-        self._last = grey, T.clone()
+        T = pose.detach().to(grey.device).double().expand(len(grey), *pose.shape[-2:]).clone()
+        last = self._seen
+        if last is None or last.grey.shape != grey.shape or last.pose.shape != T.shape:
+            last = _Seen.before(grey, T)
+        changed = (last.pose != T).flatten(1).any(1)
+        same = (grey == last.grey).flatten(1).all(1)
+        shows, frozen = shows_something(grey), same & changed
+        still = torch.where(changed, 0, last.still + 1)
+        first = torch.where(changed[:, None, None, None], grey, last.first)
+        empty = torch.where(shows, 0, last.empty + 1)
+        repeated = torch.where(changed, torch.where(same, last.frozen + 1, 0), last.frozen)
+        self._undone, self._seen = last, _Seen(grey, T, first, still, empty, repeated)
         if image.is_cpu:  # on an accelerator, reading the counts would synchronise
-            self._warn(grey)
+            self._warn(self._seen)
         return shows & ~frozen
 
-    def _warn(self, grey: Tensor) -> None:
-        for b, kind, text in (*self._findings(), *self._moving(grey)):
+    def _warn(self, seen: _Seen) -> None:
+        for b, kind, text in (*_findings(seen), *_moving(seen)):
             if (b, kind) not in self._logged:
                 self._logged.add((b, kind))
                 LOGGER.warning("stream %d: %s (logged once)", b, text)
 
-    def _findings(self) -> Iterator[tuple[int, str, str]]:
-        assert self._empty is not None
-        for b in (self._empty == _IMAGES).nonzero().flatten().tolist():
-            text = f"{_IMAGES} images in a row show nothing (black, saturated, blurred, or a covered lens): their "
-            yield b, "empty", text + "depth is a guess, so it counts as unmeasured"
-        for b in (self._frozen == _IMAGES).nonzero().flatten().tolist():
-            text = (
-                f"the image was the same in {_IMAGES + 1} frames of a moving camera: is it updated? Its depth counts "
-            )
-            yield b, "frozen", text + "as unmeasured"
 
-    def _moving(self, grey: Tensor) -> Iterator[tuple[int, str, str]]:
-        due = (self._still > 0) & (self._still % _IMAGES == 0)
-        for b in due.nonzero().flatten().tolist():
-            both = torch.stack([grey[b].flatten(), self._first[b].flatten()])
-            if float(torch.corrcoef(both)[0, 1]) < _SAME_SCENE:
-                text = (
-                    f"the pose was the same in {int(self._still[b]) + 1} images, which show different scenes: is the "
-                )
-                yield b, "pose", text + "pose updated, and has SLAM started?"
+def _findings(seen: _Seen) -> Iterator[tuple[int, str, str]]:
+    for b in (seen.empty == _IMAGES).nonzero().flatten().tolist():
+        text = f"{_IMAGES} images in a row show nothing (black, saturated, blurred, or a covered lens): their "
+        yield b, "empty", text + "depth is a guess, so it counts as unmeasured"
+    for b in (seen.frozen == _IMAGES).nonzero().flatten().tolist():
+        text = f"the image was the same in {_IMAGES + 1} frames of a moving camera: is it updated? Its depth counts "
+        yield b, "frozen", text + "as unmeasured"
+
+
+def _moving(seen: _Seen) -> Iterator[tuple[int, str, str]]:
+    due = (seen.still > 0) & (seen.still % _IMAGES == 0)
+    for b in due.nonzero().flatten().tolist():
+        both = torch.stack([seen.grey[b].flatten(), seen.first[b].flatten()])
+        if float(torch.corrcoef(both)[0, 1]) < _SAME_SCENE:
+            text = f"the pose was the same in {int(seen.still[b]) + 1} images, which show different scenes: is the "
+            yield b, "pose", text + "pose updated, and has SLAM started?"
 
 
 def _in_unit_range(image: Tensor) -> bool:

@@ -379,10 +379,10 @@ class UncertainDepth(NetworksInTurn):
         """
         predicted = self._predicted(image, pose, intrinsics, features)
         sample: dict[str, Any] = {"pixels": pixels, "fraction": fraction, "seed": seed, "average": average}
-        with self._anchored(predicted, anchors, search=not self._by_default) as found:
+        with self._anchored(predicted, anchors, search=not self._by_default) as (found, p):
             mean = self.ufm.mean_uncertainty(
-                pose=predicted.pose, intrinsics=predicted.prediction.K, valid=valid, features=predicted.features,
-                anchors=found, **maps_of(predicted.prediction, self.ufm), **sample,
+                pose=predicted.pose, intrinsics=p.K, valid=valid, features=predicted.features, anchors=found,
+                **maps_of(p, self.ufm), **sample,
             )  # fmt: skip
         self._undo(mean.statistics)
         self._count(self._next + 1)
@@ -430,8 +430,7 @@ class UncertainDepth(NetworksInTurn):
     def _fused(
         self, predicted: _Predicted, valid: Array | None = None, anchors: Anchors | None = None
     ) -> UncertainPrediction:
-        p = predicted.prediction
-        with self._anchored(predicted, anchors) as found:
+        with self._anchored(predicted, anchors) as (found, p):
             out = self.update(p, predicted.pose, p.K, valid, features=predicted.features, anchors=found)
         self._undo(out.ufm.statistics)
         return replace(out, member=predicted.member)
@@ -439,9 +438,10 @@ class UncertainDepth(NetworksInTurn):
     @contextmanager
     def _anchored(
         self, predicted: _Predicted, anchors: Anchors | None, *, search: bool = True
-    ) -> Iterator[Anchors | None]:
-        """The image's anchors, from the caller or the source, at pixels of the depth map. Waits for the prediction's
-        copies. An error in the context undoes the source's update.
+    ) -> Iterator[tuple[Anchors | None, DepthPrediction]]:
+        """The image's anchors, from the caller or the source, at pixels of the depth map, and the prediction with
+        whether the image shows something. Waits for the prediction's copies. An error in the context undoes the updates
+        by the image.
 
         Raises:
             ValueError: anchors from both the caller and a source, or as :meth:`StreamLandmarks.update`.
@@ -460,8 +460,11 @@ class UncertainDepth(NetworksInTurn):
             anchors = anchors.to(predicted.prediction.depth.device)  # UfM*'s may be another than the image's
         try:
             moved = anchors is not None and self.preprocess not in (None, in_unit_range)
-            yield require_anchors(anchors).moved(K, predicted.prediction.K) if moved else anchors
+            found = require_anchors(anchors).moved(K, predicted.prediction.K) if moved else anchors
+            informative = self._image_check.informative(predicted.image, predicted.pose)
+            yield found, replace(predicted.prediction, informative=informative)
         except BaseException:
+            self._image_check.undo()
             if self.landmarks is not None and self._searched:
                 self.landmarks.undo()
             raise
@@ -480,9 +483,11 @@ class UncertainDepth(NetworksInTurn):
         return True
 
     def _undo(self, statistics: FrameStatistics) -> None:
-        """Undo the landmark update of streams that skipped the image."""
+        """Undo the updates by the image for streams that skipped it."""
+        skipped = statistics.fault.nonzero().flatten().tolist()
+        self._image_check.undo(skipped)
         if self.landmarks is not None and self._searched:
-            self.landmarks.undo(statistics.fault.nonzero().flatten().tolist())
+            self.landmarks.undo(skipped)
 
     def _predicted(
         self,
@@ -510,7 +515,7 @@ class UncertainDepth(NetworksInTurn):
             x, K = self.prepare(picture, K_image.expand(len(picture), 3, 3))
             prediction = self.every(x, K) if member is None else self.member(x, K, member)
         index = (self._next + ahead) % SAMPLES if self.stochastic else member or 0
-        prediction = replace(prediction, member=index, informative=self._image_check.informative(picture, T))
+        prediction = replace(prediction, member=index)
         tensors = {name: value for name, value in vars(prediction).items() if isinstance(value, Tensor)}
         if features is not None:
             tensors["features"] = as_tensor("features", features)

@@ -73,10 +73,8 @@ def read_frame(path: str | Path) -> dict[str, NDArray[Any]]:
     """The arrays of a frame's file. Errors as ``read_npz_whole``; also ValueError: an array is missing, or has another
     form; the message names file and array."""
     arrays = read_npz_whole(path)
-    posterior = (
-        ("posterior_depth", "posterior_variance") if any(name.startswith("posterior_") for name in arrays) else ()
-    )
-    if missing := [name for name in (*_NEEDED, *posterior) if name not in arrays]:
+    corrected = any(name.startswith("posterior_") for name in arrays)
+    if missing := [name for name in (*_NEEDED, *(_BEFORE[1] if corrected else ())) if name not in arrays]:
         raise ValueError(f"{path} is no frame of `ufmstar run`: it has no array {missing[0]}")
     size = arrays["depth"].shape
     for name, values in arrays.items():

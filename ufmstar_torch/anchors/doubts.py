@@ -7,6 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator
 
+import numpy as np
 import torch
 
 from ufmstar_torch.anchors.anchors import FARTHEST_OFF, AnchorInput, Anchors, inside
@@ -97,7 +98,7 @@ class AnchorDoubts:
         if len(anchors) < _RANKED or float(anchors.std()) < _SPREAD:
             return ""
         ranks = torch.stack([anchors.argsort().argsort(), predicted.argsort().argsort()]).double()
-        order = float(torch.corrcoef(ranks)[0, 1])
+        order = float(np.corrcoef(ranks.cpu().numpy())[0, 1])
         self._inverse[b] = self._inverse[b] + 1 if order < _INVERSE else 0
         if self._inverse[b] != _SUCCESSIVE:
             return ""

@@ -39,7 +39,7 @@ def landmark_source(value: str | Path | LandmarkSource) -> LandmarkSource:
         ValueError: ``value`` is neither of the two names nor a file of landmarks.
     """
     if not isinstance(value, str | Path):
-        if not callable(getattr(value, "update", None)):
+        if not all(callable(getattr(value, name, None)) for name in ("update", "state")):
             raise TypeError(f"anchors must be 'corners', 'dense', a file's name or a LandmarkSource, got {value!r}")
         return value
     if value == CORNERS:
