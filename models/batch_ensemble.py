@@ -191,4 +191,4 @@ def _require_plain(name: str, module: nn.Module) -> None:
 def _draw(factor: nn.Parameter, std: float) -> None:
     """Fill a parameter with random values, drawn on the CPU in float32, so that they depend only on the seed."""
     with torch.no_grad():
-        factor.copy_(1 + std * torch.randn(factor.shape))
+        factor.copy_(1 + std * torch.randn(factor.shape, device="cpu"))

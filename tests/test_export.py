@@ -188,7 +188,7 @@ def test_a_damaged_record_is_named_by_line_and_field(finished, tmp_path, damage,
 
 ARRAYS = {
     "none": ({"variance": None}, "it has no array variance"),
-    "half a posterior": ({"posterior_depth": np.ones((48, 64), np.float32)}, "it has no array posterior_variance"),
+    "half a posterior": ({"network_depth": None}, "it has no array network_depth"),
     "another size": ({"variance": np.ones((3, 3), np.float32)}, r"array variance is float32 [3, 3]"),
     "a pose": ({"T_world_cam": np.eye(3)}, "array T_world_cam is float64 [3, 3]"),
     "NaN": ({"T_world_cam": np.full((4, 4), np.nan)}, "its pose or intrinsics are not finite"),
@@ -266,13 +266,14 @@ def far(tmp_path_factory):
     out = tmp_path_factory.mktemp("run") / "out"
     words = ["run", str(path), "--depth", "self", "--no-video", "--no-sheet", "--out", str(out)]
     assert cli.main(words) == 0
-    return out, poses, truth
+    return out, poses, truth, path
 
 
 def test_exports_far_from_the_origin_keep_millimetres(far, stand_in):
-    out, poses, truth = far
+    out, poses, truth, recording = far
     for kind in ("tum", "cloud", "transforms", "mcap", "rrd"):
-        assert cli.main(["export", str(out), "--to", kind, "--voxel", "0.001"]) == 0
+        images = ["--sequence", str(recording)] if kind in ("transforms", "mcap") else []
+        assert cli.main(["export", str(out), "--to", kind, "--voxel", "0.001", *images]) == 0
     trajectory = read_trajectory(out / "export" / "trajectory.txt")
     np.testing.assert_allclose(trajectory.T_world_cam, poses, rtol=0, atol=3e-9)
     for folder in ("transforms", "bag"):

@@ -114,9 +114,9 @@ def test_a_sequence_twice_is_refused_and_wrong_poses_are_named(ufmstar, tmp_path
     assert ufmstar("rank", path, *words, "--overwrite", "--poses", "opengl")[0] == 0
     assert any(text.startswith(f"{path}: poses disagree with the images") for text in caplog.messages)
     caplog.clear()
-    assert ufmstar("rank", path, *words, "--overwrite", "--pose-scale", "0.1")[0] == 0
+    assert ufmstar("rank", path, *words, "--overwrite", "--pose-scale", "10")[0] == 0
     assert any(
-        re.search(r"walk: depth is (9\.\d|10\.0|10) times that of tracked cor", text) for text in caplog.messages
+        re.search(r"walk: depth is 1/(9\.\d|10\.\d|10) of that of tracked cor", text) for text in caplog.messages
     )
 
 

@@ -140,12 +140,12 @@ def test_holes_are_filled_and_every_pixel_has_a_sigma(tour, finished):
         hole = np.zeros(truth.shape, bool)
         hole[:, 25:50] = True
         hole &= (truth > 0) & stored["valid"]
-        assert np.isfinite(stored["posterior_variance"][stored["valid"]]).all()
+        assert np.isfinite(stored["variance"][stored["valid"]]).all()
         if frame.index == 0:  # without an earlier view, the images show nothing
             continue
-        error = stored["posterior_depth"][hole] - truth[hole]
-        squares += np.square(error).sum(), np.square(stored["depth"][hole] - truth[hole]).sum()
-        z_scores.append(error / np.sqrt(stored["posterior_variance"][hole]))
+        error = stored["depth"][hole] - truth[hole]
+        squares += np.square(error).sum(), np.square(stored["network_depth"][hole] - truth[hole]).sum()
+        z_scores.append(error / np.sqrt(stored["variance"][hole]))
     assert np.sqrt(squares[0] / squares[1]) < 1 / 3
     z = np.concatenate(z_scores)
     assert 0.1 < np.sqrt(np.mean(np.square(z))) < 2
@@ -155,7 +155,7 @@ def test_depth_that_served_as_anchors_is_not_judged(finished):
     out, summary = finished
     assert summary["metrics"] is None
     assert summary["metrics_reason"] == "the recording's depth serves as anchors"
-    assert summary["posterior"]["metrics"] is None
+    assert summary["ufm"]["metrics"] is None
     assert not any(record["ground_truth"] for record in records(out))
     assert summary["anchors"]["used_per_frame"] > 300
     assert summary["source"]["sensor"] == "stereo"
@@ -208,11 +208,11 @@ def test_the_command(tmp_path, capfd):
     maps.mkdir()
     for i, depth in enumerate(truth.depths):
         np.save(maps / f"{i + 7}.npy", 1.3 * depth)
-    words = ["run", str(path), "--no-video", "--no-sheet", "--posterior", "--out", str(tmp_path / "out")]
+    words = ["run", str(path), "--no-video", "--no-sheet", "--out", str(tmp_path / "out")]
     assert cli.main([*words, "--depth", str(maps), "--anchors", "sensor"]) == 0
     summary = read_summary(tmp_path / "out")
     assert (summary["settings"]["anchors"], summary["metrics"]) == ("sensor", None)
-    depth = read_frame(tmp_path / "out" / "frames" / "12.npz")["posterior_depth"]
+    depth = read_frame(tmp_path / "out" / "frames" / "12.npz")["depth"]
     assert np.median(np.abs(depth / truth.depths[5] - 1)) < 0.02
     capfd.readouterr()
     assert cli.main([*words, "--overwrite", "--depth", "self", "--anchors", "sensor"]) == 2
