@@ -72,7 +72,7 @@ def cases() -> dict[str, Callable[[], object]]:
     m = mixture(2, 40, 3, features=1)
     current = mixture(2, 20, 4, features=1)
     depth = torch.full((2, *SIZE), 2.0)
-    config = UfMStarConfig()
+    config, view = UfMStarConfig(), torch.zeros(2, 4, dtype=torch.float64)
     still = torch.eye(3, dtype=torch.float64).repeat(2, 1, 1), torch.zeros(2, 3, dtype=torch.float64)
     pairs = Correspondence(torch.zeros(2, 20, 40, dtype=torch.bool), torch.zeros(2, 20, 40, dtype=torch.float64))
 
@@ -80,7 +80,7 @@ def cases() -> dict[str, Callable[[], object]]:
         previous, new = correspond.candidates(m.to(torch.float32), still, current, K.contiguous(), SIZE, config)
         words, _ = correspond.match_bits(previous, new, config, torch.zeros(2, dtype=torch.int64))
         matches = words, new.index, previous.position, new.count
-        fuse.fuse_bits(m.to(torch.float32), current, still, matches, config)
+        fuse.fuse_bits(m.to(torch.float32), current, still, matches, view, config)
 
     def device(streams: int = 2, **settings: Any) -> None:
         depth = torch.full((streams, *(SIZE if streams > 1 else (1, 1))), 2.0)
@@ -96,8 +96,8 @@ def cases() -> dict[str, Callable[[], object]]:
         assert waiting.rest is not None
         rest = waiting.rest
         append.append(
-            state.mixture, rest.current, rest.to_first, rest.left, state.frames, near_plane=0.05, again=True,
-            last=False,
+            state.mixture, rest.current, rest.to_first, rest.view, rest.left, state.frames, near_plane=0.05,
+            paper=False, again=True, last=False,
         )  # fmt: skip
 
     values = depth, torch.eye(4).double().expand(2, 4, 4), K, depth, depth, depth[:, None], depth > 0
@@ -109,7 +109,7 @@ def cases() -> dict[str, Callable[[], object]]:
         ),
         "correspond": lambda: correspond.correspond(m, current, K, SIZE, config),
         "bits": bits,
-        "fuse": lambda: fuse.fuse(m, current, pairs, config.replace(overlap_weighted=True)),
+        "fuse": lambda: fuse.fuse(m, current, pairs, view, config.replace(overlap_weighted=True)),
         "check": lambda: check.check_values(*values, rotation_tolerance=0.01, max_depth=20.0),
         "floor": lambda: fuse.floor_covariance(m.covariance, m.weight),
         "segment": lambda: segment.segment(segment_input),

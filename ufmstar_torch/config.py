@@ -11,7 +11,7 @@ from ufmstar_torch.checked import Checked, choice, number, section
 from ufmstar_torch.limits import require_bytes
 from ufmstar_torch.posterior.config import PosteriorConfig as PosteriorConfig
 
-_SLOT = 64  # [bytes] of a component's state without features
+_SLOT = 84  # [bytes] of a component's state without features
 
 # [m] Largest depth of a network that states none; SPGF's own.
 UNSTATED_RANGE = 20.0

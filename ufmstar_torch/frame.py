@@ -196,7 +196,10 @@ def check_frame(
     frame = kernel(plain, T, K, a, e, extra, mask, rotation_tolerance=rotation_tolerance, max_depth=max_depth)
     if informative is None and isinstance(member, int) and member == 0:
         return frame
-    index = torch.as_tensor(member, dtype=torch.float64, device=plain.device).expand(shape[0])
+    if isinstance(member, Tensor):
+        index = _moved(member.to(torch.float64), plain.device).expand(shape[0])
+    else:  # filled on the device: a copy would synchronise
+        index = torch.full(shape[:1], float(member), dtype=torch.float64, device=plain.device)
     return replace(frame, member=index, informative=_of_streams("informative", informative, plain))
 
 

@@ -89,19 +89,20 @@ class ImageCheck:
         if streams is None:
             self._seen: _Seen | None = None
             self._undone: _Seen | None = None
+            self._examined = False  # whether an image waits for UfM*'s verdict
             self._logged = set[tuple[int, str]]()
         elif self._seen is not None:
-            self._undone = _Seen.before(self._seen.grey, self._seen.pose)
-            self.undo(streams)
+            self._seen = _Seen.before(self._seen.grey, self._seen.pose).where(_mask(streams, self._seen), self._seen)
 
     def undo(self, streams: Sequence[int] | None = None) -> None:
         """Forget the last image of all streams, or of some, because UfM* refused or skipped it; once an image."""
-        if self._seen is not None and self._undone is not None:
-            mask = torch.full((len(self._seen.still),), streams is None)
-            mask[list(streams or ())] = True
-            if self._undone.grey.shape == self._seen.grey.shape:
-                self._seen = self._undone.where(mask.to(self._seen.still.device), self._seen)
-        self._undone = None
+        if self._examined and (streams is None or streams):
+            now, before = self._seen, self._undone
+            if streams is None or now is None or before is None or before.grey.shape != now.grey.shape:
+                self._seen = before
+            else:
+                self._seen = _Seen(*(value.to(now.still.device) for value in before)).where(_mask(streams, now), now)
+        self._examined = False
 
     def informative(self, image: Tensor, pose: Tensor) -> Tensor | None:
         """[B] False where the image shows nothing; None for an image of normalised floats, or on a device without
@@ -116,9 +117,10 @@ class ImageCheck:
             return None
         grey = reduced(image.detach())
         T = pose.detach().to(grey.device).double().expand(len(grey), *pose.shape[-2:]).clone()
-        last = self._seen
+        self._undone = last = self._seen
         if last is None or last.grey.shape != grey.shape or last.pose.shape != T.shape:
             last = _Seen.before(grey, T)
+        last = _Seen(*(value.to(grey.device) for value in last))
         changed = (last.pose != T).flatten(1).any(1)
         same = (grey == last.grey).flatten(1).all(1)
         shows, frozen = shows_something(grey), same & changed
@@ -126,7 +128,8 @@ class ImageCheck:
         first = torch.where(changed[:, None, None, None], grey, last.first)
         empty = torch.where(shows, 0, last.empty + 1)
         repeated = torch.where(changed, torch.where(same, last.frozen + 1, 0), last.frozen)
-        self._undone, self._seen = last, _Seen(grey, T, first, still, empty, repeated)
+        self._seen = _Seen(grey, T, first, still, empty, repeated)
+        self._examined = True
         if image.is_cpu:  # on an accelerator, reading the counts would synchronise
             self._warn(self._seen)
         return shows & ~frozen
@@ -136,6 +139,13 @@ class ImageCheck:
             if (b, kind) not in self._logged:
                 self._logged.add((b, kind))
                 LOGGER.warning("stream %d: %s (logged once)", b, text)
+
+
+def _mask(streams: Sequence[int], seen: _Seen) -> Tensor:
+    """[B] True for the streams; an index that the images do not have is ignored."""
+    mask = torch.zeros(len(seen.still), dtype=torch.bool)
+    mask[[b for b in streams if b < len(mask)]] = True
+    return mask.to(seen.still.device)
 
 
 def _findings(seen: _Seen) -> Iterator[tuple[int, str, str]]:

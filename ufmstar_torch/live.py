@@ -148,15 +148,15 @@ class LiveDepth:
             raise FileNotFoundError(f"state: no such folder: {self._state.parent}")
         if self._state is not None and self._state.is_dir():
             raise IsADirectoryError(f"state must be a file, got the folder {self._state}")
+        self._intrinsics = None if intrinsics is None else as_intrinsics(intrinsics)
         self._lock = None if self._state is None else self._locked(self._state)
         if self._state is not None and self._lock is not None and self._state.exists():
             try:
                 load_state(model, self._state)
-            except ValueError:
+            except BaseException:
                 self._lock.release()
                 raise
         self.model, self._on_result = model, on_result
-        self._intrinsics = None if intrinsics is None else as_intrinsics(intrinsics)
         self._max_wait, self._max_gap, self._save_every = max_wait, max_gap, save_every
         self._changed = Condition()  # guards everything below
         self._waiting: list[_Waiting] = []  # images, the oldest first

@@ -28,8 +28,8 @@ class FrameStatistics:
     Attributes:
         components: K, occupied components after the frame.
         segments: C, Gaussians segmented from the frame.
-        matched: segments fused with at least one earlier component.
-        pairs: fused (c, k) pairs.
+        matched: segments that match at least one earlier component.
+        pairs: matched pairs (c, k); fused where the view changed (``views``).
         new: segments appended to the mixture.
         dropped: components that were dropped because ``max_components`` was reached, the farthest first; and segments
             nearer than the near plane, which are not appended.
@@ -38,7 +38,7 @@ class FrameStatistics:
         out_of_range: other pixels with a finite positive depth that are not used, because depth, A, E or features lie
             outside the ranges of ``UfMStar.forward``.
         unmeasured: pixels used (with a subset, pixels regressed) where less than half of M rests on surfaces seen from
-            two or more views; ``config.unmeasured`` decides their M.
+            different places; ``config.unmeasured`` decides their M.
         single_view: components seen by only one frame. If it stays close to ``components``, hardly anything is compared
             between views; the logger ``ufmstar_torch`` then lists likely causes.
         fault: index into ``ufmstar_torch.frame.FRAME_FAULTS``; not 0 = the frame was skipped.
@@ -99,7 +99,7 @@ class StepOutput:
     Attributes:
         disagreement: M [B, H, W] [m^2] after the moving average, NaN where not valid; [B, n] on a subset.
         features: regressed features [B, H, W, F] or [B, n, F].
-        measured: [B, H, W] or [B, n] share in [0, 1] of M that rests on surfaces seen from two or more views.
+        measured: [B, H, W] or [B, n] share in [0, 1] of M that rests on surfaces seen from different places.
         current_cam: C_i in the camera frame.
         statistics: of this frame.
     """
@@ -133,7 +133,7 @@ class UfMStarOutput:
             distribution (``posterior.conformal``). NaN in a stream without evidence; None unless ``config.posterior``.
         recalibrated: [B, 1] True if a ``Recalibration`` has mapped ``variance``, or None.
         features: regressed further entries of H, [B, H, W, F], in the caller's units.
-        measured: share in [0, 1] of M that rests on surfaces seen from two or more views; below one half the pixel
+        measured: share in [0, 1] of M that rests on surfaces seen from different places; below one half the pixel
             counts as not measured (``config.unmeasured``). NaN where not valid.
         valid: True where the pixel was used.
         current_cam: C_i, the segments of this frame in the camera frame, float64.
@@ -280,7 +280,7 @@ class MeanUncertainty:
         depth: the predicted depth [m].
         standard_error: of the mean of V as an estimate of the mean over all valid pixels [m^2]; NaN with fewer than two
             pixels.
-        measured: share in [0, 1] of the sampled pixels whose M rests on surfaces seen from two or more views; about 0
+        measured: share in [0, 1] of the sampled pixels whose M rests on surfaces seen from different places; about 0
             in a first view, where ``config.unmeasured`` decides the mean. NaN without a valid pixel.
         statistics: per-stream counts of this frame; ``unmeasured`` counts the other sampled pixels.
     """

@@ -59,7 +59,7 @@ _MISSED = "UfM* alone, without anchors and the depth that the posterior corrects
 @dataclass(frozen=True)
 class UncertainPrediction:
     """The depth of an image and its variance: the posterior's, or, without a posterior, the network's depth with the
-    variance of UfM*. Before a stream's first anchor, the posterior's are the network's and UfM*'s.
+    variance of UfM*. Before a stream's first anchor, the posterior's depth is the network's, with a large variance.
 
     Attributes:
         prediction: the network's output (for "full": the predictive mean, mean A and E over the members).
@@ -484,7 +484,9 @@ class UncertainDepth(NetworksInTurn):
 
     def _undo(self, statistics: FrameStatistics) -> None:
         """Undo the updates by the image for streams that skipped it."""
-        skipped = statistics.fault.nonzero().flatten().tolist()
+        # Reading the faults synchronises with an accelerator.
+        can_skip = self.ufm.config.on_bad_frame == "skip" and not statistics.fault.is_meta
+        skipped = statistics.fault.nonzero().flatten().tolist() if can_skip else []
         self._image_check.undo(skipped)
         if self.landmarks is not None and self._searched:
             self.landmarks.undo(skipped)
@@ -514,7 +516,7 @@ class UncertainDepth(NetworksInTurn):
         with torch.no_grad():
             x, K = self.prepare(picture, K_image.expand(len(picture), 3, 3))
             prediction = self.every(x, K) if member is None else self.member(x, K, member)
-        index = (self._next + ahead) % SAMPLES if self.stochastic else member or 0
+        index = 0 if member is None else (self._next + ahead) % SAMPLES if self.stochastic else member
         prediction = replace(prediction, member=index)
         tensors = {name: value for name, value in vars(prediction).items() if isinstance(value, Tensor)}
         if features is not None:
@@ -596,14 +598,17 @@ class UncertainDepth(NetworksInTurn):
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """Restore the state of a video, of :meth:`state_dict`. The networks' weights are no part of it; if they differ
-        from those at saving, a warning is logged. Atomic: if it raises, state and landmarks are unchanged.
+        from those at saving, a warning is logged. Nor is the last image: the next one cannot be recognised as the same.
+        Atomic: if it raises, state and landmarks are unchanged.
 
         Raises:
             RuntimeError: the state is incomplete, of other sources of anchors, or invalid.
         """
         before = {name: value.clone() for name, value in self.state_dict().items()}
         try:
-            return super().load_state_dict(state_dict, strict, assign)
+            result = super().load_state_dict(state_dict, strict, assign)
+            self._image_check.reset()
+            return result
         except BaseException:
             super().load_state_dict(before)
             raise

@@ -77,6 +77,7 @@ class _Track:
     saturated: int = 0  # successive changes of the pose with the same largest depth
     depth: Tensor | None = None  # depth map at the first of the ``still`` frames
     member: float = 0.0  # index of the network that predicted it
+    waiting: bool = False  # whether its next prediction is to be compared
 
     def follow(
         self, T: list[list[float]], focal: tuple[float, float], depth: Tensor, total: float, member: float
@@ -128,7 +129,10 @@ class _Track:
         self.still += 1
         if self.still == 1 or self.depth is None or self.depth.shape != depth.shape:
             self.depth, self.member = depth.clone(), member
-        elif self.still >= _FRAMES and member == self.member:
+        elif self.still % _FRAMES == 0 or self.waiting:
+            self.waiting = member != self.member  # of networks in turn, the same one is compared
+            if self.waiting:
+                return
             both = (depth > 0) & (self.depth > 0)
             change = (depth[both] / self.depth[both] - 1).abs()
             if change.numel() and (median := float(change.median())) > _CHANGE:
@@ -239,7 +243,7 @@ class StreamWarnings:
         counts = (value.tolist() for value in (statistics.single_view, statistics.components, frames))
         for b, each in enumerate(zip(*counts, strict=True)):
             track = self._tracks.get(b)
-            if track is not None and track.travelled > _TRAVELLED and (text := hardly_compared(*each)):
+            if track is not None and (text := hardly_compared(*each, track.travelled)):
                 yield b, "views", text
 
     def _one_video(self, poses: list[list[list[float]]]) -> Iterator[tuple[int, str, str]]:
@@ -304,9 +308,10 @@ def _spreads(frame: FrameInput) -> Iterator[tuple[int, str, str]]:
         yield b, "copies", text + "network have no dropout in eval mode?"
 
 
-def hardly_compared(alone: int, components: int, frames: int) -> str:
-    """A warning if, after ``frames`` frames, nearly all components were seen in only one view (``alone``); else ""."""
-    if frames < _FRAMES or components < _COMPONENTS or alone <= _ALONE * components:
+def hardly_compared(alone: int, components: int, frames: int, travelled: float) -> str:
+    """A warning if, after ``frames`` frames and a path of ``travelled`` mean depths, nearly all components were seen in
+    only one view (``alone``); else ""."""
+    if frames < _FRAMES or components < _COMPONENTS or alone <= _ALONE * components or travelled <= _TRAVELLED:
         return ""
     text = (
         f"after {frames} frames {alone} of {components} Gaussians were seen in one view alone, so hardly anything is "

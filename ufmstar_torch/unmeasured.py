@@ -1,7 +1,7 @@
 """Detects the pixels where M was not measured, and sets their M (``config.unmeasured``), before and after step 5.
 
 A surface seen from one view has m = 0 because nothing was compared. Far from all components, M is the prior's mean. In
-the paper both count as certain. The share of a pixel's M that rests on surfaces seen from two or more views,
+the paper both count as certain. The share of a pixel's M that rests on surfaces seen from different places,
 
     s(x) = sum of w_k(x) (1 - exp(-n_k))  with the number of views n_k (``views``),
 

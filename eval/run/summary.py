@@ -113,6 +113,14 @@ def _of_network(stored: Mapping[str, np.ndarray]) -> np.ndarray:
     return stored["network_depth"] if "network_depth" in stored else stored["depth"]
 
 
+def _travelled(folder: RunFolder, done: Records) -> float:
+    """Length of the camera's path over the mean depth of the last frame; 0 without a depth."""
+    entries, stored = folder.job.sequence.entries, _stored(folder, done[-1])
+    path = np.stack([entries[record["index"]].T_world_cam[:3, 3] for record in done])
+    depth = stored["depth"][stored["valid"]]
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum() / depth.mean()) if depth.size else 0.0
+
+
 def _warnings(folder: RunFolder, depth: DepthFit | None, done: Records) -> list[str]:
     """Likely mistakes in the run's input, one line each."""
     job = folder.job
@@ -120,7 +128,8 @@ def _warnings(folder: RunFolder, depth: DepthFit | None, done: Records) -> list[
     without_depth = len(job.sequence.without_depth) == len(job.sequence)
     fits.append(_part_of_image(folder, done))
     if done:
-        fits.append(hardly_compared(done[-1]["single_view"], done[-1]["components"], len(done)))
+        last = done[-1]["single_view"], done[-1]["components"]
+        fits.append(hardly_compared(*last, len(done), _travelled(folder, done)))
         if without_depth and job.sequence.layout == "generic" and (depth is None or depth.problem):
             fits.append("nothing ties the poses to metres: sigma and disagreement are in the poses' unit")
     fitted = () if job.recalibration is None else job.recalibration.sequences

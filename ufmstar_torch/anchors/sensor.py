@@ -78,8 +78,9 @@ def completed(sensor: Landmarks, others: Landmarks, covered: NDArray[np.bool_]) 
         others: likewise; their figures of poses are those of the result.
         covered: [H, W] of the image, True where the sensor measured.
     """
+    of_sensor = {"pixel": sensor.pixel, "depth": sensor.depth, "variance": sensor.variance, "motion": None}
     if not len(others.depth):
-        return sensor
+        return replace(others, **of_sensor, tracked=sensor.tracked + others.tracked, shared=0.0, scale=0.0)
     height, width = covered.shape
     column, row = (
         np.rint(x).astype(int).clip(0, size - 1) for x, size in zip(others.pixel.T, (width, height), strict=True)
@@ -90,6 +91,7 @@ def completed(sensor: Landmarks, others: Landmarks, covered: NDArray[np.bool_]) 
         pixel=np.concatenate([sensor.pixel, others.pixel[apart]]),
         depth=np.concatenate([sensor.depth, others.depth[apart]]),
         variance=np.concatenate([sensor.variance, others.variance[apart]]),
+        motion=None,  # the sensor measures what moves, too
         tracked=sensor.tracked + others.tracked,
     )
 

@@ -157,7 +157,11 @@ def _anchors(anchors: AnchorInput | None, streams: int) -> list[AnchorRows | Non
     fields = [array(x) for x in (anchors.pixel, anchors.index, anchors.predicted, anchors.depth, anchors.variance)]
     used, motion = array(anchors.valid), None if anchors.motion is None else array(anchors.motion)
     rows = [AnchorRows(*(x[b][used[b]] for x in fields)) for b in range(streams)]
-    return list(rows) if motion is None else [row._replace(motion=motion[b]) for b, row in enumerate(rows)]
+    return (
+        list(rows)
+        if motion is None
+        else [row._replace(motion=motion[b] if np.isfinite(motion[b]).any() else None) for b, row in enumerate(rows)]
+    )
 
 
 def _of_stream(

@@ -172,14 +172,14 @@ def _fuse(
         h = tl.load(features + k[:, None] * channels + f[None, :], mask=in_f, other=0.0).to(tl.float64)
     row = tl.where(w > 0, tl.load(position + k, mask=inside, other=-1), -1)
     n = tl.load(listed_c + b)
-    for w in range(tl.cdiv(n, word)):
-        remaining = tl.load(bits + (b * capacity_k + row) * words + w, mask=row >= 0, other=0)
+    for part in range(tl.cdiv(n, word)):
+        remaining = tl.load(bits + (b * capacity_k + row) * words + part, mask=row >= 0, other=0)
         while tl.max(remaining, 0) > 0:
             use = remaining != 0
             any_match = any_match | use
             bit, rest = lowest_bit(tl.where(use, remaining, 1))
             remaining = tl.where(use, rest, 0)
-            c = tl.load(index_c + b * capacity_c + w * word + bit, mask=use, other=0)
+            c = tl.load(index_c + b * capacity_c + part * word + bit, mask=use, other=0)
             index = b * capacity_c + c
             cx = tl.load(mean_c + 3 * index, mask=use, other=0.0).to(tl.float64)
             cy = tl.load(mean_c + 3 * index + 1, mask=use, other=0.0).to(tl.float64)
