@@ -190,7 +190,7 @@ ARRAYS = {
     "none": ({"variance": None}, "it has no array variance"),
     "half a posterior": (
         {"posterior_outlier": np.ones((48, 64), np.float32), "network_depth": None},
-        "no array network_depth",
+        "it has no array network_depth",
     ),
     "another size": ({"variance": np.ones((3, 3), np.float32)}, r"array variance is float32 [3, 3]"),
     "a pose": ({"T_world_cam": np.eye(3)}, "array T_world_cam is float64 [3, 3]"),
