@@ -187,7 +187,7 @@ class CameraNode:
         T = self._frames.between(self._camera, world) if stamps else None
         if T is not None:
             self.live.push_pose(max(stamps), T)
-        elif stamps:
+        elif stamps and self._camera:
             self._node.get_logger().warning(f"tf does not connect {self._camera!r} with {world!r}", once=True)
 
     def _on_odometry(self, message: Any) -> None:

@@ -13,7 +13,8 @@ from launch.substitutions import LaunchConfiguration
 ARGUMENTS = {
     "python": ("python3", "interpreter with ufmstar_torch"),
     "weights": (None, "file of the network"),
-    "camera": ("/camera/color", "namespace of image_raw and camera_info"),
+    "camera": ("/camera/color", "namespace of the images and camera_info"),
+    "image": ("image_raw", "topic of the images below camera; image_raw/compressed with compressed: true"),
     "poses": ("tf", "tf, odometry or pose"),
     "world_frame": ("odom", "frame of the poses of tf"),
     "parameters": (str(Path(__file__).with_name("ufmstar.yaml")), "YAML file with further parameters"),
@@ -30,7 +31,7 @@ def generate_launch_description() -> LaunchDescription:
         "-p", ["weights:=", value["weights"]],
         "-p", ["poses:=", value["poses"]],
         "-p", ["world_frame:=", value["world_frame"]],
-        "-r", ["image:=", camera, "/image_raw"],
+        "-r", ["image:=", camera, "/", value["image"]],
         "-r", ["camera_info:=", camera, "/camera_info"],
     ]  # fmt: skip
     declared = [

@@ -26,6 +26,7 @@ from ufmstar_torch.eval.run import rerun_log
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.live import PoseFile, growing_folder, json_lines, replay
 from ufmstar_torch.eval.tour import export_tour
+from ufmstar_torch.file_lock import hold
 
 __all__ = ["stand_in"]
 
@@ -237,6 +238,11 @@ def test_a_recording_live(ufmstar, tmp_path):
     assert code == 2
     assert f"--out {tmp_path / 'out'} holds an earlier live run: --overwrite replaces it" in err
     assert sorted((tmp_path / "out").iterdir()) == before
+    lock = hold(tmp_path / ".state.pt.lock")
+    code, _, err = ufmstar(TOUR, "--out", tmp_path / "out", "--overwrite", "--state", tmp_path / "state.pt")
+    assert (code, sorted((tmp_path / "out").iterdir())) == (2, before)  # refused before anything is replaced
+    assert "another process is writing" in err
+    lock.release()
     assert ufmstar("tour:4?frames=2&size=64x96", "--out", tmp_path / "out", "--overwrite")[0] == 0
     assert not any((tmp_path / "out" / f"{line['stamp']:.6f}.npz").exists() for line in lines[2:])
     for content, text in ((b"no state", "it begins with b'no state'"), (malicious(tmp_path), "never loaded because")):

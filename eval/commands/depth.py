@@ -24,7 +24,7 @@ from ufmstar_torch.stream_warnings import LOGGER
 
 PRESETS = ("tum", "tartanair_indoor", "tartanair_outdoor")
 OWN_DEPTH = ("self", "ground-truth")
-# Sections of UfM*'s settings that are off by default.
+# Sections that are off in ``UfMStarConfig()``.
 SECTIONS = ("anchors", "confidence", "posterior", "merge")
 
 
@@ -132,8 +132,8 @@ class UfMOptions:
             --preset and single --ufm.* take precedence
         anchors: depths that show the error on which all views agree (docs/anchors.md): dense, a depth in every cell of
             the image, searched in earlier images; corners, tracked in the images; FILE, landmarks, a line x y z
-            sigma [m] each, in the world of the poses; run, rank: sensor (or sensor:stereo, sensor:tof), the
-            recording's own depth, dense where it has none
+            sigma [m] each, in the world of the poses; sensor (or sensor:stereo, sensor:tof), the recording's own
+            depth, dense where it has none
         scale_from: network: its scale for COLMAP poses without one; anchors then show shape only
         recalibration: file of `ufmstar recalibrate`, or none; default: WEIGHTS.recalibration.json beside the weights
     """
@@ -196,8 +196,9 @@ class PosteriorOptions(UfMOptions):
 
     Attributes:
         anchors: from which the depth is corrected (docs/anchors.md): dense (default), a depth in every cell of the
-            image, searched in earlier images; corners, tracked in the images; or FILE, landmarks, a line x y z sigma
-            [m] each, in the world of the poses
+            image, searched in earlier images; corners, tracked in the images; FILE, landmarks, a line x y z sigma
+            [m] each, in the world of the poses; with run, sensor (or sensor:stereo, sensor:tof), the recording's own
+            depth, dense where it has none
         plain: UfM* alone: the network's depth with the variance of UfM*; with --anchors, the variance has B
     """
 

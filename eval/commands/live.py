@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -36,7 +36,7 @@ from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
 from ufmstar_torch.eval.sequences.live import LiveEvent
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.live import LiveDepth, LiveResult, LiveStatistics, load_state
+from ufmstar_torch.live import LiveDepth, LiveResult, LiveStatistics
 from ufmstar_torch.pipeline import UncertainDepth
 from ufmstar_torch.stream_warnings import LOGGER
 
@@ -133,10 +133,15 @@ def main(options: LiveOptions) -> int:
             events = _events(options, K)
             model = _model(options)
             view = RerunLog(open_viewer()[0]) if options.view else None
+            times, shown = RealTime(model), list[Callable[[LiveResult], None]]()
+            how: dict[str, Any] = {"max_wait": options.max_wait, "max_gap": options.opening.max_pose_gap}
+            how |= {"state": options.state, "save_every": options.save_every}
+            # Reads and locks the state, before --out is replaced.
+            live = stack.enter_context(LiveDepth(model, lambda result: shown[0](result), K, **how))
             if options.out is not None:
                 stack.enter_context(output_folder(options.out, kind, started, overwrite=options.overwrite))
-        times = RealTime(model)
-        statistics, failure = _run(options, model, K, events, times, view)
+        shown.append(_shown_by(options, live, times, view))
+        statistics, failure = _run(options, live, events)
         summary = times.summary(statistics)
         print(realtime_table(summary), file=sys.stderr if options.json else sys.stdout)
         ending = {"state": "failed", "reason": str(failure)} if failure else {"state": "finished"}
@@ -148,16 +153,10 @@ def main(options: LiveOptions) -> int:
     return 0 if summary["results"] else 1
 
 
-def _run(
-    options: LiveOptions,
-    model: UncertainDepth,
-    K: NDArray[np.float64] | None,
-    events: Iterator[LiveEvent],
-    times: RealTime,
-    view: RerunLog | None,
-) -> tuple[LiveStatistics, Exception | None]:
-    """Push the events until they end, the time is over, or a signal comes. Returns the counts, and the error if any."""
-    deadline, warm = monotonic() + options.seconds, False
+def _shown_by(
+    options: LiveOptions, live: LiveDepth, times: RealTime, view: RerunLog | None
+) -> Callable[[LiveResult], None]:
+    """A function that writes and shows the result of an image."""
 
     def on_result(result: LiveResult) -> None:
         times.take(result)
@@ -171,8 +170,12 @@ def _run(
         elif len(times.latency) % 30 == 1:
             print("  ".join(f"{name} {value}" for name, value in figures.items()), file=sys.stderr, flush=True)
 
-    how: dict[str, Any] = {"max_wait": options.max_wait, "max_gap": options.opening.max_pose_gap}
-    live = LiveDepth(model, on_result, K, state=options.state, save_every=options.save_every, **how)
+    return on_result
+
+
+def _run(options: LiveOptions, live: LiveDepth, events: Iterator[LiveEvent]) -> tuple[LiveStatistics, Exception | None]:
+    """Push the events until they end, the time is over, or a signal comes. Returns the counts, and the error if any."""
+    deadline, warm = monotonic() + options.seconds, False
     try:
         with _interrupted_by_sigterm(), live, suppress(KeyboardInterrupt):
             for event in events:
@@ -183,7 +186,7 @@ def _run(
                 if event.image is not None:
                     if not warm:  # the first inference takes seconds; a recording's clock starts after it
                         height, width = event.image.shape[:2]
-                        model.warm_up((height, width))
+                        live.model.warm_up((height, width))
                         deadline, warm = monotonic() + options.seconds, True
                     live.push_image(event.stamp, event.image, event.intrinsics)
             live.wait_idle()
@@ -212,7 +215,7 @@ def _events(options: LiveOptions, K: NDArray[np.float64] | None) -> Iterator[Liv
 
 
 def _model(options: LiveOptions) -> UncertainDepth:
-    """The networks with UfM*, warmed up, with the state of ``--state``; errors as ``NetworkChoice.load``."""
+    """The networks with UfM*, warmed up; errors as ``NetworkChoice.load``."""
     chosen, source = options.network, options.network.load(options)
     config, anchors = options.uncertainty.config(), options.uncertainty.anchors
     model = UncertainDepth(
@@ -228,8 +231,6 @@ def _model(options: LiveOptions) -> UncertainDepth:
     ).to(options.device)
     with Bars() as bars:
         warm_up_command(model.ufm.config, bars.show, [] if config.anchors is None else [anchors or DENSE])
-    if options.state is not None and options.state.exists():
-        load_state(model, options.state)  # before --out is replaced
     return model
 
 

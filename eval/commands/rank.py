@@ -41,7 +41,7 @@ class RankOptions(StreamOptions):
         by: rank by the mean of V, M, A, E or B (docs/active_learning.md)
         diverse: rank only one of several images that show the same place from nearly the same side
         count: number of images to rank; default: all
-        measured: smallest share of pixels seen in two views; images below it get no rank by total or disagreement
+        measured: smallest share of pixels seen from two places; images below it get no rank by total or disagreement
         overwrite: replace the ranking in --out
     """
 

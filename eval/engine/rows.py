@@ -40,7 +40,7 @@ class RowResult:
     aleatoric: Tensor | None = None
     epistemic: Tensor | None = None
     disagreement: Tensor | None = None  # M of UfM* [m^2], or None
-    measured: Tensor | None = None  # share of M from two views or more, of UfM*, NaN where not valid, or None
+    measured: Tensor | None = None  # share of M from views of different places, of UfM*, NaN where not valid, or None
     anchored: Tensor | None = None  # B of UfM* with anchors [m^2], or None
     bias: Tensor | None = None  # r of UfM* with anchors, or None
     posterior_depth: Tensor | None = None  # of UfM* with anchors and a posterior [m], or None

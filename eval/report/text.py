@@ -151,7 +151,8 @@ def _anchor_lines(summary: Mapping[str, Any]) -> list[str]:
     why = "; ".join(f"{count} x {reason}" for reason, count in without.items())
     later = sum(without.values()) - before
     rest = f"without anchors: {before + later} of {frames} frames ({why})"
-    rest += f"; {before} before the first anchors: plain UfM*" if before else ""
+    first = "the network's depth with a large sigma" if summary.get("result") == "posterior" else "plain UfM*"
+    rest += f"; {before} before the first anchors: {first}" if before else ""
     return [line, rest + (f"; {later} later: with what was learnt before" if later else "")]
 
 

@@ -50,7 +50,7 @@ class ImageScores(FrameSink):
     Args:
         by: a name of ``PARTS``, whose mean over the pixels is the score; with ``unmeasured="nan"`` in the config, over
             the measured pixels for V and M.
-        measured: smallest share of pixels seen in two views for an image to be ranked by V or M.
+        measured: smallest share of pixels seen from two places for an image to be ranked by V or M.
     """
 
     sequence = ""  # name of the current sequence in scores.csv

@@ -194,7 +194,7 @@ def _uncertainty(done: Records) -> dict[str, Any]:
         "units": "disagreement m^2, sigma m",
         # Share of valid pixels with 0 < sigma < ``NEAR_ZERO``: no component is near, and the prior is 0.
         "near_zero_share": sum(record["near_zero"] for record in done) / pixels if pixels else None,
-        # Share of valid pixels not seen in two views; their M is ``UfMStarConfig.unmeasured``.
+        # Share of valid pixels not seen from two places; their M is ``UfMStarConfig.unmeasured``.
         "unmeasured_share": sum(record["unmeasured"] for record in done) / pixels if pixels else None,
         "valid_pixels": pixels,
     }

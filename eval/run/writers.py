@@ -5,7 +5,7 @@ The npz has
 - depth [m] and its variance [m^2] float32, the posterior's unless the run is plain, and valid bool, each [H, W];
 - with a posterior network_depth [m], which it corrects, and ufm_variance [m^2], V of UfM* for that depth;
   posterior_outlier (a probability) and posterior_inlier_variance [m^2];
-- disagreement [m^2] (M) and measured, the share of M from two views or more;
+- disagreement [m^2] (M) and measured, the share of M from views of different places;
 - with anchors anchored [m^2] (B), bias (r: the network's depth times 1 + r is to be expected), and anchors [N, 4]: u, v
   in the maps [px], depth and its standard deviation [m];
 - T_world_cam [4, 4] camera-to-world [m] and intrinsics [3, 3] of the maps [px].

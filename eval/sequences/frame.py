@@ -20,8 +20,6 @@ from ufmstar_torch.limits import require_pixels
 Loader = Callable[[], np.ndarray]
 Size = tuple[int, int]
 
-# Largest image; its map takes 1 GiB in double precision.
-
 
 def parse_size(text: str | None, option: str = "--size") -> Size | None:
     """HxW as (H, W), None for None. Raises ValueError: another form, or more pixels than an image can have."""

@@ -4,7 +4,7 @@ They are written while a sequence is evaluated, below its folder::
 
     examples/FRAME.npz      image [h, w, 3] uint8, truth [h, w] float32 [m] (0 = none), K [3, 3] [px], index
     examples/FRAME@ROW.npz  depth [m], and if the row has them variance, aleatoric, epistemic, disagreement [m^2] and
-                            measured (share of the disagreement from two views), each [h, w] float32;
+                            measured (share of the disagreement from two places), each [h, w] float32;
                             also image, truth and K if the row's differ from the frame's
     room/ROW_FRAME.npz      UfM*'s mixture after the frame in the world: mean_world [K, 3] [m], covariance_world
                             [K, 3, 3] [m^2], weight [K] [px], disagreement [K] [m^2], count [K]; T_world_cam

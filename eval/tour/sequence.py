@@ -30,9 +30,9 @@ _FRAME_BYTES = 4096  # of a frame's pose and entry, and of the arrays from which
 def open_tour(name: str) -> FrameSequence:
     """The tour of a name.
 
-    Options: ``style`` (home, hall, mixed, blank, scales), ``frames``, ``size`` (HxW), ``fov`` (degrees), ``path`` (seed
-    of the way), ``pan`` (1: the camera turns in place), ``sensor`` (1, or 0 for a perfect camera) and ``movers``
-    (number of things that move).
+    Options: ``style`` (home, hall, mixed, blank, scales, corridor, street, close), ``frames``, ``size`` (HxW), ``fov``
+    (degrees), ``path`` (seed of the way), ``pan`` (1: the camera turns in place), ``sensor`` (1, or 0 for a perfect
+    camera) and ``movers`` (number of things that move).
 
     Raises:
         ValueError: another form, an unknown option, or an invalid value.

@@ -1,1 +1,1 @@
-"""Extension, off by default: p(depth | network, UfM*, anchors), a depth map corrected by anchors."""
+"""Extension that ``UncertainDepth`` switches on: p(depth | network, UfM*, anchors), a depth that anchors correct."""
