@@ -248,7 +248,7 @@ def test_the_launch_file_starts_the_node(monkeypatch):
     assert kind == "process"
     words = ["".join(word) for word in process["cmd"]]
     assert words[:3] == ["<python>", str(EXAMPLES / "ros_node.py"), "--ros-args"]
-    assert "image:=<camera>/image_raw" in words
+    assert "image:=<camera>/<image>" in words
     defaults = {name: how.get("default_value") for _, name, how in arguments}
     assert "weights" in defaults
     assert Path(defaults["parameters"]).is_file()
