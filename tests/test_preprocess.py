@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import example, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from PIL import Image
 from torch import Tensor
@@ -76,6 +76,7 @@ def test_a_point_is_seen_where_the_new_intrinsics_project_it(preprocess: Preproc
 @given(height=st.integers(1, 2000), width=st.integers(1, 2000))
 @example(height=480, width=640)
 def test_the_crop_fits_into_every_image(height: int, width: int) -> None:
+    assume(max(height, width) < 500 * min(height, width))  # a longer strip exceeds the limit of a resized image
     g = NYU.geometry(height, width)
     assert g.final == (224, 224)
     assert g.cropped == (228, 304)

@@ -30,7 +30,17 @@ def test_views_are_averaged_by_their_weights():
 @pytest.mark.slow
 def test_the_example(tmp_path, capsys):
     out = tmp_path / "out"
-    words = ["run", "tour:5?frames=8&size=60x80", "--depth", "self", "--no-video", "--no-sheet", "--out", str(out)]
+    words = [
+        "run",
+        "tour:5?frames=8&size=60x80",
+        "--depth",
+        "self",
+        "--plain",
+        "--no-video",
+        "--no-sheet",
+        "--out",
+        str(out),
+    ]
     assert cli.main(words) == 0
     counted = example.main(out)
     assert "no ground truth, so no error" in capsys.readouterr().out
