@@ -320,7 +320,7 @@ class UfMStarConfig(Checked):
         - ``segment.min_pixels``, ``.min_rows``, ``.prune``: the paper drops a Gaussian below 2,000 pixels or below 32
           rows; the default one that is below 200 pixels and below 16 rows. On four sequences that is 4 to 6 Gaussians
           over 55 to 85 % of the usable pixels here, 12 to 24 over 92 to 99 % by default, and ECE_delta of FastDepth's
-          depth alone is .562 here and .458 by default (docs/results/accuracy.md).
+          depth alone is .562 here and .382 by default (docs/results/accuracy.md).
         - ``segment.slope_focal``: SPGF's thresholds have the camera's own focal length here, by default the
           reference's, which made no difference on tours.
         - ``view_baseline``: every comparison counts here, and the first view counts as agreement; by default a
