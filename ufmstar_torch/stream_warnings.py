@@ -241,9 +241,9 @@ class StreamWarnings:
     def _alone(self, statistics: FrameStatistics, frames: Tensor) -> Iterator[tuple[int, str, str]]:
         """A warning if nearly all components were seen in one view although the camera has moved far enough."""
         counts = (value.tolist() for value in (statistics.single_view, statistics.components, frames))
-        for b, each in enumerate(zip(*counts, strict=True)):
+        for b, (alone, components, seen) in enumerate(zip(*counts, strict=True)):
             track = self._tracks.get(b)
-            if track is not None and (text := hardly_compared(*each, track.travelled)):
+            if track is not None and (text := hardly_compared(alone, components, seen, track.travelled)):
                 yield b, "views", text
 
     def _one_video(self, poses: list[list[list[float]]]) -> Iterator[tuple[int, str, str]]:

@@ -78,9 +78,17 @@ def completed(sensor: Landmarks, others: Landmarks, covered: NDArray[np.bool_]) 
         others: likewise; their figures of poses are those of the result.
         covered: [H, W] of the image, True where the sensor measured.
     """
-    of_sensor = {"pixel": sensor.pixel, "depth": sensor.depth, "variance": sensor.variance, "motion": None}
     if not len(others.depth):
-        return replace(others, **of_sensor, tracked=sensor.tracked + others.tracked, shared=0.0, scale=0.0)
+        return replace(
+            others,
+            pixel=sensor.pixel,
+            depth=sensor.depth,
+            variance=sensor.variance,
+            motion=None,
+            tracked=sensor.tracked + others.tracked,
+            shared=0.0,
+            scale=0.0,
+        )
     height, width = covered.shape
     column, row = (
         np.rint(x).astype(int).clip(0, size - 1) for x, size in zip(others.pixel.T, (width, height), strict=True)
