@@ -11,8 +11,10 @@ remainder in discs of .03 to .12 image widths.
 from __future__ import annotations
 
 import argparse
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -104,9 +106,10 @@ def measure(path: str, weights: str, sensor: str | None, images: bool, frames: i
         torch.device("cpu"), {}, landmarks="dense", sensor=sensor,
     )  # fmt: skip
     row, judged = job.row(Checkpoint()), RemovedHalf(whole)
-    if not images and row.anchors is not None and row.anchors.tracks is not None:
-        row.anchors.tracks.of = lambda *_: None  # type: ignore[method-assign]
-    FrameStream(job.sequence, job.indices, [row]).drive([judged])
+    assert row.anchors is not None
+    without_images = patch.object(row.anchors.tracks, "of", return_value=None)
+    with nullcontext() if images else without_images:
+        FrameStream(job.sequence, job.indices, [row]).drive([judged])
     return judged
 
 

@@ -49,8 +49,8 @@ TOURS, OTHERS = (
     ]
     for first in (901, 801)
 )
-# Mean coverage on tours. A recording's anchors err more (median error 1.5 to 5.8 % instead of .8 %), so more than
-# the stated level is asked of tours.
+# Mean coverage that the correction must reach on tours. It is higher than the stated level because the anchors of
+# recordings have larger errors than those of tours (median error 1.5 to 5.8 % instead of .8 %).
 TARGETS = (0.525, 0.92, 0.995)
 GATES = (0.0, 0.05, 0.1, 0.2, np.inf)
 FIRST, LAST = 30, 10  # frames before the coverage counts; frames that count in shorter sequences

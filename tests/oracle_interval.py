@@ -14,7 +14,7 @@ def phi(z: float) -> float:
 
 
 def probability_below(components, x: float) -> float:
-    """Of a positive depth; ``components``: (weight, mean, variance)."""
+    """The probability that a positive depth is below x; ``components`` are (weight, mean, variance)."""
 
     def below(x: float) -> float:
         return sum(w * phi((x - mean) / math.sqrt(variance)) for w, mean, variance in components)
@@ -23,7 +23,7 @@ def probability_below(components, x: float) -> float:
 
 
 def inverse(function, value: float, low: float, high: float) -> float:
-    """Of an increasing function, by bisection."""
+    """The argument at which an increasing function has the value, by bisection."""
     for _ in range(200):
         middle = (low + high) / 2
         low, high = (middle, high) if function(middle) < value else (low, middle)

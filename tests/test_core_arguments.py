@@ -287,7 +287,7 @@ class Trainer(nn.Module):
 
 
 class Freezes(nn.Module):
-    """A network with a mode of its own, in PyTorch's form."""
+    """A network that overrides ``train``, as PyTorch allows, and stays in evaluation mode."""
 
     def __init__(self):
         super().__init__()

@@ -74,7 +74,9 @@ def test_anchors_of_another_camera_are_at_the_pixels_of_the_image():
 
 
 def test_landmarks_of_the_images_complete_it():
-    """One lies where the sensor measured, one beside it, one in the hole; their common error stays."""
+    """Only the landmark in the hole is added: one is on a pixel that the sensor measured, one is next to such a pixel.
+
+    The common error of the images' landmarks stays."""
     covered = np.ones((240, 320), bool)
     covered[:, 200:] = False
     pixel = np.array([[50.0, 50], [201, 60], [250, 70]])

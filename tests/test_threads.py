@@ -130,7 +130,7 @@ def test_an_error_inside_lets_the_next_thread_in_and_copies_are_free():
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_torch_compile_runs_the_modules_as_they_are():
-    """A network may be compiled; UfM* is left as it is, also inside a compiled function."""
+    """torch.compile compiles the network and runs UfM* uncompiled, also if a compiled function calls it."""
     compiled = []
 
     def backend(graph, _):

@@ -66,7 +66,7 @@ def _guarded(method: Callable[..., Any]) -> Callable[..., Any]:
             self._caller.leave()
 
     guarded: Any = called
-    # As torch.compiler.disable, which imports the compiler (6 s): torch.compile runs the method as it is.
+    # torch.compile does not compile this method. torch.compiler.disable does the same, but imports the compiler (6 s).
     frames = torch._C._dynamo.eval_frame
     skip = frames._FrameAction.SKIP
     function: Any = guarded

@@ -11,7 +11,7 @@ _CONFIRMED = 3  # number of consecutive doubtful stamps that agree with each oth
 
 
 class Verdict(Enum):
-    """What to do with a stamp."""
+    """The decision about a stamp."""
 
     USE = 0
     WAIT = 1  # doubtful: nothing after it has confirmed it

@@ -1,4 +1,4 @@
-"""How much a comparison counts in step 4: two views from one place are one view.
+"""The weight of a comparison in step 4: two views from one place count as one view.
 
 A network repeats its error in the same picture, so a comparison shows something only as far as the view changed. With
 the camera's centre t, the centre t_ref of the component's reference view, and the distance r of its mean from t, the

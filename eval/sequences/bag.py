@@ -292,8 +292,8 @@ def _choose(bag: Bag, options: Options) -> _Topics:
 
 
 def _without_transports(topics: list[str]) -> list[str]:
-    """The topics without those with the same images as another one: X/compressed and X/compressedDepth beside X, and
-    X/compressed beside X/compressedDepth."""
+    """Remove topics that repeat the images of another topic: X/compressed and X/compressedDepth if X exists, and
+    X/compressed if X/compressedDepth exists."""
     pairs = [(name, *name.rpartition("/")[::2]) for name in topics]
     return [
         name

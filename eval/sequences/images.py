@@ -38,7 +38,7 @@ _MILLIMETRE = 1e-3
 _FULL_SCALES = (255, 1023, 4095, 16383, 65535)
 _DEEP = ";16"  # in Pillow's name of the stored pixels of an image with 16 bits
 _SCALE_SAMPLES = 8  # images of a folder that determine its scale
-# macOS writes a file ._NAME beside NAME on disks that are not its own.
+# On a disk with another system's format, macOS stores the attributes of NAME in a file ._NAME in the same folder.
 _SIDECAR = "._"
 # Names of a depth channel of an EXR file, best first; Blender prefixes its layer ("ViewLayer.Depth.Z").
 _DEPTH_NAMES = ("Z", "depth", "V", "Y", "R")
@@ -166,7 +166,7 @@ def list_files(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list
 
 
 def is_sidecar(path: Path) -> bool:
-    """True for the file of attributes that macOS writes beside another file; it has that file's suffix."""
+    """True if the file holds the attributes that macOS stores of another file: it has the suffix of that file."""
     return path.name.startswith(_SIDECAR)
 
 

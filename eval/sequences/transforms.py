@@ -39,7 +39,7 @@ FILE, TRAIN = "transforms.json", "transforms_train.json"
 LOOKED_FOR = f"{FILE} or {TRAIN}, or the path of another file *.json"
 # Keys of a file or frame made by structure from motion.
 _NOT_METRIC = ("aabb_scale", "colmap_im_id")
-# A file and a folder that structure from motion leaves beside the file.
+# Names in the folder of transforms.json that show that structure from motion computed the poses.
 _FROM_COLMAP = ("sparse_pc.ply", "colmap")
 _SIGMA = "sigma_file_path"  # of a frame of `ufmstar export`
 _FISHEYES = ("OPENCV_FISHEYE", "FISHEYE")
