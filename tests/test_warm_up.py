@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import errno
 import gc
-import importlib.util
+import importlib
 import json
 import os
+import pkgutil
+import runpy
 import subprocess
 import sys
 from typing import ClassVar
@@ -16,7 +18,9 @@ import pytest
 import torch
 from modules import same
 from numba.core import caching, codegen, compiler, typed_passes, untyped_passes
+from numba.core.dispatcher import Dispatcher
 
+import ufmstar_torch
 from ufmstar_torch import DepthPrediction, UfMStar, UncertainDepth
 from ufmstar_torch.kernels import compile_cpu
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, part
@@ -187,28 +191,70 @@ def test_a_cold_start_compiles_all_and_a_warm_one_nothing(tmp_path):
         assert result["steps"] == [[done, 21] for done in range(22)]
 
 
+KERNEL = """
+from ufmstar_torch.kernels.compile_cpu import kernel, leaf, reordered_leaf
+
+ONE = 1
+
+
+@leaf
+def more(x):
+    return x + ONE
+
+
+@kernel
+def plus_one(x):
+    return more(x)
+"""
+
+
 @pytest.fixture
 def hits(tmp_path):
-    """Define a kernel again and call it; return the number of cache hits."""
+    """Define a kernel again, from other text or other code, and call it; return the number of cache hits."""
     path = tmp_path / "one_kernel.py"
-    path.write_text(
-        "from ufmstar_torch.kernels.compile_cpu import kernel\n\n\n@kernel\ndef plus_one(x):\n    return x + 1\n"
-    )
 
-    def call() -> int:
-        spec = importlib.util.spec_from_file_location("one_kernel", path)
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        assert module.plus_one(1) == 2
-        return sum(module.plus_one.stats.cache_hits.values())
+    def call(old: str = "", new: str = "", result: int = 2) -> int:
+        path.write_text(KERNEL.replace(old, new, 1))
+        names = runpy.run_path(str(path))
+        assert names["plus_one"](1) == result
+        return sum(names["plus_one"].stats.cache_hits.values())
 
     return call
 
 
-def test_a_kernel_on_disk_is_outdated_when_another_file_of_the_kernels_changes(hits, monkeypatch):
+@pytest.mark.parametrize(
+    ("old", "new", "result"),
+    [
+        ("ONE = 1", "ONE = 3", 4),  # a constant
+        ("x + ONE", "x + ONE + ONE", 3),  # code of a part
+        ("@leaf", "@reordered_leaf", 2),  # how a part is compiled
+    ],
+)
+def test_a_kernel_on_disk_is_outdated_when_what_is_compiled_into_it_changes(hits, old, new, result):
     assert [hits(), hits()] == [0, 1]
-    monkeypatch.setattr(compile_cpu, "_SOURCES", "of other files")
+    assert [hits(old, new, result), hits(old, new, result)] == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("ONE = 1", "# A comment, which moves each line\nONE = 1"),
+        ("return x", '"""More."""\n    return x'),
+        ("@leaf", "@leaf\ndef other(x):\n    return -x\n\n@leaf"),
+    ],
+)
+def test_a_kernel_on_disk_stays_valid_when_only_text_around_it_changes(hits, old, new):
     assert [hits(), hits()] == [0, 1]
+    assert hits(old, new) == 1
+
+
+def test_every_kernel_has_a_stamp_of_its_own():
+    """No kernel uses a global variable that a stamp does not cover."""
+    modules = [importlib.import_module(m.name) for m in pkgutil.walk_packages(ufmstar_torch.__path__, "ufmstar_torch.")
+               if m.name.split(".")[1] in ("kernels", "anchors", "posterior") and "triton" not in m.name]  # fmt: skip
+    kernels = {one.py_func for m in modules for one in vars(m).values() if isinstance(one, Dispatcher)}
+    assert len(kernels) > 40
+    assert len({compile_cpu.code_stamp(one) for one in kernels}) == len(kernels)
 
 
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])

@@ -8,25 +8,31 @@ numba optimises each function, makes machine code of it, and repeats both in eve
 kernels are optimised and made machine code, together with their parts, and only those of numba's passes run that such
 plain code needs. This halves the time of the first start.
 
-A cached kernel is valid while its own file and all files whose code and constants are compiled into kernels are
-unchanged: numba itself compares only the kernel's file and would use an outdated part. A damaged file, or one that
-cannot be written, is reported once (logger ``ufmstar_torch``), and the kernel is compiled in memory.
+A cached kernel is valid while its code, its parts and their constants are unchanged, wherever their files lie
+(:func:`code_stamp`): numba itself compares the time of the kernel's file, and would use an outdated part. A damaged
+file, or one that cannot be written, is reported once (logger ``ufmstar_torch``), and the kernel is compiled in memory.
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import inspect
 import logging
 import pickle
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
 from typing import Any, cast
 
 import numba
+import numpy as np
 from numba import njit, types
 from numba.core import caching, cgutils, codegen, compiler, typed_passes, untyped_passes
 from numba.core.compiler_machinery import PassManager, register_pass
+from numba.core.dispatcher import Dispatcher
+from numba.core.extending import _Intrinsic as Intrinsic
 from numba.extending import intrinsic, register_jitable
 from numba.np.arrayobj import get_itemsize, make_array, populate_array
 from numpy.typing import NDArray
@@ -141,20 +147,76 @@ class _Part(_Kernel):
     lowering = _PartLowering
 
 
-def _sources() -> str:
-    """Hash of the files whose code and constants are compiled into kernels."""
-    core, digest = Path(__file__).parents[1], hashlib.sha256()
-    for folder in (core, core / "kernels", core / "posterior"):
-        for file in sorted(folder.glob("*.py")):
-            digest.update(file.read_bytes())
+def code_stamp(function: Callable[..., Any]) -> str:
+    """Hash of everything that is compiled into a kernel: its code, the functions that it calls, and their constants.
+
+    Comments, docstrings and other functions of the same files do not change it.
+
+    Raises:
+        TypeError: a kernel uses a global variable of another kind than a number, text, array, class, module or
+            function.
+    """
+    digest, seen = hashlib.sha256(), set[Any]()
+
+    def add(item: Any) -> None:
+        digest.update(repr(item).encode())
+
+    def visit_code(code: CodeType, names: Mapping[str, Any], docstring: str | None) -> None:
+        add((code.co_code, code.co_names, code.co_varnames, code.co_freevars))
+        for constant in code.co_consts:
+            if isinstance(constant, CodeType):
+                visit_code(constant, names, None)
+            elif constant is not docstring and constant is not None:  # the docstring's place holds None without one
+                add(sorted(constant, key=repr) if isinstance(constant, frozenset) else constant)
+        for name in code.co_names:
+            if name in names:
+                visit(name, names[name])
+
+    def visit(name: str, value: Any) -> None:
+        if isinstance(value, Dispatcher):
+            value = value.py_func
+        if isinstance(value, FunctionType):
+            if value not in seen:
+                seen.add(value)
+                add(_COMPILED_WITH.get(value))
+                cells = [cell.cell_contents for cell in value.__closure__ or ()]
+                names = {**value.__globals__, **dict(zip(value.__code__.co_freevars, cells, strict=True))}
+                visit_code(value.__code__, names, value.__code__.co_consts[0] if value.__doc__ else None)
+                for cell_name, cell in zip(value.__code__.co_freevars, cells, strict=True):
+                    visit(cell_name, cell)
+        elif isinstance(value, np.ndarray):
+            add((name, value.dtype.str, value.shape, value.tobytes()))
+        elif isinstance(value, type):
+            add((name, value.__qualname__, getattr(value, "_fields", None)))
+        elif isinstance(value, ModuleType | BuiltinFunctionType | np.ufunc | Intrinsic):
+            add((name, getattr(value, "__name__", "")))
+        elif isinstance(value, int | float | str | tuple | np.generic | None):
+            add((name, value))
+        else:
+            raise TypeError(f"{function.__qualname__} uses {name}, which no stamp covers: {type(value).__name__}")
+
+    visit(function.__name__, function)
     return digest.hexdigest()
 
 
-_SOURCES = _sources()
+# Own code that changes how kernels are compiled, and the options of each part.
+_COMPILER = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
+_COMPILED_WITH: dict[Any, str] = {}
 
 
 class _CacheFiles(caching.IndexDataCacheFile):
-    """Cache files of a kernel: each holds a checksum, the stamp of the kernel's dependencies, and the content."""
+    """Cache files of a kernel: each holds a checksum, the kernel's stamp, and the content."""
+
+    def __init__(self, path: str, function: Callable[..., Any]) -> None:
+        module = Path(inspect.getfile(function)).stem
+        name = f"{module}.{function.__qualname__}.py{sys.version_info[0]}{sys.version_info[1]}"
+        super().__init__(path, name.replace("<", "").replace(">", ""), None)
+        self._function = function
+
+    @functools.cached_property
+    def _stamp(self) -> tuple[str, str, str]:
+        """Computed at the first use, when the functions that are defined below the kernel exist."""
+        return numba.__version__, _COMPILER, code_stamp(self._function)
 
     def _load_index(self) -> dict[Any, str]:
         return self._read(self._index_path) or {}
@@ -180,10 +242,10 @@ class _CacheFiles(caching.IndexDataCacheFile):
         if hashlib.sha256(data).digest() != checksum:
             return _report(f"a file in {Path(path).parent} is damaged and is replaced")
         stamp, content = pickle.loads(data)
-        return pickle.loads(content) if stamp == self._source_stamp else None
+        return pickle.loads(content) if stamp == self._stamp else None
 
     def _write(self, path: str, content: Any) -> None:
-        data = pickle.dumps((self._source_stamp, self._dump(content)))
+        data = pickle.dumps((self._stamp, self._dump(content)))
         try:
             with self._open_for_write(path) as file:
                 file.write(hashlib.sha256(data).digest() + data)
@@ -206,16 +268,26 @@ def cached(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             compiled = njit(cache=True, **settings)(function)
         except RuntimeError:  # numba: "no locator available"
             return njit(**settings)(function)
+        _COMPILED_WITH[function] = _described(options)
         cache = compiled._cache  # numba has no public way to add dependencies of a cached kernel
-        stamp = numba.__version__, cache._cache_file._source_stamp, _SOURCES
-        cache._cache_file = _CacheFiles(cache._cache_path, f"{cache._impl.filename_base}.kept", stamp)
+        cache._cache_file = _CacheFiles(cache._cache_path, function)
         return compiled
 
     return decorated
 
 
 def _inner(**options: Any) -> Any:
-    return register_jitable(error_model="numpy", no_cfunc_wrapper=True, pipeline_class=_Part, **options)
+    register = register_jitable(error_model="numpy", no_cfunc_wrapper=True, pipeline_class=_Part, **options)
+
+    def decorated(function: Callable[..., Any]) -> Any:
+        _COMPILED_WITH[function] = _described(options)
+        return register(function)
+
+    return decorated
+
+
+def _described(options: Mapping[str, Any]) -> str:
+    return repr(sorted((name, sorted(x) if isinstance(x, set) else x) for name, x in options.items()))
 
 
 kernel = cached()
