@@ -12,6 +12,7 @@ from modules import CONFIG, H, K, W, frame
 from walks import SPGF
 
 from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch.checked import flat
 from ufmstar_torch.config import PAPER
 from ufmstar_torch.eval.engine.estimators import make_estimator
 from ufmstar_torch.eval.engine.networks import NetworkSource
@@ -21,7 +22,6 @@ from ufmstar_torch.models import Ensemble, wrap_network
 from ufmstar_torch.models.alignment import AlignedNetwork, Alignment
 from ufmstar_torch.networks_in_turn import NetworksInTurn
 from ufmstar_torch.prediction import DepthPrediction
-from ufmstar_torch.stateful import flat
 
 pytestmark = pytest.mark.numerics
 

@@ -13,12 +13,12 @@ from typing import Any, ClassVar, Final, Literal
 import torch
 from torch import Tensor
 
-from ufmstar_torch.checked import Checked, choice
+from ufmstar_torch.checked import Checked, choice, flat
 from ufmstar_torch.confidence import as_confidence
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Chosen, Extension, FrameExtension
 from ufmstar_torch.frame import FrameInput
-from ufmstar_torch.stateful import flat, plain
+from ufmstar_torch.stateful import plain
 
 VARIANCE: Final = "variance"
 CONFIDENCE: Final = "confidence"

@@ -6,9 +6,10 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ufmstar_torch.eval.engine.progress import Progress
+if TYPE_CHECKING:
+    from ufmstar_torch.eval.engine.progress import Progress
 
 
 class Bars:

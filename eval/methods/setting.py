@@ -13,10 +13,9 @@ from difflib import get_close_matches
 from types import MappingProxyType
 from typing import Any
 
-from ufmstar_torch.anchors.sources import CORNERS, DENSE, FILE_TYPES
-from ufmstar_torch.checked import Checked, choice, number
+from ufmstar_torch.anchors.names import CORNERS, DENSE, FILE_TYPES
+from ufmstar_torch.checked import Checked, choice, flat, number
 from ufmstar_torch.config import AnchorConfig, ConfidenceConfig, MergeConfig, PosteriorConfig, UfMStarConfig
-from ufmstar_torch.stateful import flat
 
 TRUTH = "truth"
 DEFAULTS, PAPER = "default", "paper"
