@@ -22,10 +22,10 @@ from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.run.machine import require_device
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError
+from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models import FastDepth, FastDepthWidths, MonodepthResNet, Preprocess
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.prediction import DepthPrediction
 
 _ERROR, _GRID = 0.03, 4  # [1] standard deviation of a network's smooth relative error, and its nodes per side
 Progress = Callable[[str], object]

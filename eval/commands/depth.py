@@ -6,17 +6,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ufmstar_torch.checked import flat
 from ufmstar_torch.config import SPGFConfig, UfMStarConfig
 from ufmstar_torch.eval.commands.options import MachineOptions, fields_of, option
 from ufmstar_torch.eval.methods.setting import DEFAULTS, PAPER, started
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_size
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
+from ufmstar_torch.runtime.checked import flat
 
 if TYPE_CHECKING:
     from ufmstar_torch.eval.engine.maps import MapSource
     from ufmstar_torch.eval.engine.predictions import DepthSource
-    from ufmstar_torch.recalibrate import Recalibration
+    from ufmstar_torch.posterior.recalibrate import Recalibration
 
 PRESETS = ("tum", "tartanair_indoor", "tartanair_outdoor")
 OWN_DEPTH = ("self", "ground-truth")
@@ -184,8 +184,8 @@ class UfMOptions:
             FileNotFoundError: the named file does not exist.
             ValueError: the file is no recalibration, or was fitted with other settings or to another network.
         """
-        from ufmstar_torch.recalibrate import Recalibration, recalibration_path
-        from ufmstar_torch.stream_warnings import LOGGER
+        from ufmstar_torch.frames.warnings import LOGGER
+        from ufmstar_torch.posterior.recalibrate import Recalibration, recalibration_path
 
         name = self.recalibration
         if name == "none" or (name is None and not (weights and recalibration_path(weights[0]).is_file())):

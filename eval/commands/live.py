@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ufmstar_torch.eval.run.rerun_log import RerunLog
     from ufmstar_torch.eval.sequences.live import LiveEvent
     from ufmstar_torch.live import LiveDepth, LiveResult, LiveStatistics
-    from ufmstar_torch.pipeline import UncertainDepth
+    from ufmstar_torch.uncertain_depth import UncertainDepth
 
 _STANDARD_INPUT, _SUMMARY = "-", "realtime.json"
 _ARRAYS = ("depth", "variance", "disagreement", "T_world_cam", "intrinsics")  # of an image's file
@@ -197,7 +197,7 @@ def _events(options: LiveOptions, K: NDArray[np.float64] | None) -> Iterator[Liv
     from ufmstar_torch.eval.check.image_fit import image_fit, track_corners
     from ufmstar_torch.eval.sequences import live as sources
     from ufmstar_torch.eval.sequences.open import open_sequence
-    from ufmstar_torch.stream_warnings import LOGGER
+    from ufmstar_torch.frames.warnings import LOGGER
 
     opening = options.opening
     if options.recorded:
@@ -221,7 +221,7 @@ def _model(options: LiveOptions) -> UncertainDepth:
     from ufmstar_torch.anchors.sources import DENSE
     from ufmstar_torch.eval.engine.anchors import landmarks_of
     from ufmstar_torch.eval.engine.warm_up import warm_up_command
-    from ufmstar_torch.pipeline import UncertainDepth
+    from ufmstar_torch.uncertain_depth import UncertainDepth
 
     chosen, source = options.network, options.network.load(options)
     config, anchors = options.uncertainty.config(), options.uncertainty.anchors

@@ -88,7 +88,7 @@ def _scores(options: RankOptions) -> ImageScores:
     from ufmstar_torch.eval.run.rank import ImageScores, require_part
     from ufmstar_torch.eval.run.run import warm_up_job
     from ufmstar_torch.eval.run.run_folder import Checkpoint
-    from ufmstar_torch.stream_warnings import LOGGER
+    from ufmstar_torch.frames.warnings import LOGGER
 
     scores, source = ImageScores(options.by, options.measured), None
     with Bars() as bars, stop_signals(bars.say) as stop:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from ufmstar_torch.eval.methods.row import Row
     from ufmstar_torch.eval.report.data import Results
-    from ufmstar_torch.recalibrate import Recalibration
+    from ufmstar_torch.posterior.recalibrate import Recalibration
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -163,7 +163,7 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
 
 def _without_images(options: Stream, sequence: FrameSequence) -> Stream:
     """The options, plain if the default anchors are searched in images that the sequence lacks."""
-    from ufmstar_torch.stream_warnings import LOGGER
+    from ufmstar_torch.frames.warnings import LOGGER
 
     ufm = options.uncertainty
     if not isinstance(ufm, PosteriorOptions) or ufm.plain or ufm.anchors is not None or _has_images(sequence):

@@ -14,8 +14,8 @@ from types import MappingProxyType
 from typing import Any
 
 from ufmstar_torch.anchors.names import CORNERS, DENSE, FILE_TYPES
-from ufmstar_torch.checked import Checked, choice, flat, number
 from ufmstar_torch.config import AnchorConfig, ConfidenceConfig, MergeConfig, PosteriorConfig, UfMStarConfig
+from ufmstar_torch.runtime.checked import Checked, choice, flat, number
 
 TRUTH = "truth"
 DEFAULTS, PAPER = "default", "paper"

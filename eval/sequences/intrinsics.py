@@ -102,7 +102,7 @@ def scale_intrinsics(K: np.ndarray, old: Size | None, new: Size | None) -> np.nd
     the aspect ratios differ, so the images were not only resized."""
     import torch
 
-    from ufmstar_torch.camera import resize_intrinsics
+    from ufmstar_torch.gaussians.camera import resize_intrinsics
 
     if old is None or new is None or old == new:
         return K.copy()

@@ -18,8 +18,8 @@ from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.anchors.landmarks import Landmarks, LandmarkSource
 from ufmstar_torch.anchors.names import CORNERS, DENSE, FILE_TYPES
 from ufmstar_torch.anchors.tracker import LandmarkTracker
-from ufmstar_torch.array_files import read_npz
-from ufmstar_torch.camera import invert_rigid
+from ufmstar_torch.files.arrays import read_npz
+from ufmstar_torch.gaussians.camera import invert_rigid
 
 # Largest number of landmarks in one image; a tracker follows 300.
 _MAX_VISIBLE = 500
