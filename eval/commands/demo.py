@@ -17,7 +17,7 @@ from ufmstar_torch.eval.commands.terminal import Bars
 
 _WEIGHTS = ("weights", "demo.safetensors")
 _WALK = 150  # frames of a whole walk; the first --frames of them are used, so that consecutive frames overlap
-_ROOMS = {"familiar": "home", "unfamiliar": "hall"}  # style by data set
+_ROOMS = {"unfamiliar": "hall", "familiar": "home"}  # style by data set
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +62,7 @@ read = reader(DemoOptions, "ufmstar demo")
 
 def main(options: DemoOptions) -> int:
     """Run the demo, and print its table; the exit code."""
+    from ufmstar_torch.eval.report.page import PAGE
     from ufmstar_torch.eval.run.folder import FolderError
 
     with usage_errors(FileNotFoundError, FolderError):
@@ -69,7 +70,12 @@ def main(options: DemoOptions) -> int:
         if not file.is_file():
             missing = f"the package was installed without {'/'.join(_WEIGHTS)}; --weights FILE names another"
             raise FileNotFoundError(f"--weights: no such file: {file}" if options.weights else missing)
-        return _onboard(options, file) if options.onboard else evaluate.main(evaluate.read(_words(options, file)))
+        if options.onboard:
+            return _onboard(options, file)
+        code = evaluate.main(evaluate.read(_words(options, file)))
+    if (page := options.out / PAGE).is_file():
+        print(f"open {page} in a browser")
+    return code
 
 
 def _words(options: DemoOptions, weights: Path) -> list[str]:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
+from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.run.colours import FAINT, INK, plain, require_matplotlib
 from ufmstar_torch.eval.run.files import write_atomic
 
@@ -43,6 +44,11 @@ def line_style(method: Method) -> LineStyle:
     fixed = " fixed-param" if method.fixed_param else ""
     style = ("#009E73", "D") if full else ("#CC79A7", "P") if fixed else ("#0072B2", "o")
     return LineStyle(f"UfM*{full}{fixed}", *style)
+
+
+def row_style(row: Row) -> LineStyle:
+    """The style of a row: "posterior" if it has one, else its method's."""
+    return LineStyle("posterior", "#1d1d1f", "P") if row.setting.posterior else line_style(row.method)
 
 
 def new_figure(width: float, height: float, title: str) -> Any:

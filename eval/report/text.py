@@ -36,7 +36,8 @@ _FOUND = {
 
 def summary(results: Results) -> str:
     """The main table of an evaluation, failed and missing sequences, and notes."""
-    parts = [markdown(main_table(results))]
+    shown = [None] if None in results.tabulated else results.tabulated
+    parts = [markdown(main_table(results, dataset)) for dataset in shown]
     if results.failed:
         parts.append("failed:\n" + "\n".join(f"  {f.dataset}, {f.sequence}: {f.reason}" for f in results.failed))
     if results.missing:
