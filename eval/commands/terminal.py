@@ -42,7 +42,7 @@ class Bars:
         bar.total = progress.total
         if progress.components is not None:
             skipped = {"skipped": progress.skipped} if progress.skipped else {}
-            bar.set_postfix(K=progress.components, refresh=False, **skipped)
+            bar.set_postfix(components=progress.components, refresh=False, **skipped)
         bar.update(progress.done - bar.n)
         if bar.disable and progress.done == progress.total:
             self.say(f"{stage}: done, {progress.total} of {progress.total}")
