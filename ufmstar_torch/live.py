@@ -111,7 +111,7 @@ class LiveDepth:
         intrinsics: of the images [px], [3, 3] or fx, fy, cx, cy; None = pass them to every ``push_image``.
         max_wait: longest wait for a pose after an image [s].
         max_gap: longest interval between the poses around an image, beyond which it is skipped [s].
-        state: file of ``model.state_dict()``, from which the model continues if the file exists, and to which the state
+        state: file of ``model.stream_state()``, from which the model continues if it exists, and to which the state
             is written atomically, every ``save_every`` seconds [s] and at the end. Delete the file for a new place.
             None = no file.
         save_every: see ``state``.
@@ -407,7 +407,7 @@ class LiveDepth:
 
     def _save(self) -> None:
         if self._state is not None:
-            values = self.model.state_dict()
+            values = self.model.stream_state()
             write_atomic(self._state, lambda file: torch.save(values, file))
             with self._changed:
                 self._counts["saved"] += 1
@@ -431,7 +431,7 @@ def load_state(model: UncertainDepth, file: Path) -> None:
     try:
         with file.open("rb") as opened:
             state = read_tensors(opened, "it")
-        model.load_state_dict(state)
+        model.load_stream_state(state)
     except (RuntimeError, TypeError, ValueError, OSError) as error:
         text = f"state {file} cannot be continued: {error}. Delete the file, or name another one, to begin anew"
         raise ValueError(text) from error
