@@ -24,7 +24,7 @@ from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.suite.job import EvalJob
-from ufmstar_torch.eval.suite.shards import evaluate_suite
+from ufmstar_torch.eval.suite.tasks import evaluate_suite
 from ufmstar_torch.eval.suite.work_items import find_work
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models import NetworkSpec, build_network, save_trained

@@ -41,8 +41,6 @@ class FolderKind:
     # the end.
     format: int | None = None
     lock: str | None = None  # path of the lock file below the folder; None = no lock
-    wait: float = 0.0  # longest time [s] to wait for the lock
-    parts: tuple[str, ...] = ()  # glob patterns of the locks of processes that work on parts
     allowed: tuple[str, ...] = ()  # entries that may exist in a folder before its manifest does
     # Glob patterns below the folder of temporary files of a killed process.
     temporary: tuple[str, ...] = (".*.tmp",)
@@ -87,26 +85,20 @@ class FolderKind:
         return True
 
     def clear(self, out: Path) -> None:
-        """Remove the files of earlier work, and the folders that are empty then. Raises FolderError: a process works on
-        a part of it."""
-        with ExitStack() as locks:
-            for path in [path for pattern in self.parts for path in out.glob(pattern)]:
-                if (lock := hold(path)) is None:
-                    raise FolderError(f"--out {out}: another process is working there now ({path.name})")
-                locks.callback(lock.release)
-            folders = set[Path]()
-            for pattern in self.files:
-                ours = self.recognise.get(pattern, lambda _: True)
-                for path in [path for path in out.glob(pattern) if path.is_file() and ours(path)]:
-                    path.unlink()
-                    folders |= set(path.parents[: len(path.relative_to(out).parents) - 1])
-            for folder in sorted(folders, key=lambda path: -len(path.parts)):
-                with suppress(OSError):  # files of others remain in it
-                    folder.rmdir()
+        """Remove the files of earlier work, and the folders that are empty then."""
+        folders = set[Path]()
+        for pattern in self.files:
+            ours = self.recognise.get(pattern, lambda _: True)
+            for path in [path for path in out.glob(pattern) if path.is_file() and ours(path)]:
+                path.unlink()
+                folders |= set(path.parents[: len(path.relative_to(out).parents) - 1])
+        for folder in sorted(folders, key=lambda path: -len(path.parts)):
+            with suppress(OSError):  # files of others remain in it
+                folder.rmdir()
 
     def require_no_links(self, out: Path) -> None:
         """Raises FolderError: a file or folder below ``out`` to which the program writes is a symbolic link."""
-        for name in (self.manifest, *filter(None, [self.lock]), *self.parts, *self.files):
+        for name in (self.manifest, *filter(None, [self.lock]), *self.files):
             parts = Path(name).parts
             for pattern in (str(Path(*parts[:length])) for length in range(1, len(parts) + 1)):
                 # glob omits links to nothing where a pattern has no wildcard
@@ -150,10 +142,9 @@ def output_folder(
     (out / kind.manifest).parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as locks:
         if kind.lock is not None:
-            lock = hold(out / kind.lock, wait=kind.wait)
+            lock = hold(out / kind.lock)
             if lock is None:
-                for_long = f" for over {kind.wait:g} s" if kind.wait else ""
-                raise FolderError(f"--out {out}: another {kind.noun} is writing there now{for_long}")
+                raise FolderError(f"--out {out}: another {kind.noun} is writing there now")
             locks.callback(lock.release)
         # Check again, because another process may have created the folder while this one waited.
         resumed = kind.earlier(out, resume=resume, overwrite=overwrite) and resume
