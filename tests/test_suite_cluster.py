@@ -20,7 +20,7 @@ from ufmstar_torch.eval.suite import tasks
 from ufmstar_torch.eval.suite.tasks import evaluate_suite
 
 pytest.importorskip("distributed")
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 
 @contextmanager
@@ -46,12 +46,12 @@ def cluster(folder, workers=2):
 
 
 def until(condition):
-    """Wait, at most two minutes, until a condition holds."""
-    for _ in range(2400):
+    """Wait, at most five minutes, until a condition holds."""
+    for _ in range(6000):
         if condition():
             return
         time.sleep(0.05)
-    raise AssertionError("it did not happen within two minutes")
+    raise AssertionError("it did not happen within five minutes")
 
 
 def acting(folder, **acts):

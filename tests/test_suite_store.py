@@ -125,7 +125,7 @@ def test_overwriting_removes_our_files_alone(tmp_path):
     assert all(file.read_text() == "mine" for file in users)
     assert [file.exists() for file in made] == [False, False, True]
     after = {path.name for path in out.rglob("*") if path.is_file()}
-    assert after == {"eval.json", "eval.lock", ".writable", "kept", *(file.name for file in users)}
+    assert after == {"eval.json", "eval.lock", "kept", *(file.name for file in users)}
 
 
 def test_a_folder_is_evaluated_by_one_process(tmp_path):

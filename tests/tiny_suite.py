@@ -97,10 +97,10 @@ def rows_of(*names, **setting):
     return tuple(row(name, **setting) for name in names)
 
 
-def evaluate(sequence, rows, networks, store=None, *, sinks=(), progress=lambda _: None, stop=lambda: False, **judge):
+def evaluate(sequence, rows, networks, store=None, *, progress=lambda _: None, stop=lambda: False, **options):
     """Evaluate a sequence on the CPU: {slug of the row: result}."""
-    how = Judge(networks, CPU, store, **judge)
-    results = evaluate_sequence(sequence, rows, how, sinks=sinks, progress=progress, stop=stop)
+    examples, judge = options.pop("examples", None), Judge(networks, CPU, store, **options)
+    results = evaluate_sequence(sequence, rows, judge, examples=examples, progress=progress, stop=stop)
     assert [result.row for result in results] == list(rows)
     return {result.row.slug: result for result in results}
 

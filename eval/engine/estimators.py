@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.config import UfMStarConfig
@@ -33,13 +33,7 @@ _OF_OUTPUT = (
 
 
 class Estimator(ABC):
-    """Computes variances from the predictions of a sequence, frame by frame.
-
-    Attributes:
-        module: its buffers are the state; without buffers by default.
-    """
-
-    module: nn.Module = nn.Identity()
+    """Computes variances from the predictions of a sequence, frame by frame."""
 
     def __init__(self, *, uses_variances: bool = True) -> None:
         self._uses_variances = uses_variances
@@ -64,14 +58,6 @@ class Estimator(ABC):
         """Size of the state: "bytes", "count" of points or components, "smoothing_bytes" of the smoothing map [B]; with
         anchors also "anchors", the number used in the frame. {} without a state."""
         return {}
-
-    def state(self) -> dict[str, Tensor]:
-        """All tensors on which the next frame depends."""
-        return dict(self.module.state_dict())
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue from ``state``. Raises RuntimeError: it belongs to another kind of estimator."""
-        self.module.load_state_dict(dict(state))
 
 
 def make_estimator(
@@ -139,10 +125,6 @@ class Pointwise(Estimator):
         out = self.ufm(used.depth, T_world_cam, prediction.K, a, e)
         return {"depth": used.depth, "variance": out.variance, "valid": out.valid, "aleatoric": a, "epistemic": e}
 
-    def state(self) -> dict[str, Tensor]:
-        """Raises TypeError: the state of UfM cannot be saved."""
-        raise TypeError("a row of UfM cannot be continued within a sequence: only UfM* has a state that can be saved")
-
     def memory(self) -> dict[str, float]:
         """Bytes and number of the points."""
         cloud = self.ufm.cloud
@@ -164,7 +146,7 @@ class Gaussians(Estimator):
     ) -> None:
         super().__init__(uses_variances=uses_variances)
         extensions = () if recalibration is None else (recalibration,)
-        self.module = self.ufm = UfMStar(config, extensions=extensions, device=device)
+        self.ufm = UfMStar(config, extensions=extensions, device=device)
         self._posterior, self._anchors = posterior, 0
 
     def update(self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:

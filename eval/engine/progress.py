@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
+from ufmstar_torch.eval.engine.stream import FrameResult
 
 
 @dataclass(frozen=True)
@@ -19,19 +19,17 @@ class Progress:
     skipped: int = 0  # number of frames skipped so far
 
 
-class ProgressSink(FrameSink):
-    """Calls ``progress`` at the start and after every frame; ``skipped`` is the initial count of skipped frames."""
+class FrameProgress:
+    """Shows the progress over ``total`` frames: at the start, and after every frame."""
 
-    def __init__(self, progress: Callable[[Progress], object], skipped: int = 0) -> None:
-        self._progress, self._skipped = progress, skipped
+    def __init__(self, show: Callable[[Progress], object], total: int) -> None:
+        self._show, self._total, self._skipped = show, total, 0
+        show(Progress("frames", 0, total))
 
-    def begin(self, stream: FrameStream) -> None:
-        self._total = len(stream.indices)
-        self._progress(Progress("frames", stream.position, self._total, None, self._skipped))
-
-    def take(self, result: FrameResult) -> None:
+    def add(self, result: FrameResult) -> None:
+        """Show that a frame is done."""
         self._skipped += bool(result.skipped)
         each = (row.statistics for row in result.rows.values())
         statistics = next((one for one in each if one is not None), None)
         components = None if statistics is None else int(statistics.components[0])
-        self._progress(Progress("frames", result.number + 1, self._total, components, self._skipped))
+        self._show(Progress("frames", result.number + 1, self._total, components, self._skipped))

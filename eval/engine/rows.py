@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,9 +23,6 @@ from ufmstar_torch.frames.frame import FRAME_FAULTS
 from ufmstar_torch.frames.output import FrameStatistics
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.posterior.distribution import DepthDistribution
-
-# Prefixes of the tensors of a row's state.
-_IMAGES, _ESTIMATOR, _TRACKER, _DRIFT = "image_index", "ufm.", "tracker.", "drift."
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -173,24 +169,5 @@ class RowRunner:
         """``Estimator.memory``, with the bytes of the anchors' tracks or evidence."""
         memory = self.estimator.memory()
         if self._tracks is not None:
-            memory["bytes"] += sum(value.nbytes for value in self._tracks.state().values())
+            memory["bytes"] += self._tracks.bytes
         return memory
-
-    def state(self) -> dict[str, Tensor]:
-        """All tensors on which the next frame depends; networks have no state."""
-        anchors = {} if self._tracks is None else self._tracks.state()
-        parts = ((_ESTIMATOR, self.estimator.state()), (_TRACKER, anchors), (_DRIFT, self._drift.state()))
-        tensors = {prefix + name: value for prefix, state in parts for name, value in state.items()}
-        return {_IMAGES: torch.tensor(self.images), **tensors}
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue from ``state``. Raises ValueError: it belongs to another kind of row."""
-
-        def part(prefix: str) -> dict[str, Tensor]:
-            return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
-
-        self.images = int(state[_IMAGES])
-        self.estimator.load_state(part(_ESTIMATOR))
-        if self._tracks is not None:
-            self._tracks.load_state(part(_TRACKER))
-        self._drift.load_state(part(_DRIFT))

@@ -36,28 +36,17 @@ def frame_arrays(frame: Frame | None, row: RowResult) -> dict[str, NDArray[Any]]
     return arrays | {"anchors": torch.cat(columns, dim=1).float().numpy()}
 
 
-def frame_record(result: FrameResult, key: str, writing: float, saving: float) -> dict[str, Any]:
+def frame_record(result: FrameResult, key: str, ms: Mapping[str, float]) -> dict[str, Any]:
     """The line of frames.jsonl of a frame: state, figures and times [ms] of the row ``key``, or why it was skipped.
-    ``writing`` and ``saving`` are the times to write its files and the previous checkpoint [ms]."""
+    ``ms`` has the times of "metrics" and "write" [ms]."""
     about: dict[str, Any] = {"index": result.index, "name": result.name}
     if result.frame is not None and result.frame.timestamp is not None:
         about["timestamp"] = result.frame.timestamp
     if key not in result.rows:
         return {**about, "state": "skipped", "reason": result.skipped[key]}
     row = result.rows[key]
-    times = {"ms": _times(result, row, writing, saving)}
+    times = {"ms": _times(result, row, ms)}
     return {**about, "state": "done", **_figures(row), **times, **_anchor_figures(row)}
-
-
-def missing_figure(record: Mapping[str, Any]) -> str | None:
-    """The first figure that the record of a finished frame lacks, or that is no number, or None."""
-    means = ("mean_disagreement", "mean_sigma", "mean_network_sigma")
-    for name in (*_COUNTS, "near_zero", *means):
-        value = record.get(name, "none")
-        if not (isinstance(value, int | float) or (value is None and name in means)):
-            return name
-    complete = isinstance(record.get("ground_truth"), bool) and isinstance(record.get("ms"), Mapping)
-    return None if complete and isinstance(record.get("size"), list) else "ground_truth, ms or size"
 
 
 def _figures(row: RowResult) -> dict[str, Any]:
@@ -82,17 +71,16 @@ def _figures(row: RowResult) -> dict[str, Any]:
     }
 
 
-def _times(result: FrameResult, row: RowResult, writing: float, saving: float) -> dict[str, float]:
-    """Times by stage [ms]; stages overlap. "prepare" is the prediction's time without the network's, "save" the
-    previous frame's, "cycle" the time since the previous frame."""
+def _times(result: FrameResult, row: RowResult, after: Mapping[str, float]) -> dict[str, float]:
+    """Times by stage [ms]; stages overlap. "prepare" is the prediction's time without the network's, "cycle" the time
+    since the previous frame."""
     ms = result.ms
     return {
         "read": ms["read"],
         **{stage: row.ms[stage] for stage in ("network", "anchors") if stage in row.ms},
         "ufm": row.ms["uncertainty"],
-        "metrics": ms["truth"] + ms["metrics"],
-        "write": writing,
-        "save": saving,
+        "metrics": ms["truth"] + after["metrics"],
+        "write": after["write"],
         "prepare": ms["predict"] - row.ms.get("network", 0.0),
         "cycle": ms["cycle"],
     }

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.eval.engine.judge import UFM
 from ufmstar_torch.eval.engine.predictions import FramePredictions
-from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink
+from ufmstar_torch.eval.engine.stream import FrameResult
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.panels import FramePanel
 from ufmstar_torch.eval.run.pictures import panel_of
@@ -44,7 +44,7 @@ class RankedImage:
     depth: float
 
 
-class ImageScores(FrameSink):
+class ImageScores:
     """Scores the ``images`` of sequences, in the order of processing.
 
     Args:
@@ -60,7 +60,7 @@ class ImageScores(FrameSink):
         self.images: list[RankedImage] = []
         self._shown: list[tuple[float, int, FramePanel]] = []  # score, number of the image, picture
 
-    def take(self, result: FrameResult) -> None:
+    def add(self, result: FrameResult) -> None:
         """Score an image."""
         row = result.rows.get(UFM)
         if row is None or result.frame is None:
