@@ -77,7 +77,7 @@ class RemovedHalf:
         if UFM not in result.rows:
             return
         row, frame = result.rows[UFM], self._whole[result.index]
-        if frame.depth is None or row.posterior_depth is None or row.landmarks is None:
+        if frame.depth is None or not row.corrected or row.landmarks is None:
             return
         causes = removed(frame.depth, result.index)
         for cause, gone in {"all": np.any([*causes.values()], axis=0), **causes}.items():
@@ -85,8 +85,8 @@ class RemovedHalf:
             truth = truth_at(replace(frame, depth=hidden), row.intrinsics, row.size)
             assert truth is not None
             target = torch.from_numpy(truth)
-            self.network[cause].update(row.depth, row.variance, target, row.valid)
-            self.posterior[cause].update(row.posterior_depth, row.posterior_variance, target, row.valid, row.mixture)
+            self.network[cause].update(row.prediction.depth[0], row.map("ufm_variance"), target, row.valid)
+            self.posterior[cause].update(row.depth, row.variance, target, row.valid, row.mixture)
         self.anchors.append(len(row.landmarks.depth))
 
 

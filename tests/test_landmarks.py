@@ -246,9 +246,9 @@ def test_a_model_with_a_source_equals_one_that_is_given_its_anchors(tour, file):
         assert torch.equal(corners(image[None], T, K).variance, expected.variance)
         stacked = image[None].expand(2, -1, -1, -1) if i % 2 else image[None].expand(2, -1, -1, -1).float() / 255
         out = both(stacked, T.expand(2, 4, 4), K.expand(2, 3, 3))
-        assert out.ufm.statistics.anchors[1] > 0
+        assert out.statistics.anchors[1] > 0
     torch.testing.assert_close(out.variance[0], expected.variance[0], rtol=1e-4, atol=1e-6)
-    assert expected.ufm.statistics.anchors_used > 0
+    assert expected.statistics.anchors_used > 0
 
 
 def test_its_state_continues_and_errors_change_nothing(tour):
@@ -286,7 +286,7 @@ def test_a_skipped_frame_is_forgotten_by_its_source(tour):
     frames, model, clean = pictures(tour), wrapped("corners"), wrapped("corners")
     for i, (image, T, K) in enumerate(frames):
         if i == 3:
-            assert model(image[None], 1.1 * T, K).ufm.statistics.fault
+            assert model(image[None], 1.1 * T, K).statistics.fault
         out, expected = model(image[None], T, K), clean(image[None], T, K)
     assert torch.equal(out.variance, expected.variance)
     model.reset([0])
@@ -305,7 +305,7 @@ def test_a_bad_frame_of_one_stream_stops_neither_it_nor_the_others(tour, kind, a
         if i == 3:
             both[argument] = torch.stack([change(both[argument][0]), both[argument][1]])
         out = model(*both)
-        assert (out.ufm.statistics.fault > 0).tolist() == [i == 3, False]
+        assert (out.statistics.fault > 0).tolist() == [i == 3, False]
         torch.testing.assert_close(out.variance[1], expected.variance[1], rtol=1e-6, atol=1e-9)
         assert model.landmarks.last[0].none.startswith(("pose", "intrinsics") if i == 3 else ("no ", "poses"))
     assert bool(out.variance[0].isfinite().all())

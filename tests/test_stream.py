@@ -67,7 +67,7 @@ def test_an_unreadable_frame_is_skipped_by_the_rows_that_select_it_and_takes_no_
     rows = [in_turn("all"), in_turn("odd", setting=Setting(skip=2))]
     results = results_of(watched, range(FRAMES), rows)
     assert [dict(result.skipped) for result in results if result.skipped] == [{"all": "cannot be decoded"}]
-    members = [result.rows["all"].member for result in results if "all" in result.rows]
+    members = [result.rows["all"].out.member for result in results if "all" in result.rows]
     assert members == [0, 1, 0, 1, 0]
     assert results[2].frame is None
 
@@ -82,7 +82,7 @@ def test_a_frame_that_the_estimator_refuses_takes_a_turn(sequence):
     runner = RowRunner("row", source, estimator, skips_faults=True)
     results = results_of(replace(sequence, entries=tuple(entries)), range(4), [runner])
     assert "not orthonormal" in results[1].skipped["row"]
-    assert [result.rows["row"].member for result in results if result.rows] == [0, 0, 1]
+    assert [result.rows["row"].out.member for result in results if result.rows] == [0, 0, 1]
 
 
 def test_ground_truth_is_at_the_pixels_of_each_rows_maps(sequence):
@@ -95,7 +95,7 @@ def test_ground_truth_is_at_the_pixels_of_each_rows_maps(sequence):
     results = results_of(sequence, range(1), rows)
     depth = results[-1].rows["depth"]
     np.testing.assert_array_equal(depth.truth, depth.depth.numpy())
-    assert depth.member is None
+    assert depth.out.member is None
     assert "network" not in depth.ms
 
 
@@ -130,7 +130,7 @@ def test_predictions_of_a_cache_give_the_same_bits_and_run_no_network(sequence, 
     first, again = cached(), cached(at=0, then=never)
     assert len(list(tmp_path.rglob("*@*.npz"))) == FRAMES
     for one, other in zip(first, again, strict=True):
-        for name in ("depth", "variance", "disagreement", "aleatoric", "network_variance"):
-            np.testing.assert_array_equal(getattr(other.rows["row"], name), getattr(one.rows["row"], name))
+        for name in ("depth", "variance", "disagreement", "aleatoric"):
+            np.testing.assert_array_equal(other.rows["row"].map(name), one.rows["row"].map(name))
         assert "network" in one.rows["row"].ms
         assert "network" not in other.rows["row"].ms

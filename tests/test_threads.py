@@ -61,7 +61,7 @@ def test_a_second_thread_is_refused_by_name_and_changes_nothing():
     network.go_on.set()
     thread.join()
     assert model.image_index == 2
-    assert model(IMAGE, POSE, K).ufm.statistics.fault.tolist() == [0], "the module goes on"
+    assert model(IMAGE, POSE, K).statistics.fault.tolist() == [0], "the module goes on"
     assert model.ufm.frames.tolist() == [3]
 
 

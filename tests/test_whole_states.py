@@ -31,7 +31,7 @@ class Warner(Recalibration):
 
     loud = False
 
-    def map_variance(self, variance):
+    def mapped(self, variance, confidence):
         if self.loud:
             warnings.warn("after the step", RuntimeWarning, stacklevel=2)
         return variance
@@ -78,7 +78,7 @@ def test_a_frame_that_raises_leaves_everything_as_it_was(kind):
     image, pose, intrinsics = frame(3)
     broken = pose.copy()
     broken[0, 3] = np.nan
-    warner = model.ufm._extensions.each[-1]
+    warner = model.ufm.recalibration
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(ValueError, match="stream 0: pose holds NaN"):

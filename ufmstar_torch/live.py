@@ -33,10 +33,11 @@ from ufmstar_torch.frames.arguments import (
 )
 from ufmstar_torch.frames.clock import JUMP, StreamClock, Verdict
 from ufmstar_torch.frames.frame import FRAME_FAULTS, pose_fault
+from ufmstar_torch.frames.output import UncertaintyOutput
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.gaussians.camera import rotation_deviation
 from ufmstar_torch.gaussians.trajectory import SAME_TIME, Trajectory, interpolate_pose
-from ufmstar_torch.uncertain_depth import UncertainDepth, UncertainPrediction
+from ufmstar_torch.uncertain_depth import UncertainDepth
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
@@ -58,7 +59,7 @@ class LiveResult:
     stamp: float  # of the image, as it was pushed [s]
     image: ImageLike  # as it was pushed (a copy)
     T_world_cam: np.ndarray  # [4, 4] float64, interpolated at the stamp [m]
-    out: UncertainPrediction  # depth, variance and the rest
+    out: UncertaintyOutput  # depth, variance and the rest
     received: float  # when the image was pushed
     started: float  # when its pose was available and the network began
     finished: float  # when the variance was computed
@@ -395,7 +396,7 @@ class LiveDepth:
         started = perf_counter()
         out = self.model(frame.image, T, frame.intrinsics)
         finished = perf_counter()
-        if fault := int(out.ufm.statistics.fault[0]):
+        if fault := int(out.statistics.fault[0]):
             with self._changed:
                 self._skip(FRAME_FAULTS[fault], frame.stamp)
             return False

@@ -41,7 +41,7 @@ from ufmstar_torch.frames.networks import (
     shared_preprocess,
     weights_mark,
 )
-from ufmstar_torch.frames.output import FrameStatistics, MeanUncertainty, UfMStarOutput
+from ufmstar_torch.frames.output import FrameStatistics, MeanUncertainty, UncertaintyOutput
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.posterior.recalibrate import Recalibration
@@ -57,67 +57,12 @@ _MISSED = "UfM* alone, without anchors and the depth that the posterior corrects
 
 
 @dataclass(frozen=True)
-class UncertainPrediction:
-    """The depth of an image and its variance: the posterior's, or, without a posterior, the network's depth with the
-    variance of UfM*. Before a stream's first anchor, the posterior's depth is the network's, with a large variance.
-
-    Attributes:
-        prediction: the network's output (for "full": the predictive mean, mean A and E over the members).
-        ufm: the output of UfM* for the network's depth: V, M, A, E and B, ``measured`` and the counts.
-        member: index of the network that was run; None if all were, or none.
-    """
-
-    prediction: DepthPrediction
-    ufm: UfMStarOutput
-    member: int | None
-
-    @property
-    def depth(self) -> Tensor:
-        """[B, H, W] [m]; the posterior's is NaN where not valid."""
-        corrected = self.ufm.posterior_depth
-        return self.prediction.depth if corrected is None else corrected
-
-    @property
-    def intrinsics(self) -> Tensor:
-        """[B, 3, 3] of the depth map [px]."""
-        return self.prediction.K
-
-    @property
-    def variance(self) -> Tensor:
-        """[B, H, W] of ``depth`` [m^2], NaN where not valid."""
-        corrected = self.ufm.posterior_variance
-        return self.ufm.variance if corrected is None else corrected
-
-    @property
-    def std(self) -> Tensor:
-        """[B, H, W] square root of ``variance`` [m]."""
-        return self.variance.sqrt()
-
-    @property
-    def disagreement(self) -> Tensor:
-        """[B, H, W] M [m^2]."""
-        return self.ufm.disagreement
-
-    def interval(self, level: float) -> tuple[Tensor, Tensor]:
-        """As :meth:`UfMStarOutput.interval`, [B, H, W] [m]."""
-        return self.ufm.interval(level)
-
-    def probability_nearer(self, than: float | Tensor) -> Tensor:
-        """As :meth:`UfMStarOutput.probability_nearer`, [B, H, W]."""
-        return self.ufm.probability_nearer(than)
-
-    def probability_between(self, near: float | Tensor, far: float | Tensor) -> Tensor:
-        """As :meth:`UfMStarOutput.probability_between`, [B, H, W]."""
-        return self.ufm.probability_between(near, far)
-
-
-@dataclass(frozen=True)
 class _Predicted:
     """A prediction that is being copied to UfM*'s device.
 
     Attributes:
         image, pose, intrinsics: the image and its camera, as tensors.
-        prediction, member: as in :class:`UncertainPrediction`.
+        prediction, member: as in :class:`UncertaintyOutput`.
         features: [B, F, H, W] for UfM*, or None.
         ready: recorded after the copies; None = no copy to wait for.
     """
@@ -191,7 +136,7 @@ class UncertainDepth(NetworksInTurn):
         model = UncertainDepth(network)
         for image, pose, intrinsics in video:  # [H, W, 3] uint8, [4, 4], [3, 3]
             out = model(image, pose, intrinsics)
-            out.depth, out.std  # corrected [m]; the network's are in out.prediction, M, A, E and B in out.ufm
+            out.depth, out.std  # corrected [m]; the network's depth is out.network_depth, M is out.disagreement
     """
 
     image_index: Tensor
@@ -236,8 +181,7 @@ class UncertainDepth(NetworksInTurn):
             config = config.replace(anchors=config.anchors or AnchorConfig())
         if posterior:
             config = config.replace(posterior=config.posterior or PosteriorConfig())
-        mapped = () if recalibration is None else (recalibration,)
-        self.ufm = UfMStar(config.within(self.max_depth, self.states_confidence), extensions=mapped)
+        self.ufm = UfMStar(config.within(self.max_depth, self.states_confidence), recalibration=recalibration)
         self.landmarks = None if anchors is None else StreamLandmarks(anchors)
         self._unsearchable = False  # whether an image could not be searched for anchors
         self._searched = False  # whether the source of anchors has processed the current image
@@ -275,7 +219,7 @@ class UncertainDepth(NetworksInTurn):
         *,
         features: Array | None = None,
         anchors: Anchors | None = None,
-    ) -> UncertainPrediction:
+    ) -> UncertaintyOutput:
         """Predict depth and its variance for the next image of every stream.
 
         Args:
@@ -296,7 +240,7 @@ class UncertainDepth(NetworksInTurn):
     if TYPE_CHECKING:
         __call__ = forward
 
-    def stream(self, frames: Iterable[tuple[ImageLike, CameraLike, CameraLike]]) -> Iterator[UncertainPrediction]:
+    def stream(self, frames: Iterable[tuple[ImageLike, CameraLike, CameraLike]]) -> Iterator[UncertaintyOutput]:
         """The predictions of a video, in order, with the networks one image ahead of UfM*.
 
         With networks on a GPU and ``multiview_device="cpu"``, both run at the same time. Each result is yielded after
@@ -330,7 +274,7 @@ class UncertainDepth(NetworksInTurn):
         *,
         features: Array | None = None,
         anchors: Anchors | None = None,
-    ) -> UncertainPrediction:
+    ) -> UncertaintyOutput:
         """Process an existing prediction, for example a cached one, as :meth:`forward` does after its networks.
 
         Args:
@@ -345,12 +289,12 @@ class UncertainDepth(NetworksInTurn):
         """
         require_kind("prediction", prediction, DepthPrediction, "a DepthPrediction")
         maps = maps_of(prediction, self.ufm)
-        ufm = self.ufm(pose=pose, intrinsics=intrinsics, valid=valid, features=features, anchors=anchors, **maps)
+        out = self.ufm(pose=pose, intrinsics=intrinsics, valid=valid, features=features, anchors=anchors, **maps)
         self._count(self._next + 1)
         if prediction.intrinsics is None:
             K = as_intrinsics(intrinsics)
             prediction = replace(prediction, intrinsics=K.expand(len(prediction.depth), 3, 3))
-        return UncertainPrediction(prediction, ufm, None)
+        return replace(out, prediction=prediction)
 
     def mean_uncertainty(
         self,
@@ -429,10 +373,10 @@ class UncertainDepth(NetworksInTurn):
 
     def _fused(
         self, predicted: _Predicted, valid: Array | None = None, anchors: Anchors | None = None
-    ) -> UncertainPrediction:
+    ) -> UncertaintyOutput:
         with self._anchored(predicted, anchors) as (found, p):
             out = self.update(p, predicted.pose, p.K, valid, features=predicted.features, anchors=found)
-        self._undo(out.ufm.statistics)
+        self._undo(out.statistics)
         return replace(out, member=predicted.member)
 
     @contextmanager
@@ -632,7 +576,7 @@ def maps_of(prediction: DepthPrediction, ufm: UfMStar) -> dict[str, Any]:
         "member": prediction.member,
         "informative": prediction.informative,
     }
-    return maps | ({"confidence": prediction.confidence} if ufm.takes("confidence") else {})
+    return maps | ({"confidence": prediction.confidence} if ufm.uses_confidence else {})
 
 
 def _missed(networks: object) -> str:

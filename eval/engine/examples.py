@@ -77,7 +77,7 @@ class ExampleWriter:
         first = next(iter(scenes.values()))
         _write(folder / f"{frame.name}.npz", {**first, "index": np.array(frame.index)})
         for key, row in result.rows.items():
-            maps = {part: getattr(row, part) for part in _MAPS}
+            maps = {part: row.map(part) for part in _MAPS}
             arrays = {part: value.float().numpy() for part, value in maps.items() if value is not None}
             scene = scenes[key]
             same_camera = scene["truth"].shape == first["truth"].shape and np.array_equal(scene["K"], first["K"])

@@ -66,11 +66,12 @@ class RunMetrics:
         if row.truth is None:
             return
         target = torch.from_numpy(row.truth)
-        maps: dict[str, tuple[Tensor, Tensor | None]] = {UFM: (row.depth, row.variance)}
-        maps |= {} if row.network_variance is None else {ALONE: (row.depth, row.network_variance)}
-        if row.posterior_depth is not None:
-            maps[POSTERIOR] = row.posterior_depth, row.posterior_variance
-        corrected = POSTERIOR if POSTERIOR in maps else UFM
+        depth = row.prediction.depth[0]
+        maps: dict[str, tuple[Tensor, Tensor | None]] = {UFM: (depth, row.map("ufm_variance"))}
+        maps |= {} if row.network_variance is None else {ALONE: (depth, row.network_variance)}
+        if row.corrected:
+            maps[POSTERIOR] = row.depth, row.variance
+        corrected = POSTERIOR if row.corrected else UFM
         for name, (depth, variance) in maps.items():
             mixture, level = row.mixture if name == POSTERIOR else None, row.level if name == corrected else None
             masks = {name: row.valid, **{f"{name}.{part}": row.valid & mask for part, mask in row.parts.items()}}
@@ -124,8 +125,9 @@ class RowJudge:
             self._add(result.rows[self.row.slug], result.rows)
 
     def _add(self, result: RowResult, rows: Mapping[str, RowResult]) -> None:
-        if result.statistics is not None:
-            segments, matched = (int(count[0]) for count in (result.statistics.segments, result.statistics.matched))
+        statistics, multiview = result.out.statistics, self.row.method.fusion == method.UFM_STAR
+        if multiview:
+            segments, matched = (int(count[0]) for count in (statistics.segments, statistics.matched))
             # In the first frame there is no component to match.
             self._idle.update(without_segment=int(not segments), without_match=int(bool(self._ms) and not matched))
         self._ms.append(result.ms)
@@ -139,15 +141,15 @@ class RowJudge:
             torch.where(result.valid, result.depth, torch.nan), result.variance, torch.from_numpy(result.truth)
         )  # fmt: skip
         how = {"with_variance": variance is not None, "bins": self._bins, "plugins": self._plugins}
-        mixture = result.mixture if self.row.setting.posterior else None
+        mixture = result.mixture
         level = None if variance is None else result.level
         metrics_of(self._metrics, METRICS, **how).update(depth, variance, target, mixture=mixture, level=level)
         for part, mask in result.parts.items():
             metrics_of(self._metrics, part, **how).update(depth, variance, target, mask, mixture, level)
         if variance is None:
             return
-        if result.confidence is not None:
-            self._samples.append(_samples(result.confidence, depth, variance, target))
+        if multiview and (confidence := result.prediction.confidence) is not None:
+            self._samples.append(_samples(confidence[0], depth, variance, target))
         for other, name in self._references.items():
             by_error = self._by_error.setdefault(f"{BY_ERROR}:{name}", NLLByError(sync_on_compute=False))
             by_error.update(depth, variance, target, rows[other].confident)

@@ -15,7 +15,7 @@ class Progress:
     stage: str  # "kernels" (compiled on a machine's first run), "rooms", "frames" or "pictures"
     done: int  # number of finished steps of this stage, skipped frames included
     total: int  # number of steps of this stage
-    components: int | None = None  # of the first row with UfM*; None if it skipped the frame, and before the first one
+    components: int | None = None  # of the first row with components; None before the first frame
     skipped: int = 0  # number of frames skipped so far
 
 
@@ -29,7 +29,6 @@ class FrameProgress:
     def add(self, result: FrameResult) -> None:
         """Show that a frame is done."""
         self._skipped += bool(result.skipped)
-        each = (row.statistics for row in result.rows.values())
-        statistics = next((one for one in each if one is not None), None)
-        components = None if statistics is None else int(statistics.components[0])
+        each = (int(row.out.statistics.components[0]) for row in result.rows.values())
+        components = next((count for count in each if count), None)
         self._show(Progress("frames", result.number + 1, self._total, components, self._skipped))

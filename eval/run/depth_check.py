@@ -21,7 +21,8 @@ class DepthCheck:
         """Keep the depth map if corners begin in this frame."""
         row = result.rows.get(UFM)
         if row is not None and result.frame is not None and result.index in self._first:
-            self._maps[result.index] = row.depth.numpy(), row.valid.numpy(), row.intrinsics, result.frame.intrinsics
+            depth, valid = row.prediction.depth[0].numpy(), row.valid.numpy()
+            self._maps[result.index] = depth, valid, row.intrinsics, result.frame.intrinsics
 
     def fit(self) -> DepthFit | None:
         """Compare; None if the motion is too small, or if the poses contradict the images."""

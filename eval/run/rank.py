@@ -22,7 +22,7 @@ from ufmstar_torch.eval.sequences.frame import FrameError
 from ufmstar_torch.frames.choose import choose
 from ufmstar_torch.steps.sample import sample_statistics
 
-# The quantities for ranking, V, M, A, E and B, and their maps in ``RowResult``.
+# The quantities for ranking, V, M, A, E and B, and their maps.
 PARTS = {
     "total": "variance", "disagreement": "disagreement", "aleatoric": "aleatoric", "epistemic": "epistemic",
     "anchored": "anchored",
@@ -67,11 +67,12 @@ class ImageScores:
             return
         parts = {}
         for name, of in PARTS.items():
-            if (values := getattr(row, of)) is not None:
+            if (values := row.map(of)) is not None:
                 masked = torch.where(row.valid, values, torch.nan).flatten()[None]
                 parts[name] = {key: float(value) for key, value in asdict(sample_statistics(masked)).items()}
-        assert row.measured is not None
-        share = float((row.measured >= 0.5)[row.valid].float().mean())
+        measured = row.map("measured")
+        assert measured is not None
+        share = float((measured >= 0.5)[row.valid].float().mean())
         score = parts[self._by]["mean"] if share >= self._measured else float("nan")
         columns = {f"{n}_{key}_{unit}": one[key] for n, one in parts.items() for key, unit in _UNITS.items()}
         line = {"sequence": self.sequence, "frame": result.name, "measured": share, **columns}

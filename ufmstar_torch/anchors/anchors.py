@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.frames.arguments import require_float, require_mask
-from ufmstar_torch.frames.frame import FrameInput
+from ufmstar_torch.frames.frame import AnchorInput, FrameInput
 from ufmstar_torch.gaussians.fixed_order import apply, product
 
 # Largest factor between an anchor and the prediction. A single anchor beyond it would dominate the mean of all others,
@@ -128,40 +128,6 @@ class Anchors:
         """Copy the anchors to another device."""
         moved = {name: value.to(device) for name, value in vars(self).items() if value is not None}
         return replace(self, **moved)
-
-
-@dataclass(frozen=True)
-class AnchorInput:
-    """Checked anchors, and the frame's values at their pixels.
-
-    Attributes:
-        pixel: [B, N, 2] position (u, v) [px]; 0 where it is impossible or outside the image.
-        index: [B, N] int64 of the pixel in the flattened image.
-        predicted: [B, N] the network's depth at the pixel [m]; 1 where not valid.
-        depth, variance: [B, N] of the anchor [m], [m^2]; 1 and 0 where not valid.
-        own_variance: [B, N] variance that the network predicts at the pixel, A + E as far as they are used [m^2].
-        valid: [B, N] bool: finite, depth > 0, 0 <= variance < depth^2, within a factor of 100 of the prediction, on a
-            valid pixel, not masked.
-        rejected: [B] number of anchors that only this factor makes invalid; None = not counted.
-        contradiction: [B] mean r^2 of the rejected anchors, r at most 100, where they outnumber the valid ones and
-            therefore measure the prediction's error; else 0. None = not counted.
-        pose_error, shared, scale, motion, moving: as in :class:`Anchors`.
-    """
-
-    pixel: Tensor
-    index: Tensor
-    predicted: Tensor
-    depth: Tensor
-    variance: Tensor
-    own_variance: Tensor
-    valid: Tensor
-    rejected: Tensor | None = None
-    contradiction: Tensor | None = None
-    pose_error: Tensor | None = None
-    shared: Tensor | None = None
-    scale: Tensor | None = None
-    motion: Tensor | None = None
-    moving: Tensor | None = None
 
 
 def check_anchors(anchors: Anchors, frame: FrameInput, network_variances: Sequence[Tensor] = ()) -> AnchorInput:

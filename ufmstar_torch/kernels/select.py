@@ -9,8 +9,6 @@ from typing import Protocol, runtime_checkable
 
 import torch
 
-from ufmstar_torch.anchors.extension import REFERENCE as ANCHOR_REFERENCE
-from ufmstar_torch.anchors.extension import AnchorKernels
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.frame import CheckKernel, check_values
 from ufmstar_torch.gaussians.state import UfMStarState
@@ -69,15 +67,6 @@ def select_check(name: str, device_type: str) -> CheckKernel:
 
         return check.check_values
     return check_values
-
-
-def select_anchors(name: str, device_type: str) -> AnchorKernels:
-    """Kernels of the anchors' evidence; arguments as :func:`select_step`. Raises ValueError: "numba" off the CPU."""
-    if _compiled(name, device_type):
-        from ufmstar_torch.anchors.kernels import learn as fast
-
-        return AnchorKernels(fast.inliers, fast.learn_in_view)
-    return ANCHOR_REFERENCE
 
 
 def select_kernels(name: str, device_type: str) -> Kernels:
