@@ -92,8 +92,8 @@ def evaluate_sequence(
     check = partial(_check_frame, sources=sources.values(), tracked=tracked)
     shown = FrameProgress(progress, len(indices))
     writer = None if examples is None else ExampleWriter(examples, len(indices), runners)
-    how = {"cache": judge.store, "device": judge.device, "check": check, "stop": stop}
-    with closing(frame_results(sequence, indices, runners, **how)) as results:
+    stream = frame_results(sequence, indices, runners, cache=judge.store, device=judge.device, check=check, stop=stop)
+    with closing(stream) as results:
         for result in results:
             for one in judges:
                 one.add(result)

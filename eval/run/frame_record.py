@@ -27,6 +27,7 @@ def frame_arrays(frame: Frame | None, row: RowResult) -> dict[str, NDArray[Any]]
     """The arrays of a frame's file, by name: maps, pose, intrinsics and anchors (``writers``)."""
     left_out = _OF_NETWORK if row.corrected else (*_OF_NETWORK, *_BEFORE)
     maps = {name: value for name in MAPS if name not in left_out and (value := row.map(name)) is not None}
+    arrays: dict[str, NDArray[Any]]
     arrays = {name: value.numpy().astype(np.float32, copy=False) for name, value in maps.items()}
     arrays |= {"valid": row.valid.numpy(), "T_world_cam": row.T_world_cam, "intrinsics": row.intrinsics}
     if row.landmarks is None or frame is None:
