@@ -14,7 +14,7 @@ from ufmstar_torch import UfMStarConfig
 from ufmstar_torch.eval.engine.estimators import Alone, Gaussians
 from ufmstar_torch.eval.engine.maps import own_depth
 from ufmstar_torch.eval.engine.predictions import PredictionCache
-from ufmstar_torch.eval.engine.progress import FrameProgress
+from ufmstar_torch.eval.engine.progress import frame_progress
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameResult, Stopped, frame_results
 from ufmstar_torch.eval.methods.setting import Setting
@@ -101,12 +101,12 @@ def test_ground_truth_is_at_the_pixels_of_each_rows_maps(sequence):
 
 def test_it_stops_between_frames_and_ends_its_thread(sequence):
     shown, before = [], threading.active_count()
-    progress = FrameProgress(lambda now: shown.append((now.done, now.total)), FRAMES)
+    progress = frame_progress(lambda now: shown.append((now.done, now.total)), FRAMES)
     stream = frame_results(sequence, range(FRAMES), [in_turn()], stop=lambda: len(shown) > 2)
     assert next(stream).number == 0
-    progress.add(FrameResult(0, 0, "a"))
+    progress(FrameResult(0, 0, "a"))
     assert next(stream).number == 1
-    progress.add(FrameResult(1, 1, "b"))
+    progress(FrameResult(1, 1, "b"))
     with pytest.raises(Stopped):
         next(stream)
     assert shown == [(0, FRAMES), (1, FRAMES), (2, FRAMES)]

@@ -12,7 +12,7 @@ from ufmstar_torch.eval.commands.depth import OWN_DEPTH
 from ufmstar_torch.eval.commands.options import option, positional, reader, usage_errors
 from ufmstar_torch.eval.commands.run import StreamOptions, job_from
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-from ufmstar_torch.eval.engine.progress import FrameProgress
+from ufmstar_torch.eval.engine.progress import frame_progress
 from ufmstar_torch.eval.engine.stream import Stopped, frame_results
 from ufmstar_torch.eval.run.depth_check import DepthCheck
 from ufmstar_torch.eval.run.files import write_bytes_atomic, write_json_atomic
@@ -99,13 +99,13 @@ def _scores(options: RankOptions) -> ImageScores:
             source, scores.sequence = job.source, path
             if job.image_fit is not None and job.image_fit.problem:
                 LOGGER.warning("%s: %s", path, job.image_fit.problem)
-            check, shown = DepthCheck(job), FrameProgress(bars.show, len(job.indices))
+            check, shown = DepthCheck(job), frame_progress(bars.show, len(job.indices))
             try:
                 with closing(frame_results(job.sequence, job.indices, [job.row()[0]], stop=stop)) as results:
                     for result in results:
                         scores.add(result)
                         check.add(result)
-                        shown.add(result)
+                        shown(result)
             except Stopped:
                 raise KeyboardInterrupt from None
             if (fit := check.fit()) is not None and fit.problem:

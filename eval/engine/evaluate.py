@@ -22,7 +22,7 @@ from ufmstar_torch.eval.engine.estimators import make_estimator
 from ufmstar_torch.eval.engine.examples import ExampleWriter
 from ufmstar_torch.eval.engine.judge import RowFigures, RowJudge, SequenceError, references
 from ufmstar_torch.eval.engine.predictions import DepthSource, PredictionCache
-from ufmstar_torch.eval.engine.progress import FrameProgress, Progress
+from ufmstar_torch.eval.engine.progress import Progress, frame_progress
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import frame_results
 from ufmstar_torch.eval.methods.method import ALONE
@@ -90,7 +90,7 @@ def evaluate_sequence(
         judges.append(RowJudge(row, runners[-1], named, judge.bins, judge.plugins.metrics))
     tracked = any(row.setting.anchors in (CORNERS, DENSE) for row in rows)
     check = partial(_check_frame, sources=sources.values(), tracked=tracked)
-    shown = FrameProgress(progress, len(indices))
+    shown = frame_progress(progress, len(indices))
     writer = None if examples is None else ExampleWriter(examples, len(indices), runners)
     stream = frame_results(sequence, indices, runners, cache=judge.store, device=judge.device, check=check, stop=stop)
     with closing(stream) as results:
@@ -99,7 +99,7 @@ def evaluate_sequence(
                 one.add(result)
             if writer is not None:
                 writer.add(result)
-            shown.add(result)
+            shown(result)
     if writer is not None:
         writer.end()
     opened = dict(sorted(Counter(skipped.reason for skipped in sequence.skipped).items()))

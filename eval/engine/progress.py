@@ -19,16 +19,16 @@ class Progress:
     skipped: int = 0  # number of frames skipped so far
 
 
-class FrameProgress:
-    """Shows the progress over ``total`` frames: at the start, and after every frame."""
+def frame_progress(show: Callable[[Progress], object], total: int) -> Callable[[FrameResult], None]:
+    """Show the progress over ``total`` frames: at the start, and by the returned function after every frame."""
+    skipped = 0
 
-    def __init__(self, show: Callable[[Progress], object], total: int) -> None:
-        self._show, self._total, self._skipped = show, total, 0
-        show(Progress("frames", 0, total))
-
-    def add(self, result: FrameResult) -> None:
-        """Show that a frame is done."""
-        self._skipped += bool(result.skipped)
+    def shown(result: FrameResult) -> None:
+        nonlocal skipped
+        skipped += bool(result.skipped)
         each = (int(row.out.statistics.components[0]) for row in result.rows.values())
         components = next((count for count in each if count), None)
-        self._show(Progress("frames", result.number + 1, self._total, components, self._skipped))
+        show(Progress("frames", result.number + 1, total, components, skipped))
+
+    show(Progress("frames", 0, total))
+    return shown

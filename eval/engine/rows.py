@@ -150,12 +150,13 @@ class RowRunner:
         self.anchors, self._skips_faults = anchors, skips_faults
         self._tracks = None if anchors is None else anchors.tracks
         self.images = 0
-        self._drift = Drift(setting)
+        self._drift = Drift(setting) if setting.rotation_drift or setting.translation_drift else None
 
     def update(self, frame: Frame, prediction: DepthPrediction, truth: NDArray[np.float32] | None) -> RowResult:
         """Process the next frame. Ground truth [h, w] is used for anchors alone. Raises FrameError: ``skips_faults``,
         and the pose or the intrinsics are bad."""
-        T = perturbed(self._drift.of(frame.T_world_cam, frame.index), self.setting, frame.index)
+        drifted = frame.T_world_cam if self._drift is None else self._drift.of(frame.T_world_cam, frame.index)
+        T = perturbed(drifted, self.setting, frame.index)
         landmarks, anchors, tracking_ms = (
             (None, None, None) if self.anchors is None else self.anchors.of(frame, T, prediction, truth)
         )

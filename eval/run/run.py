@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.engine.predictions import CacheError, PredictionCache
-from ufmstar_torch.eval.engine.progress import FrameProgress, Progress
+from ufmstar_torch.eval.engine.progress import Progress, frame_progress
 from ufmstar_torch.eval.engine.stream import Stopped, frame_results
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.engine.writer_thread import WriterThread
@@ -62,12 +62,12 @@ def run(
         ending, outputs = (FAILED, "an error in the program"), {}
         try:
             warm_up_job(job, progress)
-            shown = FrameProgress(progress, len(job.indices))
+            shown = frame_progress(progress, len(job.indices))
             results = frame_results(job.sequence, job.indices, [row], cache=cache, stop=stop)
             with closing(results), WriterThread() as writer:
                 for result in results:  # reads, predicts, updates
                     writer.call(folder.write, result)
-                    shown.add(result)
+                    shown(result)
             ending = _ending(folder)
             outputs = _outputs(folder, ufm, progress, stop)
         except (KeyboardInterrupt, Stopped):
