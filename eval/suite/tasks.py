@@ -30,6 +30,7 @@ from ufmstar_torch.eval.suite.evaluate import evaluate_item
 from ufmstar_torch.eval.suite.folder import STOP, evaluation_folder
 from ufmstar_torch.eval.suite.job import EvalJob
 from ufmstar_torch.eval.suite.work_items import WorkItem
+from ufmstar_torch.runtime.optional import optional
 
 _POLL_SECONDS = 0.1
 _CONNECT_SECONDS = 30
@@ -139,12 +140,10 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def dask_cluster(address: str) -> Iterator[Executor]:
-    """The workers of a Dask scheduler. Raises ImportError: Dask is not installed; OSError: no scheduler answers."""
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise ImportError('--scheduler needs Dask: pip install "ufmstar-torch[cluster]"') from error
-    with Client(address, timeout=_CONNECT_SECONDS, set_as_default=False) as client:
+    """The workers of a Dask scheduler. Raises ModuleNotFoundError: Dask is not installed; OSError: no scheduler
+    answers."""
+    distributed = optional("distributed", "--scheduler needs Dask", "'ufmstar-torch[cluster]'")
+    with distributed.Client(address, timeout=_CONNECT_SECONDS, set_as_default=False) as client:
         yield client.get_executor(pure=False)
 
 
