@@ -21,11 +21,12 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork
 from ufmstar_torch.eval.bench.timing import StagedStep
 from ufmstar_torch.eval.engine.clock import synchronize
-from ufmstar_torch.eval.engine.estimators import Answer, Gaussians, Pointwise, make_estimator
+from ufmstar_torch.eval.engine.estimators import Gaussians, Pointwise, make_estimator
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
+from ufmstar_torch.frames.output import UncertaintyOutput
 from ufmstar_torch.frames.prediction import DepthPrediction
 
 MULTIVIEW = "multiview"
@@ -44,7 +45,7 @@ class MultiviewStep:
 
     def __call__(
         self, image: Tensor | None, frame: Frame, prediction: DepthPrediction, *, first: bool = False
-    ) -> Answer:
+    ) -> UncertaintyOutput:
         """Move a frame's maps to the device, track landmarks in its ``image`` [1, 3, H, W], and run the step.
         ``first`` resets the state before."""
         if first:
