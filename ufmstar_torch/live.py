@@ -29,9 +29,9 @@ from ufmstar_torch.arguments import (
     require_number,
 )
 from ufmstar_torch.atomic import remove_temporaries, write_atomic
-from ufmstar_torch.camera import rotation_deviation
 from ufmstar_torch.file_lock import hold
-from ufmstar_torch.frame import FRAME_FAULTS, pose_fault
+from ufmstar_torch.frame import FRAME_FAULTS, NOT_FINITE
+from ufmstar_torch.kernels.check_cpu import pose_fault
 from ufmstar_torch.pipeline import UncertainDepth, UncertainPrediction
 from ufmstar_torch.stream_clock import JUMP, StreamClock, Verdict
 from ufmstar_torch.stream_warnings import LOGGER
@@ -239,7 +239,8 @@ class LiveDepth:
             self._counts["poses"] += 1
             if not self._replaced(stamp, pose):
                 self._insert(stamp, pose)
-            self._changed.notify_all()
+            if self._waiting:  # a worker without an image has no use for a pose
+                self._changed.notify_all()
 
     def _replaced(self, stamp: float, pose: np.ndarray) -> bool:
         """Replace the pose in the buffer that has the same stamp; False if there is none."""
@@ -454,10 +455,10 @@ def _pose(T: CameraLike, tolerance: float) -> np.ndarray:
     pose = as_pose(T).detach().cpu().double()
     if pose.dim() != 2:
         raise ValueError(f"T must be one pose, [4, 4] or [3, 4], got {tuple(pose.shape)}")
-    if not bool(pose.isfinite().all()):
+    rigid = np.array(pose.numpy())
+    fault = pose_fault(rigid.tolist(), tolerance)
+    if fault == NOT_FINITE:
         return np.full((4, 4), np.nan)
-    fault = int(pose_fault(pose[None], rotation_deviation(pose[None, :3, :3]), tolerance)[0])
     if fault:
         raise ValueError(f"T: {FRAME_FAULTS[fault]}")
-    rigid: np.ndarray = pose.numpy().copy()
     return rigid

@@ -21,7 +21,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork
 from ufmstar_torch.eval.bench.timing import StagedStep
 from ufmstar_torch.eval.engine.clock import synchronize
-from ufmstar_torch.eval.engine.estimators import Answer, Gaussians, Pointwise, make_estimator
+from ufmstar_torch.eval.engine.estimators import Gaussians, Pointwise, make_estimator
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.sequences.frame import Frame
@@ -42,9 +42,7 @@ class MultiviewStep:
         anchors = ANCHORS[row.setting.anchors]
         self._landmarks = None if anchors is None else StreamLandmarks(landmark_source(anchors))
 
-    def __call__(
-        self, image: Tensor | None, frame: Frame, prediction: DepthPrediction, *, first: bool = False
-    ) -> Answer:
+    def __call__(self, image: Tensor | None, frame: Frame, prediction: DepthPrediction, *, first: bool = False) -> None:
         """Move a frame's maps to the device, track landmarks in its ``image`` [1, 3, H, W], and run the step.
         ``first`` resets the state before."""
         if first:
@@ -57,7 +55,11 @@ class MultiviewStep:
             K = torch.from_numpy(frame.intrinsics)
             anchors = self._landmarks.update(image, T, K, UfMStarConfig.rotation_tolerance)
             anchors = anchors.moved(K, prediction.K).to(self._device)
-        return self.estimator.update(prediction.to(self._device), T, anchors)
+        prediction = prediction.to(self._device)
+        if isinstance(self.estimator, Gaussians):
+            self.estimator.step(prediction, T, anchors)
+        else:
+            self.estimator.update(prediction, T, anchors)
 
     def memory(self) -> dict[str, float]:
         """Bytes of the state, that of anchors included; number of points or components; bytes of the smoothing map."""

@@ -19,6 +19,7 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import configured
 from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.output import UfMStarOutput
 from ufmstar_torch.pipeline import maps_of
 from ufmstar_torch.prediction import DepthPrediction
 from ufmstar_torch.recalibrate import Recalibration
@@ -168,15 +169,19 @@ class Gaussians(Estimator):
         self._posterior, self._anchors = posterior, 0
 
     def update(self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
-        used = self.used(prediction)
-        out = self.ufm(pose=T_world_cam, intrinsics=prediction.K, anchors=anchors, **maps_of(used, self.ufm))
+        out = self.step(prediction, T_world_cam, anchors)
         anchors_used = out.statistics.anchors_used
         self._anchors = 0 if anchors_used is None else int(anchors_used[0])
-        answer = {name: getattr(out, name) for name in _OF_OUTPUT} | {"confidence": used.confidence}
+        answer = {name: getattr(out, name) for name in _OF_OUTPUT} | {"confidence": prediction.confidence}
         answer["distribution"] = out.distribution() if out.has_intervals else None
         if self._posterior:
             answer["depth"], answer["variance"] = out.posterior()
         return answer
+
+    def step(self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> UfMStarOutput:
+        """The output of UfM* alone, without what only metrics need of it."""
+        maps = maps_of(self.used(prediction), self.ufm)
+        return self.ufm(pose=T_world_cam, intrinsics=prediction.K, anchors=anchors, **maps)
 
     def mixture_world(self) -> GaussianMixture:
         """[1, K] M_i in the world's frame, float64; after a frame."""

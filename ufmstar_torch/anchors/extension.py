@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.anchors import AnchorInput, check_anchors
+from ufmstar_torch.anchors.anchors import AnchorInput, CheckAnchors, check_anchors, check_values
 from ufmstar_torch.anchors.doubts import AnchorDoubts
 from ufmstar_torch.anchors.evidence import SUMS, Evidence, inliers, means, observe
 from ufmstar_torch.camera import unproject_at
@@ -96,15 +96,17 @@ class AnchorKernels:
 
     Attributes:
         supported: see ``evidence.inliers``.
+        check: see ``anchors.check_values``.
         learn_in_view: :func:`learn` with the compiled step's components in view, to which it adds the columns
             (``kernels.anchors_cpu.learn_in_view``); None = use :func:`learn`.
     """
 
     supported: Callable[[AnchorInput], Tensor]
+    check: CheckAnchors
     learn_in_view: Callable[..., Learnt] | None
 
 
-REFERENCE = AnchorKernels(inliers, None)
+REFERENCE = AnchorKernels(inliers, check_values, None)
 
 
 class AnchorFrame(FrameExtension):
@@ -173,6 +175,8 @@ class AnchorFrame(FrameExtension):
         self._term, both = anchored_term(depth, self._residual[..., 1], disagreement)
         if self.anchors is None or self.anchors.contradiction is None:
             return both
+        if self.anchors.contradiction.is_cpu and not self.anchors.contradiction.any():  # no change
+            return both
         least = self.anchors.contradiction.view(-1, *[1] * (depth.dim() - 1)).to(depth.dtype) * depth.square()
         self._term = torch.maximum(self._term, least)
         return torch.maximum(both, disagreement + least)
@@ -229,7 +233,7 @@ class AnchorExtension(Extension):
         kernels = self._kernels(self._config.backend, frame.depth.device.type)
         if argument is None:
             return AnchorFrame(frame, None, self._config, kernels)
-        anchors = check_anchors(argument, frame, network_variances)
+        anchors = check_anchors(argument, frame, network_variances, kernels.check)
         return AnchorFrame(
             frame, anchors, self._config, kernels, partial(self._doubts.judge, argument, anchors, frame.size)
         )

@@ -76,7 +76,7 @@ def select_anchors(name: str, device_type: str) -> AnchorKernels:
     if _compiled(name, device_type):
         from ufmstar_torch.kernels import anchors_cpu as fast
 
-        return AnchorKernels(fast.inliers, fast.learn_in_view)
+        return AnchorKernels(fast.inliers, fast.check_values, fast.learn_in_view)
     return ANCHOR_REFERENCE
 
 
