@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from random_gaussians import covariances, means
 
 import oracle
-from ufmstar_torch import gaussian
+from ufmstar_torch.gaussians import gaussian
 
 pytestmark = pytest.mark.numerics
 
