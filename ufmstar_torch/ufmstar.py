@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.frames.arguments import Array, CameraLike, as_device, as_tensor, require_flag
+from ufmstar_torch.frames.arguments import Array, CameraLike, as_device, as_tensor, require_flag, require_whole
 from ufmstar_torch.frames.extension import Extension
 from ufmstar_torch.frames.extensions import extensions_of
 from ufmstar_torch.frames.frame import CheckKernel, FrameInput, check_frame, raise_faults
@@ -22,13 +22,13 @@ from ufmstar_torch.gaussians.camera import invert_rigid
 from ufmstar_torch.gaussians.fixed_order import apply
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.gaussians.state import NAMES, UfMStarState
-from ufmstar_torch.kernels.select import LateStep, select_check, select_step
+from ufmstar_torch.kernels.select import LateStep, select_check, select_sample, select_step
 from ufmstar_torch.runtime.one_caller import one_caller
 from ufmstar_torch.runtime.stateful import StatefulModule, full_precision, outliving
 from ufmstar_torch.runtime.warm_up import warm_up
 from ufmstar_torch.steps import unmeasured
 from ufmstar_torch.steps.regress import Regression, regress
-from ufmstar_torch.steps.sample import mean_uncertainty, sample_pixels, sample_size
+from ufmstar_torch.steps.sample import mean_uncertainty, sample_size
 from ufmstar_torch.steps.step import Step
 from ufmstar_torch.steps.step_parts import StepObserver
 
@@ -178,9 +178,13 @@ class UfMStar(StatefulModule):
         depth = as_tensor("depth", depth)
         optional, view = (aleatoric, epistemic, valid, features), {"member": member, "informative": informative}
         frame = self._checked(depth, pose, intrinsics, *optional, **view)
-        index, used = sample_pixels(frame.valid, sample_size(frame.size, pixels, fraction), seed)
+        kernels = select_sample(self.config.backend, depth.device.type)
+        index, used = kernels.pixels(
+            frame.valid, sample_size(frame.size, pixels, fraction), require_whole("seed", seed)
+        )
         out, maps = self._observe(frame, inputs, index, average=require_flag("average", average))
-        return mean_uncertainty(out, maps | {"depth": torch.gather(frame.depth.flatten(1), 1, index)}, used)
+        maps |= {"depth": torch.gather(frame.depth.flatten(1), 1, index)}
+        return mean_uncertainty(out, maps, used, kernels.statistics)
 
     def warm_up(
         self, size: tuple[int, int], *, streams: int = 1, progress: Callable[[int, int], object] | None = None

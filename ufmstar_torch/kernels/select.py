@@ -15,6 +15,8 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.frame import CheckKernel, check_values
 from ufmstar_torch.gaussians.state import UfMStarState
 from ufmstar_torch.kernels.host import on_host
+from ufmstar_torch.steps.sample import REFERENCE as SAMPLE_REFERENCE
+from ufmstar_torch.steps.sample import SampleKernels
 from ufmstar_torch.steps.step import Step, step
 from ufmstar_torch.steps.step_parts import REFERENCE, Kernels
 
@@ -78,6 +80,15 @@ def select_anchors(name: str, device_type: str) -> AnchorKernels:
 
         return AnchorKernels(fast.inliers, fast.check_values, fast.learn_in_view)
     return ANCHOR_REFERENCE
+
+
+def select_sample(name: str, device_type: str) -> SampleKernels:
+    """Kernels of samples of pixels; arguments as :func:`select_step`. Raises ValueError: "numba" off the CPU."""
+    if _compiled(name, device_type):
+        from ufmstar_torch.kernels.cpu import sample as sample_cpu
+
+        return SampleKernels(sample_cpu.sample_pixels, sample_cpu.sample_statistics)
+    return SAMPLE_REFERENCE
 
 
 def select_kernels(name: str, device_type: str) -> Kernels:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,16 +18,35 @@ from ufmstar_torch.steps import unmeasured
 _MAPS = ("variance", "disagreement", "aleatoric", "epistemic", "anchored", "depth")
 
 
-def mean_uncertainty(out: StepOutput, maps: Mapping[str, Tensor | None], used: Tensor) -> MeanUncertainty:
+class SampleKernels(NamedTuple):
+    """The implementations of the replaceable parts.
+
+    Attributes:
+        pixels: see :func:`sample_pixels`.
+        statistics: see :func:`sample_statistics`; without gradients.
+    """
+
+    pixels: Callable[[Tensor, int, int], tuple[Tensor, Tensor]]
+    statistics: Callable[[Tensor], SampleStatistics]
+
+
+def mean_uncertainty(
+    out: StepOutput,
+    maps: Mapping[str, Tensor | None],
+    used: Tensor,
+    statistics: Callable[[Tensor], SampleStatistics] | None = None,
+) -> MeanUncertainty:
     """Averages of V, M, A, E and B over the sampled pixels.
 
     Args:
         out: of the step on the sample [B, n].
         maps: [B, n] the variance, its parts and the depth, by name; None = no statistics.
         used: [B, n] True for the pixels to average.
+        statistics: an implementation of :func:`sample_statistics` for values without a graph.
     """
     sampled = {name: torch.where(used, value, torch.nan) for name in _MAPS if (value := maps.get(name)) is not None}
-    each = sample_statistics(torch.stack(list(sampled.values())))
+    values = torch.stack(list(sampled.values()))
+    each = sample_statistics(values) if statistics is None or values.requires_grad else statistics(values)
     by_map = {name: SampleStatistics(*(value[i] for value in vars(each).values())) for i, name in enumerate(sampled)}
     count, variance = used.sum(1), by_map["variance"]
     # finite population correction: a sample of all pixels has no error
@@ -118,3 +138,6 @@ def sample_statistics(values: Tensor) -> SampleStatistics:
 def random_order(pixels: int, seed: int) -> Tensor:
     """A permutation of the numbers below ``pixels``; the caller must not modify it."""
     return torch.randperm(pixels, generator=torch.Generator().manual_seed(seed))
+
+
+REFERENCE = SampleKernels(sample_pixels, sample_statistics)
