@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+
 from ufmstar_torch import UfMStar
 from ufmstar_torch.kernels.cpu import sample as compiled
 from ufmstar_torch.steps import sample as reference

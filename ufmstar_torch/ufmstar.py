@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.frames.arguments import Array, CameraLike, as_device, as_tensor, require_flag, require_whole
+from ufmstar_torch.frames.arguments import Array, CameraLike, as_device, as_tensor, require_flag
 from ufmstar_torch.frames.extension import Extension
 from ufmstar_torch.frames.extensions import extensions_of
 from ufmstar_torch.frames.frame import CheckKernel, FrameInput, check_frame, raise_faults
@@ -179,12 +179,9 @@ class UfMStar(StatefulModule):
         optional, view = (aleatoric, epistemic, valid, features), {"member": member, "informative": informative}
         frame = self._checked(depth, pose, intrinsics, *optional, **view)
         kernels = select_sample(self.config.backend, depth.device.type)
-        index, used = kernels.pixels(
-            frame.valid, sample_size(frame.size, pixels, fraction), require_whole("seed", seed)
-        )
+        index, used = kernels.pixels(frame.valid, *sample_size(frame.size, pixels, fraction, seed))
         out, maps = self._observe(frame, inputs, index, average=require_flag("average", average))
-        maps |= {"depth": torch.gather(frame.depth.flatten(1), 1, index)}
-        return mean_uncertainty(out, maps, used, kernels.statistics)
+        return mean_uncertainty(out, maps, frame.depth, index, used, kernels.statistics)
 
     def warm_up(
         self, size: tuple[int, int], *, streams: int = 1, progress: Callable[[int, int], object] | None = None
@@ -316,8 +313,7 @@ class UfMStar(StatefulModule):
         return out, maps
 
     def _stored(self) -> UfMStarState:
-        buffers = cast("dict[str, Tensor]", self._buffers)  # no buffer is None; avoids ``__getattr__``
-        return self._empty.with_tensors(buffers)
+        return self._empty.with_tensors(cast("dict[str, Tensor]", self._buffers))  # avoids ``__getattr__``
 
     def _kernels(self, device_type: str) -> tuple[Step, CheckKernel]:
         """The step and the check for a device. The step is cached, since it may hold pending components."""

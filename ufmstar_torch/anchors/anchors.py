@@ -237,11 +237,11 @@ def check_anchors(
     pixel, index, predicted, depth, variance, valid, rejected, contradiction = kernel(
         pixel, depth, variance, mask, frame
     )
-    own = torch.zeros_like(depth)
+    predicted_variance = torch.zeros_like(depth)
     if network_variances:
-        own = torch.where(valid, _variance_at(network_variances, index), own)
+        predicted_variance = torch.where(valid, _variance_at(network_variances, index), predicted_variance)
     return AnchorInput(
-        pixel, index, predicted, depth, variance, own, valid, rejected, contradiction,
+        pixel, index, predicted, depth, variance, predicted_variance, valid, rejected, contradiction,
         pose_error=anchors.pose_error,
         shared=anchors.shared,
         scale=anchors.scale,

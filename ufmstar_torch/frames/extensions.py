@@ -9,7 +9,7 @@ from ufmstar_torch.anchors.extension import AnchorExtension
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.arguments import require_kind
 from ufmstar_torch.frames.extension import Extension, Extensions
-from ufmstar_torch.kernels.select import select_anchors
+from ufmstar_torch.kernels.select import select_anchors, select_merge
 from ufmstar_torch.posterior.extension import PosteriorExtension
 from ufmstar_torch.steps.merge import MergeExtension
 
@@ -30,5 +30,5 @@ def extensions_of(config: UfMStarConfig, further: Sequence[Extension] = ()) -> E
     if config.posterior is not None:
         each.append(PosteriorExtension(config))
     if config.merge is not None:
-        each.append(MergeExtension(config))
+        each.append(MergeExtension(config, select_merge))
     return Extensions([*each, *further], config)

@@ -15,6 +15,8 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.frame import CheckKernel, check_values
 from ufmstar_torch.gaussians.state import UfMStarState
 from ufmstar_torch.kernels.host import on_host
+from ufmstar_torch.steps.merge import REFERENCE as MERGE_REFERENCE
+from ufmstar_torch.steps.merge import MergeKernels
 from ufmstar_torch.steps.sample import REFERENCE as SAMPLE_REFERENCE
 from ufmstar_torch.steps.sample import SampleKernels
 from ufmstar_torch.steps.step import Step, step
@@ -80,6 +82,15 @@ def select_anchors(name: str, device_type: str) -> AnchorKernels:
 
         return AnchorKernels(fast.inliers, fast.check_values, fast.learn_in_view)
     return ANCHOR_REFERENCE
+
+
+def select_merge(name: str, device_type: str) -> MergeKernels:
+    """Kernels of merging; arguments as :func:`select_step`. Raises ValueError: "numba" off the CPU."""
+    if _compiled(name, device_type):
+        from ufmstar_torch.kernels.cpu import merge as merge_cpu
+
+        return MergeKernels(merge_cpu.close_pairs, merge_cpu.evidence)
+    return MERGE_REFERENCE
 
 
 def select_sample(name: str, device_type: str) -> SampleKernels:
