@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import AnchorInput
@@ -16,6 +18,8 @@ from ufmstar_torch.frames.extension import Extension, FrameExtension, Tensors, T
 from ufmstar_torch.frames.frame import FrameInput
 from ufmstar_torch.frames.output import StepOutput
 from ufmstar_torch.gaussians.state import UfMStarState
+from ufmstar_torch.kernels.cpu.arrays import array
+from ufmstar_torch.kernels.cpu.threads import each
 from ufmstar_torch.posterior import conformal
 from ufmstar_torch.posterior.running import SIZE, require, restarted
 
@@ -43,18 +47,13 @@ class PosteriorFrame(FrameExtension):
         assert self._config.posterior is not None
         claimed = total(out.disagreement).detach()
         frame, anchors, packed = self._anchors.frame, self._anchors.anchors, state.by_stream["posterior"]
-        if anchors is not None and anchors.shared is not None:  # wrong poses, for an unknown time
+        wrong = None if anchors is None or anchors.shared is None else anchors.shared.isinf()
+        if wrong is not None and not (wrong.is_cpu and not wrong.any()):  # wrong poses, for an unknown time
             start = restarted(packed, self._config.posterior)
-            packed = torch.where(anchors.shared.isinf()[:, None], start, packed)
+            packed = torch.where(wrong[:, None], start, packed)
         learnt, posterior = update(packed, frame, anchors, claimed, self._config.posterior)
-        added = torch.zeros_like(posterior.variance)
-        if anchors is not None and anchors.contradiction is not None:  # most anchors are off by a factor over 100
-            added = posterior.depth.square() * anchors.contradiction[:, None, None].to(added.dtype)
-        if anchors is not None:
-            added = added + common_error(anchors, posterior.depth, self._config.posterior.prior_sigma**2)
-        floor = self._config.variance_floor
-        variance, inlier = (v.clamp_min(floor) + added for v in (posterior.variance, posterior.inlier))
-        self._posterior = replace(posterior, variance=variance, inlier=inlier)
+        limit, floor = self._config.posterior.prior_sigma**2, self._config.variance_floor
+        self._posterior = widened(posterior, anchors, limit, floor)
         self._intervals = conformal.after_frame(state.by_stream["intervals"], posterior.scores)
         statistics = replace(out.statistics, calibration=posterior.calibration, unseen=posterior.unseen)
         tensors = {"posterior": learnt, "intervals": self._intervals}
@@ -70,6 +69,28 @@ class PosteriorFrame(FrameExtension):
             "posterior_outlier": p.outlier, "posterior_inlier_variance": p.inlier,
             "quantiles": conformal.quantiles(self._intervals),
         }  # fmt: skip
+
+
+def widened(posterior: Posterior, anchors: AnchorInput | None, limit: float, floor: float) -> Posterior:
+    """The posterior with variances of at least ``floor`` and the errors that all anchors of the frame share:
+    :func:`common_error`, and where most anchors are off by a factor over 100, their mean squared error."""
+    if posterior.depth.is_cpu:
+        from ufmstar_torch.posterior.cells import widen
+
+        columns: list[NDArray[Any]] = [np.zeros(len(posterior.depth))] * 3
+        if anchors is not None:
+            parts = (anchors.shared, anchors.scale, anchors.contradiction)
+            columns = [none if x is None else array(x) for none, x in zip(columns, parts, strict=True)]
+        maps = [array(x) for x in (posterior.depth, posterior.variance, posterior.inlier)]
+        each(widen, [(*(x[b] for x in (*maps, *columns)), limit, floor) for b in range(len(maps[0]))])
+        return posterior
+    added = torch.zeros_like(posterior.variance)
+    if anchors is not None:
+        added = common_error(anchors, posterior.depth, limit)
+        if anchors.contradiction is not None:
+            added = added + posterior.depth.square() * anchors.contradiction[:, None, None].to(added.dtype)
+    variance, inlier = (v.clamp_min(floor) + added for v in (posterior.variance, posterior.inlier))
+    return replace(posterior, variance=variance, inlier=inlier)
 
 
 def common_error(anchors: AnchorInput, depth: Tensor, limit: float) -> Tensor:
