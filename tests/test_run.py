@@ -65,8 +65,8 @@ def test_a_run_equals_a_loop_by_hand(scene, tmp_path):
         np.testing.assert_array_equal(stored["depth"], result.depth[0].numpy())
         np.testing.assert_array_equal(stored["variance"], result.variance[0].numpy())
         np.testing.assert_array_equal(stored["disagreement"], result.disagreement[0].numpy())
-        np.testing.assert_array_equal(stored["measured"], result.ufm.measured[0].numpy())
-        unmeasured.append(int(result.ufm.statistics.unmeasured[0]))
+        np.testing.assert_array_equal(stored["measured"], result.measured[0].numpy())
+        unmeasured.append(int(result.statistics.unmeasured[0]))
         target = preprocess.apply_depth(torch.from_numpy(frame.depth))
         assert np.abs(target.numpy() - preprocess.apply_depth(torch.from_numpy(depth)).numpy()).max() < 1e-3
         ours.update(result.depth[0], result.variance[0], target)

@@ -180,7 +180,7 @@ def walk_of(images, *, moving: bool = True):
         pose = np.eye(4)
         pose[0, 3] = 0.1 * i * moving
         out = model(image, pose, camera)
-    return out.ufm
+    return out
 
 
 def test_a_covered_lens_is_named_and_measures_nothing(caplog):

@@ -18,7 +18,7 @@ from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import configured
 from ufmstar_torch.eval.methods.ufm import UfM
-from ufmstar_torch.frames.output import UfMStarOutput
+from ufmstar_torch.frames.output import UncertaintyOutput
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.posterior.recalibrate import Recalibration
@@ -28,8 +28,8 @@ from ufmstar_torch.uncertain_depth import maps_of
 # Maps [1, h, w] on the estimator's device, by their names in ``RowResult``; UfM* adds "statistics".
 Answer = dict[str, Any]
 _OF_OUTPUT = (
-    "depth", "variance", "valid", "aleatoric", "epistemic", "disagreement", "measured", "anchored", "bias",
-    "posterior_depth", "posterior_variance", "posterior_inlier_variance", "posterior_outlier", "statistics",
+    "valid", "aleatoric", "epistemic", "disagreement", "measured", "anchored", "bias", "posterior_inlier_variance",
+    "posterior_outlier", "statistics",
 )  # fmt: skip
 
 
@@ -164,8 +164,7 @@ class Gaussians(Estimator):
         recalibration: Recalibration | None = None,
     ) -> None:
         super().__init__(uses_variances=uses_variances)
-        extensions = () if recalibration is None else (recalibration,)
-        self.module = self.ufm = UfMStar(config, extensions=extensions, device=device)
+        self.module = self.ufm = UfMStar(config, recalibration=recalibration, device=device)
         self._posterior, self._anchors = posterior, 0
 
     def update(self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
@@ -174,11 +173,16 @@ class Gaussians(Estimator):
         self._anchors = 0 if anchors_used is None else int(anchors_used[0])
         answer = {name: getattr(out, name) for name in _OF_OUTPUT} | {"confidence": prediction.confidence}
         answer["distribution"] = out.distribution() if out.has_intervals else None
+        answer["depth"], answer["variance"] = out.network_depth, out.ufm_variance
+        if out.posterior_outlier is not None:
+            answer["posterior_depth"], answer["posterior_variance"] = out.depth, out.variance
         if self._posterior:
-            answer["depth"], answer["variance"] = out.posterior()
+            answer["depth"], answer["variance"] = out.depth, out.variance
         return answer
 
-    def step(self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> UfMStarOutput:
+    def step(
+        self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None
+    ) -> UncertaintyOutput:
         """The output of UfM* alone, without what only metrics need of it."""
         maps = maps_of(self.used(prediction), self.ufm)
         return self.ufm(pose=T_world_cam, intrinsics=prediction.K, anchors=anchors, **maps)

@@ -126,8 +126,8 @@ def _anchor_figures(row: RowResult) -> dict[str, Any]:
 
 
 def _posterior_figures(row: RowResult) -> dict[str, Any]:
-    """Figures of held-out anchors (``FrameStatistics``), the quantiles of intervals (``UfMStarOutput``), and the mean
-    of sqrt(V) of UfM* [m], which ``mean_sigma`` is not; {} without a posterior."""
+    """Figures of held-out anchors (``FrameStatistics``), the quantiles of intervals, and the mean of sqrt(V) of UfM*
+    [m], which ``mean_sigma`` is not; {} without a posterior."""
     variance, statistics = row.variance, row.statistics
     if variance is None or statistics is None or statistics.calibration is None or statistics.unseen is None:
         return {}

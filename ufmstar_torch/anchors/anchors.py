@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.frames.arguments import require_float, require_mask
-from ufmstar_torch.frames.frame import FrameInput
+from ufmstar_torch.frames.frame import AnchorInput, FrameInput
 from ufmstar_torch.gaussians.camera import focal_and_centre
 from ufmstar_torch.gaussians.fixed_order import apply
 
@@ -132,47 +132,13 @@ class Anchors:
         return replace(self, **moved)
 
 
-@dataclass(frozen=True)
-class AnchorInput:
-    """Checked anchors, and the frame's values at their pixels.
-
-    Attributes:
-        pixel: [B, N, 2] position (u, v) [px]; 0 where it is impossible or outside the image.
-        index: [B, N] int64 of the pixel in the flattened image.
-        predicted: [B, N] the network's depth at the pixel [m]; 1 where not valid.
-        depth, variance: [B, N] of the anchor [m], [m^2]; 1 and 0 where not valid.
-        own_variance: [B, N] variance that the network predicts at the pixel, A + E as far as they are used [m^2].
-        valid: [B, N] bool: finite, depth > 0, 0 <= variance < depth^2, within a factor of 100 of the prediction, on a
-            valid pixel, not masked.
-        rejected: [B] number of anchors that only this factor makes invalid; None = not counted.
-        contradiction: [B] mean r^2 of the rejected anchors, r at most 100, where they outnumber the valid ones and
-            therefore measure the prediction's error; else 0. None = not counted.
-        pose_error, shared, scale, motion, moving: as in :class:`Anchors`.
-    """
-
-    pixel: Tensor
-    index: Tensor
-    predicted: Tensor
-    depth: Tensor
-    variance: Tensor
-    own_variance: Tensor
-    valid: Tensor
-    rejected: Tensor | None = None
-    contradiction: Tensor | None = None
-    pose_error: Tensor | None = None
-    shared: Tensor | None = None
-    scale: Tensor | None = None
-    motion: Tensor | None = None
-    moving: Tensor | None = None
-
-
 # Pixel, depth and variance, the mask of usable anchors, and the frame -> the first columns of ``AnchorInput``: pixel,
 # index, predicted, depth, variance, valid, rejected and contradiction.
 Checked = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 CheckAnchors = Callable[[Tensor, Tensor, Tensor, Tensor | None, FrameInput], Checked]
 
 
-def check_values(
+def check_anchor_values(
     pixel: Tensor, depth: Tensor, variance: Tensor, mask: Tensor | None, frame: FrameInput
 ) -> Checked:  # fmt: skip
     """Check the values of anchors: pixel [B, N, 2] [px], depth [B, N] [m], variance [B, N] [m^2], all float64, and mask
@@ -198,8 +164,11 @@ def check_values(
 
 
 def check_anchors(
-    anchors: Anchors, frame: FrameInput, network_variances: Sequence[Tensor] = (), kernel: CheckAnchors = check_values
-) -> AnchorInput:  # fmt: skip
+    anchors: Anchors,
+    frame: FrameInput,
+    network_variances: Sequence[Tensor] = (),
+    kernel: CheckAnchors = check_anchor_values,
+) -> AnchorInput:
     """Check the anchors of one frame and convert them to float64 on the depth's device.
 
     An anchor is invalid if a value is impossible, if it lies outside the image or on a pixel without depth, if its
@@ -209,7 +178,7 @@ def check_anchors(
         anchors: see :class:`Anchors`.
         frame: of the same B streams.
         network_variances: the network's variances in use, of A and E, each [B, H, W] [m^2].
-        kernel: an implementation of :func:`check_values`.
+        kernel: an implementation of :func:`check_anchor_values`.
 
     Raises:
         TypeError: ``anchors`` is no :class:`Anchors`, or a field is no tensor or has the wrong kind of dtype.

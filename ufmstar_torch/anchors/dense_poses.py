@@ -93,7 +93,8 @@ class PoseErrors(SavedState):
         self._variance = np.zeros((self._baselines, 2))  # of w and s [rad^2, m^2]
         self._unexplained = np.full(self._baselines, _FIRST_UNEXPLAINED**2)  # [px^2]
         self._disagreement = 1.0
-        self._camera, self._covariance = np.zeros(CAMERA), np.eye(CAMERA)
+        self._camera: NDArray[np.float64] = np.zeros(CAMERA)
+        self._covariance: NDArray[np.float64] = np.eye(CAMERA)
 
     def positions(self, K: NDArray[np.float64], width: int, depth: float) -> NDArray[np.float64]:
         """[baselines] variance of a position in a keyframe by all errors [px^2], at a depth [m], in an image of a

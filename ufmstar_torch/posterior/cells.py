@@ -135,7 +135,7 @@ def read(
 
 @with_nan
 def widen(depth, variance, inlier, shared, scale, contradiction, limit, floor):
-    """Raise two variances [H, W] to ``floor`` and add what the anchors of a frame share (``extension.widened``)."""
+    """Raise two variances [H, W] to ``floor`` and add what the anchors of a frame share (``correct.widened``)."""
     for i in range(depth.shape[0]):
         d, V, V1 = depth[i], variance[i], inlier[i]
         for j in range(len(d)):

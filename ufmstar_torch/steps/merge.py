@@ -1,4 +1,4 @@
-"""Reduction of the mixture with little change to the regressed map: an extension, not in the paper (``config.merge``).
+"""Reduction of the mixture with little change to the regressed map; not in the paper (``config.merge``).
 
 The paper's method only adds components, and a surface that each view segments differently collects dozens of them.
 Every ``merge.every`` frames, two rules reduce the mixture; both are pure functions of it.
@@ -31,16 +31,14 @@ shares at these points. Their means and covariances do not change.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.frames.extension import Extension, FrameExtension, Total
 from ufmstar_torch.frames.frame import FrameInput
-from ufmstar_torch.frames.output import StepOutput
 from ufmstar_torch.gaussians.fixed_order import total
 from ufmstar_torch.gaussians.gaussian import cholesky3, floor_covariance, inverse_lower3, storage_floor
 from ufmstar_torch.gaussians.mixture import GaussianMixture
@@ -59,44 +57,13 @@ _LEAST_SHARE = 1e-9
 Components = dict[str, Tensor]
 
 
-class MergeExtension(Extension):
-    """Merging every ``merge.every`` frames.
-
-    Args:
-        config: with ``merge``.
-        kernels: returns the kernels for a backend and a device type.
-    """
-
-    def __init__(self, config: UfMStarConfig, kernels: Callable[[str, str], MergeKernels]) -> None:
-        self._config, self._kernels = config, kernels
-
-    def of_frame(
-        self,
-        frame: FrameInput,
-        network_variances: Sequence[Tensor],
-        argument: object,
-        before: Sequence[FrameExtension],
-        *,
-        dense: bool,
-    ) -> FrameExtension:
-        """Merging after this frame."""
-        return _MergeFrame(frame, self._config, self._kernels(self._config.backend, frame.depth.device.type))
-
-
-class _MergeFrame(FrameExtension):
-    """Merging after one frame."""
-
-    changes_mixture = True
-
-    def __init__(self, frame: FrameInput, config: UfMStarConfig, kernels: MergeKernels) -> None:
-        self._frame, self._config, self._kernels = frame, config, kernels
-
-    def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
-        """Merge the due streams, and count the components."""
-        state = merged(state, self._frame.fault == 0, self._config, self._kernels)
-        alone = state.mixture.valid & (state.views == 0)
-        counts = {"components": state.mixture.components, "single_view": alone.sum(1)}
-        return state, replace(out, statistics=replace(out.statistics, **counts))
+def after_frame(
+    state: UfMStarState, frame: FrameInput, config: UfMStarConfig, kernels: MergeKernels | None = None
+) -> tuple[UfMStarState, dict[str, Tensor]]:
+    """Merge the streams that are due after a frame, and count the components."""
+    state = merged(state, frame.fault == 0, config, kernels)
+    alone = state.mixture.valid & (state.views == 0)
+    return state, {"components": state.mixture.components, "single_view": alone.sum(1)}
 
 
 def merged(
@@ -212,7 +179,11 @@ def close_pairs(
         pair = torch.stack([torch.minimum(i[row], j), torch.maximum(i[row], j)])
         (first, second), d = weight[pair], mean[pair[0]] - mean[pair[1]]
         a, b = first / (first + second), second / (first + second)
-        volume = _log_det(_joint_covariance(*covariance[pair], a, b, d)) - a * log_det[pair[0]] - b * log_det[pair[1]]
+        volume = (
+            _log_det(_joint_covariance(covariance[pair[0]], covariance[pair[1]], a, b, d))
+            - a * log_det[pair[0]]
+            - b * log_det[pair[1]]
+        )
         loss = 0.5 * volume / torch.minimum(a, b)
         lighter, heavier = (
             torch.where(first < second, views[one], views[other]) for one, other in (pair, pair.flip(0))
