@@ -15,7 +15,7 @@ from ufmstar_torch.eval.bench.measure import Plan, measure
 from ufmstar_torch.eval.bench.networks import ONCE, TimedNetwork
 from ufmstar_torch.eval.bench.parts import MULTIVIEW
 from ufmstar_torch.eval.bench.streams import time_streams
-from ufmstar_torch.eval.bench.timing import most_threads
+from ufmstar_torch.eval.bench.timing import CLOCKS, most_threads
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.methods.method import BASES, Method
 from ufmstar_torch.eval.methods.row import Row
@@ -54,6 +54,7 @@ class BenchSettings:
         frames: number of timed frames
         history: number of frames before them
         threads: number of CPU threads; default: the cores of this process
+        clock: wall, or cpu: the processor's time for this process, for one thread on a machine with other load
         device: cpu, cuda or cuda:N, for network and UfM*
         streams: numbers of simultaneous streams on which UfM* alone is also timed
         json: file for the report
@@ -70,6 +71,7 @@ class BenchSettings:
     frames: int = field(default=40, metadata={"least": 1})
     history: int = field(default=60, metadata={"least": 1})
     threads: int | None = None
+    clock: str = field(default="wall", metadata={"choices": tuple(CLOCKS)})
     device: str = "cpu"
     streams: tuple[int, ...] = ()
     json: Path | None = None
@@ -77,6 +79,8 @@ class BenchSettings:
     def __post_init__(self) -> None:
         if self.weights is None and self.model not in ARCHITECTURES:
             raise ValueError(f"--model {self.model} needs --weights; without, it is one of {', '.join(ARCHITECTURES)}")
+        if self.clock == "cpu" and (self.device != "cpu" or self.threads != 1):
+            raise ValueError("--clock cpu needs --threads 1 on the CPU: it is the time of all threads together")
         if any(count < 1 for count in self.streams):
             raise ValueError(f"--streams must be positive, got {list(self.streams)}")
         if not self.sizes or any(size < 64 or size % 32 for size in self.sizes):
@@ -92,7 +96,9 @@ def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None
     """
     device = torch.device(require_device(options.device))
     threads = options.threads or most_threads()
-    plan = Plan(frames=options.frames, warm_up=options.history, threads=threads, windows=1)
+    plan = Plan(
+        frames=options.frames, warm_up=options.history, threads=threads, windows=1, clock=options.clock, samples=True
+    )
     networks = (
         [_loaded(options, threads, device)] if options.weights else (_random(options, s, device) for s in options.sizes)
     )
@@ -189,6 +195,11 @@ def _lines(result: Mapping[str, Any]) -> list[str]:
         if row["stages"] is not None:
             stages = row["stages"]["stages"].items()
             lines.append(f"stages of {row['row']}: " + ", ".join(f"{n} {t['median_ms']:.2f}" for n, t in stages))
+        if (sample := row["sample"]) is not None:
+            times, ratio = sample["latency"], sample["ratio_to_step"]["median"]
+            beside = row["stages"]["beside_the_paper"]["median"]
+            lines.append(f"mean over 1,000 pixels {times['median_ms']:.2f} ms, x step {ratio:.3f}; ")
+            lines[-1] += f"check and average, which the paper does not have, x step {beside:.3f}"
     for line in result["streams"]:
         forms = (f"{name} {line[name]['median_ms']:.2f} ms" for name in ("step", "graph") if name in line)
         lines.append(f"{line['streams']} streams at once: {', '.join(forms)}")
