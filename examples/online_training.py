@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jsonargparse import auto_cli
+import tyro
 
 from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.metrics import mean_and_ci
@@ -65,4 +65,4 @@ def main(walks: int = 4, frames: int = 64, cost: float = 0.06) -> dict[str, list
 
 
 if __name__ == "__main__":
-    auto_cli(main)
+    tyro.cli(main)

@@ -322,7 +322,16 @@ def test_only_the_named_part_is_trained(frames, tmp_path):
 
 def words(frames, out, *more):
     base = ["train", "--preset", "fastdepth-aleatoric", "--data", "sequences", "--root", frames, "--out", out]
-    base += ["--part", "0:12", "--validation-part", "12:16", "--network.size", "[32,32]", "--network.widths", "0.05"]
+    base += [
+        "--set",
+        "data.part=0:12",
+        "--set",
+        "data.validation_part=12:16",
+        "--set",
+        "network.size=[32,32]",
+        "--set",
+        "network.widths=0.05",
+    ]
     base += ["--accelerator", "cpu", "--batch-size", "4", "--no-tensorboard", "--no-progress"]
     return [*base, *more]
 
@@ -348,7 +357,7 @@ def test_a_file_that_cannot_be_read_ends_a_training_in_a_line(ufmstar, tmp_path)
         file.write_bytes(b"no depth")
     code, _, err = ufmstar(*words(path, tmp_path / "out", "--max-steps", 1))
     assert code == 1
-    assert re.search(r"ufmstar train: failed: walk/\S+: .*--on-bad-file skip", err), err
+    assert re.search(r"ufmstar train: failed: walk/\S+: .*--set data.on_bad_file=skip", err), err
 
 
 def test_a_stopped_training_says_how_to_go_on(ufmstar, frames, tmp_path):
