@@ -166,7 +166,7 @@ MISTAKES = {
     "demo: frames": ("ufmstar demo --frames 1 --out {out}", "--frames must be 2 to 150"),
     "demo: seed": ("ufmstar demo --seed -1 --out {out}", "--seed must be at least 0"),
     "anchors": ("--depth self --plain --set anchors.half_life=10", "--set anchors.* needs --anchors"),
-    "posterior": ("--depth self --plain --set posterior.prior_sigma=1", "--set posterior.* needs the posterior"),
+    "posterior": ("--depth self --plain --set posterior.half_life=9", "--set posterior.* needs the posterior"),
     "export": ("ufmstar export {path} --to depth", "no output of `ufmstar run`"),
 }
 

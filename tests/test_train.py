@@ -298,7 +298,7 @@ def test_the_shared_weights_are_starts():
 
     for key, value in FastDepth.from_onnx(onnx).state_dict().items():
         assert torch.equal(network.backbone.state_dict()[key], value)
-    with pytest.raises(ValueError, match=r"--network\.widths pruned or full"):
+    with pytest.raises(ValueError, match=r"network\.widths=pruned or full"):
         starting_network(NetworkSpec(widths=0.5), onnx)
     spec = NetworkSpec(architecture="monodepth2", strides="v1")
     weights = torch.load(require_shared(resnet), weights_only=True)
@@ -322,16 +322,8 @@ def test_only_the_named_part_is_trained(frames, tmp_path):
 
 def words(frames, out, *more):
     base = ["train", "--preset", "fastdepth-aleatoric", "--data", "sequences", "--root", frames, "--out", out]
-    base += [
-        "--set",
-        "data.part=0:12",
-        "--set",
-        "data.validation_part=12:16",
-        "--set",
-        "network.size=[32,32]",
-        "--set",
-        "network.widths=0.05",
-    ]
+    settings = ("data.part=0:12", "data.validation_part=12:16", "network.size=[32,32]", "network.widths=0.05")
+    base += [f"--set={setting}" for setting in settings]
     base += ["--accelerator", "cpu", "--batch-size", "4", "--no-tensorboard", "--no-progress"]
     return [*base, *more]
 
@@ -368,7 +360,7 @@ def test_a_stopped_training_says_how_to_go_on(ufmstar, frames, tmp_path):
 @pytest.mark.parametrize(
     ("more", "told"),
     [
-        (["--learning-speed", "2"], r"[Uu]nrecognized arguments: --learning-speed 2"),
+        (["--learning-speed", "2"], "Unrecognized options: --learning-speed, 2"),
         (["--resume", "--overwrite"], "contradict each other"),
         (["--data", "tour"], "--data tour takes no --root"),
         (["--threads", "0"], "--threads must be at least 1"),
