@@ -274,7 +274,7 @@ def test_a_monodepth2_of_another_resnet_is_refused(tmp_path, held, wanted):
     torch.save(decoder, tmp_path / "depth.pth")
     started = starting_network(NetworkSpec("monodepth2", layers=held), tmp_path)
     assert torch.equal(started.backbone.levels[4].before.weight, network.levels[4].before.weight)
-    with pytest.raises(ValueError, match=r"does not fit MonodepthResNet .* another --network\.layers may"):
+    with pytest.raises(ValueError, match=r"does not fit MonodepthResNet .* another network\.layers may"):
         starting_network(NetworkSpec("monodepth2", layers=wanted), tmp_path)
 
 

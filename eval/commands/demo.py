@@ -37,7 +37,7 @@ class DemoOptions(MachineOptions):
         frames: Each of the two walks has this many frames.
         seed: The rooms are drawn with this seed; the networks were trained on others.
         weights: Use another ensemble (.safetensors of `ufmstar train`); with --onboard any of its networks, or a
-            FastDepth (.onnx, .tflite).
+            FastDepth (.onnx).
         onboard: Run live, as on a small robot: one quantised network, 30 images/s, things of many sizes.
         seconds: With --onboard, walk this long [s].
         device: Run on cpu, cuda or cuda:N.

@@ -41,8 +41,8 @@ class NetworkOptions:
     """Depth from networks.
 
     Attributes:
-        model: The network is a fastdepth, monodepth2, trained, depth_anything, huggingface, onnx, litert, torchscript
-            or exported.
+        model: The network is a fastdepth, monodepth2, trained, depth_anything, huggingface, onnx, torchscript or
+            exported.
         weights: The file of its weights (depth_anything, huggingface: directory); several are an ensemble's members.
         mode: Run one member of an ensemble per image in turn, or all on every image.
         samples: Run an mc_dropout network this many times per image in mode full (default: 10).
