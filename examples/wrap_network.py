@@ -7,7 +7,7 @@ from importlib.resources import files
 from typing import Any
 
 import torch
-from jsonargparse import auto_cli
+import tyro
 from torch import Tensor
 
 from ufmstar_torch import UncertainDepth
@@ -39,4 +39,4 @@ def main(tour: int = 5, frames: int = 40) -> dict[str, SequenceMetrics]:
 
 
 if __name__ == "__main__":
-    auto_cli(main)
+    tyro.cli(main)
