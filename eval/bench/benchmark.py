@@ -40,7 +40,9 @@ def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None
     """
     device = torch.device(require_device(options.device))
     threads = options.threads or most_threads()
-    plan = Plan(frames=options.frames, warm_up=options.history, threads=threads, windows=1)
+    plan = Plan(
+        frames=options.frames, warm_up=options.history, threads=threads, windows=1, clock=options.clock, samples=True
+    )
     networks = (
         [_loaded(options, threads, device)] if options.weights else (_random(options, s, device) for s in options.sizes)
     )
@@ -137,6 +139,11 @@ def _lines(result: Mapping[str, Any]) -> list[str]:
         if row["stages"] is not None:
             stages = row["stages"]["stages"].items()
             lines.append(f"stages of {row['row']}: " + ", ".join(f"{n} {t['median_ms']:.2f}" for n, t in stages))
+        if (sample := row["sample"]) is not None:
+            times, ratio = sample["latency"], sample["ratio_to_step"]["median"]
+            slower = row["stages"]["beside_the_paper"]["median"]
+            lines.append(f"mean over 1,000 pixels {times['median_ms']:.2f} ms, x step {ratio:.3f}; ")
+            lines[-1] += f"check and average, which the paper does not have, x step {slower:.3f}"
     for line in result["streams"]:
         forms = (f"{name} {line[name]['median_ms']:.2f} ms" for name in ("step", "graph") if name in line)
         lines.append(f"{line['streams']} streams at once: {', '.join(forms)}")

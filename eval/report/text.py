@@ -134,7 +134,7 @@ def _metric_lines(summary: Mapping[str, Any]) -> list[str]:
     if (metrics["nll"] or 0) > NLL_OF_FEW:
         lines.append(
             f"NLL: dominated by the {uncertainty['near_zero_share']:.2%} of the pixels with a sigma between "
-            f"0 and {1000 * NEAR_ZERO:g} mm; --ufm.variance_floor 1e-4 bounds what they cost"
+            f"0 and {1000 * NEAR_ZERO:g} mm; --set variance_floor=1e-4 bounds what they cost"
         )
     return lines
 
