@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from ufmstar_torch.eval.commands.opening import OpeningOptions
 from ufmstar_torch.eval.commands.options import (
@@ -25,11 +25,10 @@ from ufmstar_torch.eval.methods.method import UFM_STAR
 from ufmstar_torch.eval.methods.setting import DEFAULTS, started
 from ufmstar_torch.eval.methods.suite import listing, suite_named
 from ufmstar_torch.eval.sequences.frame import parse_slice
-
-if TYPE_CHECKING:
-    from ufmstar_torch.eval.engine.load import NetworkChoice
-    from ufmstar_torch.eval.suite.job import EvalJob
-    from ufmstar_torch.eval.suite.tasks import EvalOutcome
+from ufmstar_torch.eval.suite.job import EvalJob, require_methods, with_recalibrations
+from ufmstar_torch.eval.suite.record import ResultsError
+from ufmstar_torch.eval.suite.tasks import EvalOutcome
+from ufmstar_torch.eval.suite.work_items import find_work, read_names
 
 # Options that are fields of a job with the same name.
 _OF_JOB = ("device", "bins", "examples", "samples", "runtime", "precision")
@@ -179,8 +178,7 @@ def job_from(options: EvalOptions) -> EvalJob:
     """The job of the options. Opens no sequence. Raises FileNotFoundError, ValueError: a file does not exist, options
     contradict each other, a base is named twice, no row has a network, or there is no sequence."""
     from ufmstar_torch.eval.engine.load import NetworkChoice
-    from ufmstar_torch.eval.suite.job import EvalJob, require_methods, with_recalibrations
-    from ufmstar_torch.eval.suite.work_items import find_work, read_names
+    from ufmstar_torch.eval.suite.job import EvalJob
 
     what, data, output, values = options.what, options.data, options.output, as_dict(options)
     suite = with_recalibrations(suite_named(str(what.suite), what.base, what.ufm_preset), joined(what.recalibration))
@@ -239,7 +237,6 @@ def _report(job: EvalJob, outcome: EvalOutcome, options: EvalOptions) -> int:
     from ufmstar_torch.eval.report.data import load_results
     from ufmstar_torch.eval.report.text import summary, written
     from ufmstar_torch.eval.report.write import write_report
-    from ufmstar_torch.eval.suite.record import ResultsError
 
     try:
         print(summary(load_results(job.out, with_sums=False)))

@@ -5,16 +5,24 @@ from __future__ import annotations
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.depth import OWN_DEPTH
 from ufmstar_torch.eval.commands.options import Count, Flag, Positional, Texts, reader, require_least, usage_errors
 from ufmstar_torch.eval.commands.run import StreamOptions, job_from
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-
-if TYPE_CHECKING:
-    from ufmstar_torch.eval.run.rank import ImageScores
+from ufmstar_torch.eval.engine.progress import frame_progress
+from ufmstar_torch.eval.engine.stream import Stopped, frame_results
+from ufmstar_torch.eval.run.depth_check import DepthCheck
+from ufmstar_torch.eval.run.files import write_bytes_atomic, write_json_atomic
+from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
+from ufmstar_torch.eval.run.machine import share_threads
+from ufmstar_torch.eval.run.panels import contact_sheet
+from ufmstar_torch.eval.run.pictures import SHEET
+from ufmstar_torch.eval.run.rank import ImageScores, require_part
+from ufmstar_torch.eval.run.run import warm_up_job
+from ufmstar_torch.frames.warnings import LOGGER
 
 SCORES, SETTINGS = "scores.csv", "rank.json"
 _SHOWN = 10  # lines of the printed table
@@ -70,9 +78,6 @@ read = reader(RankOptions, "ufmstar rank")
 
 def main(options: RankOptions) -> int:
     """Score the sequences, and write table and pictures; the exit code."""
-    from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
-    from ufmstar_torch.eval.run.machine import share_threads
-    from ufmstar_torch.eval.run.pictures import SHEET
 
     if options.threads is None:
         share_threads()
@@ -86,12 +91,7 @@ def main(options: RankOptions) -> int:
 
 def _scores(options: RankOptions) -> ImageScores:
     """Stream the sequences."""
-    from ufmstar_torch.eval.engine.progress import frame_progress
-    from ufmstar_torch.eval.engine.stream import Stopped, frame_results
-    from ufmstar_torch.eval.run.depth_check import DepthCheck
-    from ufmstar_torch.eval.run.rank import ImageScores, require_part
-    from ufmstar_torch.eval.run.run import warm_up_job
-    from ufmstar_torch.frames.warnings import LOGGER
+    from ufmstar_torch.eval.run.rank import ImageScores
 
     scores, source = ImageScores(options.by, options.measured), None
     with Bars() as bars, stop_signals(bars.say) as stop:
@@ -125,9 +125,6 @@ def _write(options: RankOptions, scores: ImageScores) -> int:
 
     from ufmstar_torch.eval.report.table import csv_text
     from ufmstar_torch.eval.report.text import aligned
-    from ufmstar_torch.eval.run.files import write_bytes_atomic, write_json_atomic
-    from ufmstar_torch.eval.run.panels import contact_sheet
-    from ufmstar_torch.eval.run.pictures import SHEET
 
     out, chosen = Path(options.out), scores.chosen(options.count, diverse=options.diverse)
     rest = sorted(set(range(len(scores.images))) - set(chosen))
