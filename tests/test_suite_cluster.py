@@ -11,8 +11,8 @@ import threading
 import time
 from contextlib import contextmanager
 
-import process_parts
 import pytest
+from process_parts import acting
 from tiny_suite import TRUTH, job_on, stored_results
 
 from ufmstar_torch.eval.commands.evaluate import job_from, read
@@ -54,17 +54,6 @@ def until(condition):
     raise AssertionError("it did not happen within five minutes")
 
 
-def acting(folder, **acts):
-    """A job on sequences with the actions of process_parts.py."""
-    folder.mkdir()
-    for name, act in acts.items():
-        (folder / f"{name}.act").write_text(act)
-    (folder / "alone.toml").write_text('[[rows]]\nmethods = ["DepthOnly"]\n')
-    words = ["--suite", folder / "alone.toml", "--plugin", process_parts.__file__, "--network", TRUTH]
-    words += ["--root", *(f"d={folder / name}.act" for name in acts), "--out", folder / "out"]
-    return job_from(read([str(word) for word in words]))
-
-
 def workers_at(folder, name):
     """The ids of the processes that have opened a sequence."""
     return [int(path.suffix[1:]) for path in folder.glob(f"{name}.[0-9]*")]
@@ -97,7 +86,7 @@ def test_two_workers_give_the_bits_of_one_process(rooms, tmp_path):
 
 def test_another_worker_takes_over_from_a_killed_one(tmp_path):
     folder = tmp_path / "acts"
-    job = acting(folder, a="hold", b="go", c="go")
+    job = job_from(read(acting(folder, TRUTH, "hold", "go", "go")))
     with cluster(tmp_path) as (address, _):
         thread, result = in_thread(job, address)
         until(lambda: workers_at(folder, "a"))
@@ -113,7 +102,7 @@ def test_another_worker_takes_over_from_a_killed_one(tmp_path):
 def test_a_lost_scheduler_ends_the_evaluation_and_finished_records_remain(tmp_path, monkeypatch):
     monkeypatch.setattr(tasks, "_CONNECT_SECONDS", 2)
     folder = tmp_path / "acts"
-    job = acting(folder, a="go", b="hold", c="hold")
+    job = job_from(read(acting(folder, TRUTH, "go", "hold", "hold")))
     with cluster(tmp_path) as (address, scheduler):
         thread, result = in_thread(job, address)
         until(lambda: list(folder.glob("out/records/d/a/*.json")) and workers_at(folder, "b"))
