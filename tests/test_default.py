@@ -87,7 +87,7 @@ def test_every_stream_of_a_batch_has_its_own_evidence():
         torch.testing.assert_close(batch.variance[:1], out.variance, rtol=0, atol=0, equal_nan=True)
         assert torch.equal(batch.depth[1].nan_to_num(), batch.prediction.depth[1].nan_to_num())  # no anchor in the dark
     again = UncertainDepth(TooFar())
-    again.load_state_dict(two.state_dict())
+    again.load_stream_state(two.stream_state())
     again.networks[0].calls = 4
     frame = walk()[4]
     images = np.stack([frame.image, dark])

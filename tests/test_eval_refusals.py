@@ -24,7 +24,6 @@ from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.tour import make_tour, render, tour_path
 from ufmstar_torch.eval.tour.view import intrinsics
 from ufmstar_torch.frames.choose import choose
-from ufmstar_torch.frames.online import TrainDecision
 
 NAN, INF = math.nan, math.inf
 EYE, K = torch.eye(4, dtype=torch.float64), torch.from_numpy(intrinsics(24, 32))
@@ -108,10 +107,6 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: choose([1.0, 2.0], poses=torch.eye(4)[None]), r"poses must be \[2, 4, 4\]"),
     (lambda: choose([1.0, 2.0], poses=torch.eye(4).repeat(2, 1, 1) * NAN), "poses must be finite"),
     (lambda: choose([1.0, -2.0], poses=torch.eye(4).repeat(2, 1, 1)), "scores of at least 0"),
-    *[
-        (partial(TrainDecision, **values), "cost must be finite, first at least 2")
-        for values in ({"cost": NAN}, {"cost": 0.1, "first": 1}, {"cost": 0.1, "half_life": 0.0})
-    ],
     # tours
     *[(partial(tour, name), "tour:SEED") for name in ("tour:", "tour:-1", "tour:a")],
     (lambda: tour("tour:1?colour=red"), "unknown option 'colour'"),

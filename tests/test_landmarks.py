@@ -255,7 +255,7 @@ def test_its_state_continues_and_errors_change_nothing(tour):
     frames, model = pictures(tour), wrapped("corners", on_bad_frame="raise")
     for image, T, K in frames[:3]:
         model(image[None], T, K)
-    saved = {name: value.clone() for name, value in model.state_dict().items()}
+    saved = {name: value.clone() for name, value in model.stream_state().items()}
     assert "landmarks.0.gray" in saved
     image, T, K = frames[3]
     wrong = [
@@ -268,18 +268,18 @@ def test_its_state_continues_and_errors_change_nothing(tour):
     for change in wrong:
         with pytest.raises(ValueError, match=r"image must|floating-point image|pose|valid|pass none|2 streams but"):
             model(**{"image": image[None], "pose": T, "intrinsics": K, **change})
-        after = model.state_dict()
+        after = model.stream_state()
         assert all(torch.equal(after[name], value) for name, value in saved.items())
     expected = model(image[None], T, K).variance
     again = wrapped("corners", on_bad_frame="raise")
-    again.load_state_dict(saved)
+    again.load_stream_state(saved)
     assert torch.equal(again(image[None], T, K).variance, expected)
-    with pytest.raises(RuntimeError, match="landmarks"):
-        wrapped(None, on_bad_frame="raise").load_state_dict(saved)
-    with pytest.raises(RuntimeError, match="anchors: the state must hold"):
-        again.load_state_dict({name: value for name, value in saved.items() if "gray" not in name})
+    with pytest.raises(ValueError, match="landmarks"):
+        wrapped(None, on_bad_frame="raise").load_stream_state(saved)
+    with pytest.raises(ValueError, match="anchors: the state must hold"):
+        again.load_stream_state({name: value for name, value in saved.items() if "gray" not in name})
     again.reset()
-    assert int(again.state_dict()["landmarks.0.view"]) == -1
+    assert int(again.stream_state()["landmarks.0.view"]) == -1
 
 
 def test_a_skipped_frame_is_forgotten_by_its_source(tour):
@@ -290,7 +290,7 @@ def test_a_skipped_frame_is_forgotten_by_its_source(tour):
         out, expected = model(image[None], T, K), clean(image[None], T, K)
     assert torch.equal(out.variance, expected.variance)
     model.reset([0])
-    assert int(model.state_dict()["landmarks.0.view"]) == -1
+    assert int(model.stream_state()["landmarks.0.view"]) == -1
 
 
 @pytest.mark.parametrize("kind", ["corners", "dense"])

@@ -182,15 +182,15 @@ def test_only_a_run_with_anchors_is_repeated_with_anchors(tour, finished, tmp_pa
 
 
 def test_the_flag(tmp_path, capfd):
-    words = ["run", TOUR, "--depth", "self", "--plain", "--anchors", "corners", "--ufm.disagreement", "overlap"]
+    words = ["run", TOUR, "--depth", "self", "--plain", "--anchors", "corners", "--set", "disagreement=overlap"]
     words += ["--no-video", "--no-sheet"]
     assert cli.main([*words, "--frames", ":5", "--out", str(tmp_path / "a")]) == 0
     printed = capfd.readouterr().out
     summary = read_summary(tmp_path / "a")
     assert (summary["settings"]["anchors"], summary["settings"]["plain"], summary["result"]) == ("corners", True, "ufm")
     assert "posterior" not in summary
-    assert summary["settings"]["ufm"]["anchors"] == AnchorConfig().to_dict()
-    assert summary["settings"]["ufm"]["disagreement"] == "overlap"
+    assert summary["settings"]["set"]["anchors"] == AnchorConfig().to_dict()
+    assert summary["settings"]["set"]["disagreement"] == "overlap"
     assert "UfM*, anchored  " in printed
     used, result = (summary["anchors"][key] for key in ("used_per_frame", "found_per_frame"))
     assert f"anchors: {used:.1f} used a frame, of {result:.1f} triangulated" in printed

@@ -11,6 +11,7 @@ from tiny_suite import TRUTH, Stub
 
 from ufmstar_torch.eval.bench import measure as measurement
 from ufmstar_torch.eval.commands.evaluate import job_from, read
+from ufmstar_torch.eval.commands.options import joined
 from ufmstar_torch.eval.methods.suite import names
 from ufmstar_torch.eval.suite.tasks import warned_once
 
@@ -91,9 +92,9 @@ def test_several_roots_and_networks_and_a_file_of_options(rooms, tmp_path):
     job = job_from(read(list(map(str, words[1:]))))
     assert [item.dataset for item in job.items] == ["a", "rooms", "tour"]
     in_file = {"suite": "depth-only", "root": [f"rooms={rooms}"], "network": [TRUTH], "out": "out", "seed": 3}
-    (tmp_path / "eval.yaml").write_text(json.dumps(in_file))
-    options = read(["--config", str(tmp_path / "eval.yaml"), "--seed", "4"])
-    assert (list(options.data.root), options.data.seed) == (in_file["root"], 4)
+    (tmp_path / "eval.json").write_text(json.dumps(in_file))
+    options = read(["--config", str(tmp_path / "eval.json"), "--seed", "4"])
+    assert (joined(options.data.root), options.data.seed) == (tuple(in_file["root"]), 4)
     assert len(job_from(options).items) == 3
 
 

@@ -13,12 +13,12 @@ from ufmstar_torch.anchors.anchors import Anchors, check_anchors
 from ufmstar_torch.anchors.doubts import AnchorDoubts
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.arguments import Array, CameraLike, as_device, as_tensor, require_flag
-from ufmstar_torch.frames.frame import CheckKernel, FrameInput, as_confidence, check_frame, raise_faults
+from ufmstar_torch.frames.frame import FrameInput, as_confidence, check_frame, raise_faults
 from ufmstar_torch.frames.output import MeanUncertainty, StepOutput, UncertaintyOutput
 from ufmstar_torch.frames.warnings import StreamWarnings
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.gaussians.state import NAMES, UfMStarState
-from ufmstar_torch.kernels.select import LateStep, select_check, select_step
+from ufmstar_torch.kernels.select import FrameKernels, LateStep, select_frame, select_step
 from ufmstar_torch.posterior import memory
 from ufmstar_torch.posterior.recalibrate import CONFIDENCE, Recalibration
 from ufmstar_torch.runtime.one_caller import one_caller
@@ -27,7 +27,7 @@ from ufmstar_torch.runtime.warm_up import warm_up
 from ufmstar_torch.steps import variance
 from ufmstar_torch.steps.query import query
 from ufmstar_torch.steps.regress import Regression, at_pixels
-from ufmstar_torch.steps.sample import mean_uncertainty, sample_pixels, sample_size
+from ufmstar_torch.steps.sample import mean_uncertainty, sample_size
 from ufmstar_torch.steps.step import Step
 from ufmstar_torch.steps.step_parts import StepObserver
 
@@ -58,7 +58,7 @@ class UfMStar(StatefulModule):
     STATE = NAMES
     config: UfMStarConfig
     observer: StepObserver | None = None
-    _cached_step: tuple[tuple[str, str], Step, CheckKernel] | None = None
+    _cached_step: tuple[tuple[str, str], Step, FrameKernels] | None = None
 
     def __init__(
         self,
@@ -188,9 +188,10 @@ class UfMStar(StatefulModule):
             depth, pose, intrinsics, aleatoric, epistemic, valid, features, member=member, informative=informative,
             anchors=anchors, confidence=confidence,
         )  # fmt: skip
-        index, used = sample_pixels(frame.valid, sample_size(frame.size, pixels, fraction), seed)
+        kernels = self._kernels(depth.device.type)[1].sample
+        index, used = kernels.pixels(frame.valid, *sample_size(frame.size, pixels, fraction, seed))
         out, maps, _ = self._observe(frame, index, average=require_flag("average", average))
-        return mean_uncertainty(out, maps, used)
+        return mean_uncertainty(out, maps, frame.depth, index, used, kernels.statistics)
 
     def warm_up(
         self, size: tuple[int, int], *, streams: int = 1, progress: Callable[[int, int], object] | None = None
@@ -278,14 +279,14 @@ class UfMStar(StatefulModule):
         frame = check_frame(
             depth, T, K, *maps, **view, feature_count=self.config.features, aleatoric_in_h=self.config.aleatoric_in_h,
             rotation_tolerance=self.config.rotation_tolerance, max_depth=self.config.segment.depth_limit,
-            kernel=self._kernels(depth.device.type)[1],
+            kernel=self._kernels(depth.device.type)[1].check,
         )  # fmt: skip
         if confidence is not None:
             frame = replace(frame, confidence=as_confidence(confidence, frame))
         if anchors is None:
             return frame
         variances = [v for v in variance.network_variances(frame, self.config) if v is not None]
-        checked = check_anchors(anchors, frame, variances)
+        checked = check_anchors(anchors, frame, variances, self._kernels(depth.device.type)[1].check_anchors)
         self._doubts.judge(anchors, checked, frame.size)
         return replace(frame, anchors=checked)
 
@@ -305,9 +306,9 @@ class UfMStar(StatefulModule):
                 raise_faults(frame)
             if self.observer is not None:
                 self.observer.stage("check")
-            step, _ = self._kernels(frame.depth.device.type)
+            step, kernels = self._kernels(frame.depth.device.type)
             state, out = step(state, frame, self.config, pixels=pixels, smooth=average, observer=self.observer)
-            after = variance.corrected(state, frame, out, self.config, self.recalibration, pixels)
+            after = variance.corrected(state, frame, out, self.config, self.recalibration, pixels, kernels.merge)
         # With gradients to A and E.
         V = variance.total_variance(
             after.disagreement, frame, out, self.config, self.recalibration, pixels, after.factor
@@ -321,15 +322,14 @@ class UfMStar(StatefulModule):
         return out, maps, after.quantiles
 
     def _stored(self) -> UfMStarState:
-        buffers = cast("dict[str, Tensor]", self._buffers)  # no buffer is None; avoids ``__getattr__``
-        return self._empty.with_tensors(buffers)
+        return self._empty.with_tensors(cast("dict[str, Tensor]", self._buffers))  # avoids ``__getattr__``
 
-    def _kernels(self, device_type: str) -> tuple[Step, CheckKernel]:
+    def _kernels(self, device_type: str) -> tuple[Step, FrameKernels]:
         """The step and the check for a device. The step is cached, since it may hold pending components."""
         key = (self.config.backend, device_type)
         if self._cached_step is None or self._cached_step[0] != key:
             self._settle()
-            self._cached_step = key, select_step(*key), select_check(*key)
+            self._cached_step = key, select_step(*key), select_frame(*key)
         return self._cached_step[1:]
 
     def _settle(self) -> None:

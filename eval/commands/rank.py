@@ -5,11 +5,11 @@ from __future__ import annotations
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.depth import OWN_DEPTH
-from ufmstar_torch.eval.commands.options import option, positional, reader, usage_errors
+from ufmstar_torch.eval.commands.options import Count, Flag, Positional, Texts, reader, require_least, usage_errors
 from ufmstar_torch.eval.commands.run import StreamOptions, job_from
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.engine.progress import frame_progress
@@ -33,30 +33,33 @@ class RankOptions(StreamOptions):
     """Rank the images of sequences by their uncertainty: the most uncertain ones are to be labelled first.
 
     Writes scores.csv, a line per image, and a contact sheet of the least and the most certain images. Each sequence
-    starts with an empty state. M is the frame's alone, at measured pixels (--ufm.ema_alpha 1, --ufm.unmeasured nan).
+    starts with an empty state. M is the frame's alone, at measured pixels (--set ema_alpha=1, unmeasured=nan).
 
     Attributes:
-        sequences: folders of sequences, video files, or tour:SEED, as for `ufmstar run`
-        out: folder for everything that is written
-        by: rank by the mean of V, M, A, E or B (docs/active_learning.md)
-        diverse: rank only one of several images that show the same place from nearly the same side
-        count: number of images to rank; default: all
-        measured: smallest share of pixels seen from two places; images below it get no rank by total or disagreement
-        overwrite: replace the ranking in --out
+        sequences: Folders of sequences, video files, or tour:SEED, as for `ufmstar run`.
+        out: Write everything to this folder.
+        by: Rank by the mean of V, M, A, E or B (docs/active_learning.md).
+        diverse: Rank only one of several images that show the same place from nearly the same side.
+        count: Rank this many images (default: all).
+        measured: Rank by total or disagreement only images measured at this share of their pixels.
+        overwrite: Replace the ranking in --out.
     """
 
     USAGE: ClassVar[str] = "ufmstar rank SEQUENCE... (--model NAME --weights FILE... | --depth DIR) --out OUT [options]"
 
-    sequences: tuple[str, ...] = positional()
+    sequences: Positional[Texts]
     out: str
-    by: str = option("total", choices=("total", "disagreement", "aleatoric", "epistemic", "anchored"))
-    diverse: bool = False
-    count: int | None = option(None, least=1)
+    by: Literal["total", "disagreement", "aleatoric", "epistemic", "anchored"] = "total"
+    diverse: Flag = False
+    count: Count = None
     measured: float = 0.5
-    overwrite: bool = False
+    overwrite: Flag = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        require_least(self, count=1)
+        if not self.sequences:
+            raise ValueError("a SEQUENCE is missing; ufmstar rank --help")
         if not 0 <= self.measured <= 1:
             raise ValueError(f"--measured must be a share from 0 to 1, got {self.measured}")
         if self.maps.depth not in (None, *OWN_DEPTH) and len(self.sequences) > 1:

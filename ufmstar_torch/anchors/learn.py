@@ -113,7 +113,7 @@ def anchored_term(
     square = depth.square()
     term = (square * excess).sub_(disagreement).clamp_min_(0)
     both = disagreement + term
-    if contradiction is None:
+    if contradiction is None or (contradiction.is_cpu and not contradiction.any()):  # no bound
         return term, both
     least = contradiction.view(-1, *[1] * (depth.dim() - 1)).to(depth.dtype) * square
     return torch.maximum(term, least), torch.maximum(both, disagreement + least)

@@ -39,6 +39,7 @@ FRAME_FAULTS = (
     "intrinsics have their principal point outside the depth map; expected the intrinsics of the depth map, not those "
     "of an image of another size (ufmstar_torch.gaussians.camera.resize_intrinsics)",
 )
+NOT_FINITE = 1  # index of a pose with NaN or infinity
 # Accepted ranges. Within them, no square or quotient of the algorithm leaves the range of float32.
 DEPTH_RANGE = (1e-6, 1e6)  # [m]
 LARGEST = 1e12  # A and E [m^2], and entries of features

@@ -112,7 +112,7 @@ class Corrections(NamedTuple):
 
 def corrected(
     state: UfMStarState, frame: FrameInput, out: StepOutput, config: UfMStarConfig, mapped: VarianceMap | None,
-    pixels: Tensor | None,
+    pixels: Tensor | None, merging: merge.MergeKernels | None = None,
 ) -> Corrections:  # fmt: skip
     """The corrections after a step.
 
@@ -122,6 +122,7 @@ def corrected(
         config: of UfM*.
         mapped: map of V, applied last, or None.
         pixels: [B, n] indices into the flattened image, or None = every pixel, which the posterior needs.
+        merging: implementation of each part of merging; None = the reference.
     """
     M, factor, quantiles = out.disagreement, None, None
     maps, counts = dict[str, Tensor](), dict[str, Tensor]()
@@ -141,7 +142,7 @@ def corrected(
         quantiles, state = posterior.pop("quantiles"), state.with_tensors(learnt)
         maps, counts = maps | posterior, counts | of_posterior
     if config.merge is not None:
-        state, merged = merge.after_frame(state, frame, config)
+        state, merged = merge.after_frame(state, frame, config, merging)
         counts |= merged
     if isinstance(mapped, Recalibration):
         quantiles = normal_where_missing(quantiles, M)

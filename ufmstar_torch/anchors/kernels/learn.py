@@ -7,12 +7,14 @@ other streams change no bit.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors.anchors import FARTHEST_OFF, FEW, Checked
 from ufmstar_torch.anchors.evidence import CLAIM, COUNTS, LEAST_SIGMA, Evidence
 from ufmstar_torch.anchors.kernels.neighbours import grid, supported
 from ufmstar_torch.anchors.learn import Learnt
@@ -28,6 +30,57 @@ from ufmstar_torch.kernels.cpu.threads import each
 
 _PER_CELL = 16  # mean number of anchors in a cell of the search for components
 _NEGLIGIBLE = 1e-30  # smaller means become 0, before single precision loses them
+
+
+def check_anchor_values(
+    pixel: Tensor, depth: Tensor, variance: Tensor, mask: Tensor | None, frame: FrameInput
+) -> Checked:  # fmt: skip
+    """As :func:`ufmstar_torch.anchors.anchors.check_anchor_values`, for CPU tensors; the same values."""
+    streams, n = depth.shape
+    values = [array(x) for x in (pixel, depth, variance)]
+    used = np.ones((streams, n), np.bool_) if mask is None else array(mask)
+    position, valid, index = (
+        np.zeros((streams, n, 2)),
+        np.zeros((streams, n), np.bool_),
+        np.zeros((streams, n), np.int64),
+    )
+    (predicted, out_depth), out_variance = np.ones((2, streams, n)), np.zeros((streams, n))
+    rejected, contradiction = np.zeros(streams, np.int64), np.zeros(streams)
+    outputs = position, index, predicted, out_depth, out_variance, valid, rejected, contradiction
+    inputs = zip(*values, used, array(frame.depth), array(frame.valid), strict=True)
+    each(_check, [(*one, *(x[b : b + 1] if x.ndim == 1 else x[b] for x in outputs)) for b, one in enumerate(inputs)])
+    a, b, c, d, e, f, g, h = map(torch.from_numpy, outputs)
+    return a, b, c, d, e, f, g, h
+
+
+@kernel
+def _check(
+    pixel, depth, variance, mask, depth_map, valid_map, position, index, predicted, out_depth, out_variance, valid,
+    rejected, contradiction,
+):  # fmt: skip
+    """One stream of N anchors; writes where they are usable."""
+    height, width = depth_map.shape
+    fine, square = 0, 0.0
+    for i in range(depth.size):
+        u, v, d, s2 = np.rint(pixel[i, 0]), np.rint(pixel[i, 1]), depth[i], variance[i]
+        if not (mask[i] and 0 < d < np.inf and s2 >= 0 and math.sqrt(s2) < d):
+            continue
+        if not (u >= 0 and u < width and v >= 0 and v < height):
+            continue
+        position[i, 0], position[i, 1] = pixel[i, 0], pixel[i, 1]
+        index[i] = np.int64(v) * width + np.int64(u)
+        z = np.float64(depth_map[np.int64(v), np.int64(u)])
+        if not valid_map[np.int64(v), np.int64(u)]:
+            continue
+        if d <= FARTHEST_OFF * z and z <= FARTHEST_OFF * d:
+            predicted[i], out_depth[i], out_variance[i], valid[i] = z, d, s2, True
+            fine += 1
+        else:
+            r = min(d / z - 1, FARTHEST_OFF)
+            square += r * r
+            rejected[0] += 1
+    if rejected[0] > FEW and rejected[0] > fine:
+        contradiction[0] = square / rejected[0]
 
 
 def inliers(anchors: AnchorInput) -> Tensor:
