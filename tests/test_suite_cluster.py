@@ -17,7 +17,7 @@ from tiny_suite import TRUTH, job_on, stored_results
 
 from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.suite import tasks
-from ufmstar_torch.eval.suite.tasks import evaluate_suite
+from ufmstar_torch.eval.suite.tasks import dask_cluster, evaluate_suite
 
 pytest.importorskip("distributed")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
@@ -64,7 +64,8 @@ def in_thread(job, address):
     result, lines = [], []
 
     def work():
-        result.append((evaluate_suite(job, scheduler=address, threads=1, report=lines.append), lines))
+        with dask_cluster(address) as workers:
+            result.append((evaluate_suite(job, workers, threads=1, report=lines.append), lines))
 
     thread = threading.Thread(target=work)
     thread.start()
@@ -74,8 +75,8 @@ def in_thread(job, address):
 def test_two_workers_give_the_bits_of_one_process(rooms, tmp_path):
     alone, shared = job_on(rooms, tmp_path / "alone"), job_on(rooms, tmp_path / "shared")
     shown = []
-    with cluster(tmp_path) as (address, _):
-        outcome = evaluate_suite(shared, scheduler=address, threads=1, progress=shown.append)
+    with cluster(tmp_path) as (address, _), dask_cluster(address) as workers:
+        outcome = evaluate_suite(shared, workers, threads=1, progress=shown.append)
     assert (outcome.finished, outcome.stopped, dict(outcome.failed)) == (True, False, {})
     assert [(now.done, now.total) for now in shown] == [(1, 3), (2, 3), (3, 3)]
     evaluate_suite(alone)
@@ -114,8 +115,8 @@ def test_a_lost_scheduler_ends_the_evaluation_and_finished_records_remain(tmp_pa
     assert "processes were lost" in lines[-1]
     assert "d/b" in lines[-1]
     assert stored_results(job.out) == before != {}
-    with pytest.raises(OSError, match="Timed out"):
-        evaluate_suite(job, scheduler=address, resume=True)
+    with pytest.raises(OSError, match="Timed out"), dask_cluster(address):
+        pass
     (folder / "release").touch()
     assert evaluate_suite(job, resume=True).finished
     assert len(stored_results(job.out)) == 3

@@ -17,7 +17,7 @@ from trainings import SPEC
 
 from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.run import machine
-from ufmstar_torch.eval.suite.tasks import evaluate_suite
+from ufmstar_torch.eval.suite.tasks import evaluate_suite, process_pool
 from ufmstar_torch.models.spec import build_network
 from ufmstar_torch.models.trained import save_trained
 
@@ -36,7 +36,8 @@ def test_one_process_and_two_give_the_same_bits(rooms, tmp_path):
     words += ["--root", f"rooms={rooms}", "--examples", "0", "--out"]
     one, two = (job_from(read([*words, str(tmp_path / name)])) for name in ("one", "two"))
     lines, shown = list[str](), []
-    outcome = evaluate_suite(two, processes=2, threads=1, report=lines.append, progress=shown.append)
+    with process_pool(2) as pool:
+        outcome = evaluate_suite(two, pool, threads=1, report=lines.append, progress=shown.append)
     assert (outcome.finished, outcome.stopped, dict(outcome.failed)) == (True, False, {})
     assert sorted(line.partition(":")[0] for line in lines) == [f"rooms/{name}" for name in NAMES]
     assert [(now.stage, now.done, now.total) for now in shown] == [("sequences", done, 3) for done in (1, 2, 3)]
@@ -64,7 +65,8 @@ def at_work(folder):
 def in_two(words, stop=lambda: False):
     """Run an evaluation in two processes: whether it finished, and its output lines."""
     lines: list[str] = []
-    return evaluate_suite(job_from(read(words)), processes=2, threads=1, stop=stop, report=lines.append).finished, lines
+    with process_pool(2) as pool:
+        return evaluate_suite(job_from(read(words)), pool, threads=1, stop=stop, report=lines.append).finished, lines
 
 
 @pytest.mark.slow
