@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 from process_parts import acting
@@ -24,20 +25,20 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 
 @contextmanager
-def cluster(folder, workers=2):
+def cluster(folder, threads="1"):
     """A scheduler and its workers in processes of their own: the address, and the scheduler's process."""
     file, running = folder / "scheduler.json", []
     quiet = {"DASK_LOGGING__DISTRIBUTED": "critical", **os.environ}
 
     def begin(kind, *words):
         command = [sys.executable, "-P", "-m", f"distributed.cli.{kind}", "--no-dashboard", "--scheduler-file", file]
-        running.append(subprocess.Popen([*map(str, command), *words], env=quiet, stderr=subprocess.DEVNULL))
+        running.append(subprocess.Popen([*map(str, command), *words], env=quiet, stderr=subprocess.DEVNULL, cwd="/"))
 
     try:
         begin("dask_scheduler", "--port", "0", "--host", "127.0.0.1")
         until(file.exists)
-        for _ in range(workers):
-            begin("dask_worker", "--no-nanny", "--nthreads", "1", "--death-timeout", "60")
+        for _ in range(2):
+            begin("dask_worker", "--no-nanny", "--nthreads", threads, "--death-timeout", "60")
         yield json.loads(file.read_text())["address"], running[0]
     finally:
         for process in running:
@@ -72,10 +73,12 @@ def in_thread(job, address):
     return thread, result
 
 
-def test_two_workers_give_the_bits_of_one_process(rooms, tmp_path):
-    alone, shared = job_on(rooms, tmp_path / "alone"), job_on(rooms, tmp_path / "shared")
+def test_two_workers_give_the_bits_of_one_process(rooms, tmp_path, monkeypatch):
+    """Each has two threads and another working folder."""
+    monkeypatch.chdir(tmp_path)
+    alone, shared = job_on(rooms, tmp_path / "alone"), job_on(rooms, Path("shared"))
     shown = []
-    with cluster(tmp_path) as (address, _), dask_cluster(address) as workers:
+    with cluster(tmp_path, "2") as (address, _), dask_cluster(address) as workers:
         outcome = evaluate_suite(shared, workers, threads=1, progress=shown.append)
     assert (outcome.finished, outcome.stopped, dict(outcome.failed)) == (True, False, {})
     assert [(now.done, now.total) for now in shown] == [(1, 3), (2, 3), (3, 3)]

@@ -15,9 +15,10 @@ import signal
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, ProcessPoolExecutor, wait
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from threading import Thread
+from pathlib import Path
+from threading import Lock, Thread
 from typing import Any
 
 import torch
@@ -65,7 +66,8 @@ def evaluate_suite(
     Args:
         job: the evaluation.
         executor: of the sequences, such as :func:`process_pool` or :func:`dask_cluster`; None = this process. Its
-            processes need this package, and all files under the paths that they have here.
+            processes need this package, and all files and the working folder under the paths that they have here.
+            Each evaluates one sequence at a time, whatever its number of threads.
         threads: CPU threads of each process of the executor; None = its own choice.
         resume, overwrite: see ``evaluation_folder``.
         stop: called before every frame; True ends the work.
@@ -167,8 +169,8 @@ def _on_executor(
 ) -> bool:
     """Evaluate the sequences on an executor, a task each. Returns True if all tasks ended. Raises RuntimeError: a task
     failed; the others end after their current frame."""
-    folder, total = job.folder, len(job.items)
-    stop_file, content = job.out / STOP, pickle.dumps((job, threads))
+    folder, total, stop_file = job.folder, len(job.items), job.out.absolute() / STOP
+    content = pickle.dumps((replace(job, out=job.out.absolute()), threads, Path.cwd()))
     stop_file.unlink(missing_ok=True)  # of a process that was killed
     running = {executor.submit(evaluate_task, content, item): item for item in job.items}
     lost, failure = False, None
@@ -199,25 +201,33 @@ def _on_executor(
 
 
 def evaluate_task(content: bytes, item: WorkItem) -> str:
-    """Evaluate a sequence in a process of an executor; ``content`` is the pickled job and its number of threads, or
-    None. Returns and raises as ``evaluate_item``."""
-    job, threads = pickle.loads(content)
+    """Evaluate a sequence in a process of an executor. Returns and raises as ``evaluate_item``.
+
+    Args:
+        content: the pickled job, with an absolute output folder, its number of threads (None = unchanged), and the
+            folder to which other paths are relative.
+        item: the sequence.
+    """
+    job, threads, folder = pickle.loads(content)
     stop_file = job.out / STOP
     if stop_file.exists():
         raise Stopped
     if threads is not None:
         torch.set_num_threads(threads)
-    return evaluate_item(job, item, _judge(content), stop=stop_file.exists)
+    judge, lock = _judge(content)
+    with lock:
+        os.chdir(folder)
+        return evaluate_item(job, item, judge, stop=stop_file.exists)
 
 
 @lru_cache(maxsize=1)
-def _judge(content: bytes) -> Judge:
-    """The judge of a pickled job, loaded once in every process."""
-    job, _ = pickle.loads(content)
+def _judge(content: bytes) -> tuple[Judge, Lock]:
+    """The judge of a pickled job, loaded once in every process, and the lock of the thread that uses it."""
+    job, _, folder = pickle.loads(content)
+    os.chdir(folder)
     logging.getLogger("ufmstar_torch").addFilter(_once())
     device = torch.device(job.device)
-    judge: Judge = job.judge(job.load(device), device)
-    return judge
+    return job.judge(job.load(device), device), Lock()
 
 
 def _once() -> Callable[[logging.LogRecord], bool]:
