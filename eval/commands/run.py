@@ -66,7 +66,7 @@ class RunOptions(StreamOptions):
 
     Attributes:
         sequence: The folder of the sequence, or a video file, or tour:SEED for rendered rooms.
-        out: Write everything to this folder.
+        out: Write everything to this folder; after an interruption, the same command computes the rest.
         overwrite: Replace another run in --out; the predictions in its cache are kept.
         no_video: Leave preview.mp4 out.
         no_sheet: Leave contact_sheet.png out.
