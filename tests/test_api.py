@@ -31,7 +31,7 @@ PUBLIC = {
     "SPGFConfig",
     "UfMStar",
     "UfMStarConfig",
-    "UfMStarOutput",
+    "UncertaintyOutput",
     "UncertainDepth",
 }
 
@@ -52,10 +52,10 @@ def test_public_names():
 
 def test_signatures():
     observation = ["depth", "pose", "intrinsics", "aleatoric", "epistemic", "valid", "features"]
-    assert names(UfMStar.__init__) == ["config", "extensions", "dtype", "device"]
-    view = ["member", "informative"]
-    assert names(UfMStar.forward) == [*observation, *view, "inputs"]
-    assert names(UfMStar.mean_uncertainty) == [*observation, *view, "pixels", "fraction", "seed", "average", "inputs"]
+    assert names(UfMStar.__init__) == ["config", "recalibration", "dtype", "device"]
+    view, sampled = ["member", "informative"], ["pixels", "fraction", "seed", "average"]
+    assert names(UfMStar.forward) == [*observation, *view, "anchors", "confidence"]
+    assert names(UfMStar.mean_uncertainty) == [*observation, *view, *sampled, "anchors", "confidence"]
     assert names(UfMStar.query) == ["points", "frame"]
     assert names(UfMStar.reset) == ["streams", "keep_evidence"]
     made_of = [

@@ -116,7 +116,6 @@ MISTAKES = {
     "no data": ("--depth self --device meta", "--device meta is not"),
     "threads": ("--depth self --threads 0", "--threads"),
     "threads without measure": ("--depth self --threads 10000", "--threads must be 1 to"),
-    "contradiction": ("--depth self --resume --overwrite", "--resume and --overwrite contradict"),
     "report": ("ufmstar report", "The folder of `ufmstar eval`. (required)"),
     "bench: kind": ("ufmstar bench --frames x", "frames"),
     "bench: frames": ("ufmstar bench --frames 0", "--frames must be at least 1"),
@@ -157,8 +156,7 @@ MISTAKES = {
     "eval: spec": (f"{EVAL} --network depth_only=torchscript:n.ts --spec s", "--spec must be a file *.json"),
     "eval: no root": (f"{EVAL} --root /nowhere", "no such file or folder: /nowhere"),
     "eval: frames": (f"{EVAL} --root /nowhere --frames 5", "--frames must be START:STOP"),
-    "eval: shard": (f"{EVAL} --root /nowhere --shard 3/2", "--shard must be 1/n to n/n"),
-    "eval: shard and overwrite": (f"{EVAL} --shard 1/2 --overwrite", "--overwrite goes without shards"),
+    "eval: two kinds of processes": (f"{EVAL} --processes 2 --scheduler tcp://h:1", "give one of them"),
     "eval: both": (f"{EVAL} --resume --overwrite", "--resume and --overwrite contradict"),
     "eval: processes": (f"{EVAL} --processes 0", "--processes must be at least 1"),
     "eval: sequences": (f"{EVAL} --sequences 0", "--sequences must be at least 1"),
@@ -272,10 +270,9 @@ def test_other_weights_under_the_same_name_do_not_go_on(ufmstar, path, tmp_path,
     words = ("run", path, "--model", "any", "--weights", *brightness.files, *QUICK, "--out", tmp_path / "out")
     assert ufmstar(*words)[0] == 0
     brightness.files[1].write_text("1.2")
-    code, _, err = ufmstar(*words, "--resume")
+    code, _, err = ufmstar(*words)
     assert code == 2
     assert "source.files.1.sha256 was" in err
-    assert ufmstar(*words)[0] == 2
     assert ufmstar(*words, "--overwrite")[0] == 0
 
 
@@ -294,15 +291,15 @@ def test_a_signal_ends_the_run_after_the_frame_in_hand(ufmstar, path, tmp_path, 
     code, _, err = ufmstar(*words, "--out", tmp_path / "out")
     assert code == 130
     assert "stopping after this frame" in err
-    assert "interrupted: stopped by the user after 3 of 6 frames; --resume goes on" in err
+    assert "interrupted: stopped by the user after 3 of 6 frames; the same command" in err
     assert signal.getsignal(signal.SIGINT) is before
     assert read_summary(tmp_path / "out")["state"] == "interrupted"
     brightness.at = None
-    assert ufmstar(*words, "--out", tmp_path / "out", "--resume")[0] == 0
-    whole, resumed = outputs(tmp_path / "whole"), outputs(tmp_path / "out")
-    for result in (whole, resumed):
+    assert ufmstar(*words, "--out", tmp_path / "out")[0] == 0
+    whole, again = outputs(tmp_path / "whole"), outputs(tmp_path / "out")
+    for result in (whole, again):
         del result["summary.json"]["settings"]["out"]
-    assert whole == resumed
+    assert whole == again
 
 
 def test_a_second_signal_ends_it_at_once(ufmstar, path, tmp_path, brightness):

@@ -21,7 +21,6 @@ from ufmstar_torch.eval.methods.suite import Suite, suite_named
 from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.eval.metrics.recalibration import fit
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.eval.suite.work_items import Shard
 from ufmstar_torch.eval.tour import make_tour, render, tour_path
 from ufmstar_torch.eval.tour.view import intrinsics
 from ufmstar_torch.frames.choose import choose
@@ -92,8 +91,6 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: network("depth_only=onnx:net.onnx,a.json,b.json"), "one spec"),
     (lambda: network("aleatoric=ground-truth"), "goes with depth_only"),
     (lambda: network("depth_only=ground-truth:48"), "HxW"),
-    # shards
-    *[(partial(Shard.parse, text), "--shard must be") for text in ("0/2", "3/2", "1", "1/0", "a/b", "1/2/3", "-1/2")],
     # recalibration
     *[
         (partial(Recalibration, *knots), "Recalibration")

@@ -159,7 +159,7 @@ def test_refusals(
         choice.load(CPU, inference=Inference(**inference))
 
 
-def test_a_resumed_run_is_the_same_and_needs_the_same_runtime(tmp_path: Path, weights: Path) -> None:
+def test_a_run_that_begins_again_is_the_same_and_needs_the_same_runtime(tmp_path: Path, weights: Path) -> None:
     write_tum(tmp_path / "seq")
     sequence = open_sequence(tmp_path / "seq" / "rgbd_dataset_freiburg2_desk")
 
@@ -170,8 +170,8 @@ def test_a_resumed_run_is_the_same_and_needs_the_same_runtime(tmp_path: Path, we
     stops = iter([False, True])
     run(job(Inference()), tmp_path / "out", stop=lambda: next(stops))
     with pytest.raises(FolderError, match="runtime"):
-        run(job(Inference("torch")), tmp_path / "out", resume=True)
-    run(job(Inference()), tmp_path / "out", resume=True)
+        run(job(Inference("torch")), tmp_path / "out")
+    run(job(Inference()), tmp_path / "out")
     assert outputs(tmp_path / "out") == outputs(tmp_path / "whole")
     about = read_summary(tmp_path / "out")["runtime"]
     assert about["name"] == "onnxruntime"

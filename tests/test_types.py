@@ -115,7 +115,7 @@ def test_a_type_checker_knows_what_a_call_returns_and_accepts_the_short_examples
         assert len([line for line in example.read_text().splitlines() if line]) < 64, name
     mypy = [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "own.py", *names]
     output = subprocess.run(mypy, cwd=tmp_path, capture_output=True, text=True, check=False).stdout
-    assert 'own.py:7: note: Revealed type is "ufmstar_torch.uncertain_depth.UncertainPrediction"' in output, output
+    assert 'own.py:7: note: Revealed type is "ufmstar_torch.frames.output.UncertaintyOutput"' in output, output
     assert 'own.py:8: note: Revealed type is "torch._tensor.Tensor"' in output, output
     assert "own.py:9: error: Too few arguments" in output, output
     assert 'own.py:10: error: Argument "mode"' in output, output

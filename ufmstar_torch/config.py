@@ -210,8 +210,8 @@ class MergeConfig(Checked):
 
 @dataclass(frozen=True)
 class UfMStarConfig(Checked):
-    """All settings of UfM*. The defaults are the paper's except for those listed in :meth:`paper`. Extensions that are
-    not in the paper have a section each, None = off.
+    """All settings of UfM*. The defaults are the paper's except for those listed in :meth:`paper`. What is not in
+    the paper has a section each, None = off.
 
     Attributes:
         segment: thresholds of the segmentation
@@ -241,10 +241,10 @@ class UfMStarConfig(Checked):
             limit
         on_bad_frame: refuse a frame with a fault, or skip and count it
         backend: implementation of the kernels
-        anchors: use anchors, sparse measured depths (an extension)
-        confidence: with anchors, learn what the network's confidence means (an extension)
-        posterior: with anchors, also a corrected depth and its variance (an extension)
-        merge: join Gaussians that overlap (an extension)
+        anchors: use anchors, sparse measured depths (not in the paper)
+        confidence: with anchors, learn what the network's confidence means (not in the paper)
+        posterior: with anchors, also a corrected depth and its variance (not in the paper)
+        merge: join Gaussians that overlap (not in the paper)
     """
 
     segment: SPGFConfig = section(SPGFConfig)
@@ -283,7 +283,7 @@ class UfMStarConfig(Checked):
     on_bad_frame: str = choice("raise", "skip")
     backend: str = choice("auto", "torch", "numba", "triton")
 
-    # Extensions, not in the paper
+    # Not in the paper
     anchors: AnchorConfig | None = section(AnchorConfig, optional=True)
     confidence: ConfidenceConfig | None = section(ConfidenceConfig, optional=True)
     posterior: PosteriorConfig | None = section(PosteriorConfig, optional=True)

@@ -54,6 +54,7 @@ class BenchSettings:
         frames: Time this many frames.
         history: Pass this many frames before them.
         threads: Use this many CPU threads (default: the cores of this process).
+        clock: Measure wall time, or cpu: the processor time of one thread, on a machine with other load.
         device: Run network and UfM* on cpu, cuda or cuda:N.
         streams: Also time UfM* alone on these numbers of simultaneous streams.
         json: Write the report to this file.
@@ -70,6 +71,7 @@ class BenchSettings:
     frames: int = 40
     history: int = 60
     threads: int | None = None
+    clock: Literal["wall", "cpu"] = "wall"
     device: str = "cpu"
     streams: tuple[int, ...] = ()
     json: Path | None = None
@@ -77,6 +79,8 @@ class BenchSettings:
     def __post_init__(self) -> None:
         if self.weights is None and self.model not in ARCHITECTURES:
             raise ValueError(f"--model {self.model} needs --weights; without, it is one of {', '.join(ARCHITECTURES)}")
+        if self.clock == "cpu" and (self.device != "cpu" or self.threads != 1):
+            raise ValueError("--clock cpu needs --threads 1 on the CPU: it is the time of all threads together")
         for name in ("frames", "history"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
@@ -95,7 +99,9 @@ def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None
     """
     device = torch.device(require_device(options.device))
     threads = options.threads or most_threads()
-    plan = Plan(frames=options.frames, warm_up=options.history, threads=threads, windows=1)
+    plan = Plan(
+        frames=options.frames, warm_up=options.history, threads=threads, windows=1, clock=options.clock, samples=True
+    )
     networks = (
         [_loaded(options, threads, device)] if options.weights else (_random(options, s, device) for s in options.sizes)
     )
@@ -192,6 +198,11 @@ def _lines(result: Mapping[str, Any]) -> list[str]:
         if row["stages"] is not None:
             stages = row["stages"]["stages"].items()
             lines.append(f"stages of {row['row']}: " + ", ".join(f"{n} {t['median_ms']:.2f}" for n, t in stages))
+        if (sample := row["sample"]) is not None:
+            times, ratio = sample["latency"], sample["ratio_to_step"]["median"]
+            beside = row["stages"]["beside_the_paper"]["median"]
+            lines.append(f"mean over 1,000 pixels {times['median_ms']:.2f} ms, x step {ratio:.3f}; ")
+            lines[-1] += f"check and average, which the paper does not have, x step {beside:.3f}"
     for line in result["streams"]:
         forms = (f"{name} {line[name]['median_ms']:.2f} ms" for name in ("step", "graph") if name in line)
         lines.append(f"{line['streams']} streams at once: {', '.join(forms)}")

@@ -146,7 +146,7 @@ def _contrasts(model: UncertainDepth, sequence: FrameSequence) -> list[Contrast]
     found = []
     for n, frame in enumerate(sequence):
         out = model(image_tensor(frame), frame.T_world_cam, frame.intrinsics)
-        aleatoric = out.prediction.aleatoric_variance
+        aleatoric = out.aleatoric
         if aleatoric is None:
             return []
         if n % 5 or n < 30:
@@ -154,7 +154,7 @@ def _contrasts(model: UncertainDepth, sequence: FrameSequence) -> list[Contrast]
         depth = out.depth[0].numpy()
         truth = truth_at(frame, out.intrinsics[0].numpy(), depth.shape)
         assert truth is not None
-        usable = (truth > 0) & (out.ufm.measured[0].numpy() > 0.5) & np.isfinite(out.variance[0].numpy())
+        usable = (truth > 0) & (out.measured[0].numpy() > 0.5) & np.isfinite(out.variance[0].numpy())
         image = image_tensor(frame)[0].permute(1, 2, 0).numpy()
         roots = (aleatoric[0].sqrt().numpy(), np.nan_to_num(out.disagreement[0].sqrt().numpy()))
         found.append(Contrast(image, *roots, np.abs(depth - truth), usable))

@@ -19,16 +19,17 @@ from ufmstar_torch.anchors.sources import landmark_source
 from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork
-from ufmstar_torch.eval.bench.timing import StagedStep
+from ufmstar_torch.eval.bench.timing import Clock, StagedStep
 from ufmstar_torch.eval.engine.clock import synchronize
-from ufmstar_torch.eval.engine.estimators import Answer, Gaussians, Pointwise, make_estimator
+from ufmstar_torch.eval.engine.estimators import Gaussians, Pointwise, make_estimator
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.frames.prediction import DepthPrediction
+from ufmstar_torch.uncertain_depth import maps_of
 
-MULTIVIEW = "multiview"
+MULTIVIEW, SAMPLE = "multiview", "sample"
 # ``Setting.anchors`` that are measured: the name of their source of landmarks.
 ANCHORS = {"": None, "corners": "corners", "dense": "dense"}
 Part = tuple[str, str]  # the owner of a part, a base or a row by its label, and the part
@@ -42,22 +43,33 @@ class MultiviewStep:
         anchors = ANCHORS[row.setting.anchors]
         self._landmarks = None if anchors is None else StreamLandmarks(landmark_source(anchors))
 
-    def __call__(
-        self, image: Tensor | None, frame: Frame, prediction: DepthPrediction, *, first: bool = False
-    ) -> Answer:
+    def __call__(self, image: Tensor | None, frame: Frame, prediction: DepthPrediction, *, first: bool = False) -> None:
         """Move a frame's maps to the device, track landmarks in its ``image`` [1, 3, H, W], and run the step.
         ``first`` resets the state before."""
         if first:
-            assert isinstance(self.estimator, Pointwise | Gaussians)
-            self.estimator.ufm.reset()
-            if self._landmarks is not None:
-                self._landmarks.reset()
+            self.reset()
         anchors, T = None, torch.from_numpy(frame.T_world_cam)
         if self._landmarks is not None:
             K = torch.from_numpy(frame.intrinsics)
             anchors = self._landmarks.update(image, T, K, UfMStarConfig.rotation_tolerance)
             anchors = anchors.moved(K, prediction.K).to(self._device)
-        return self.estimator.update(prediction.to(self._device), T, anchors)
+        self.estimator.update(prediction.to(self._device), T, anchors)
+
+    def sample(self, frame: Frame, prediction: DepthPrediction, *, first: bool = False) -> None:
+        """Average the uncertainty of a frame's map over 1,000 pixels; ``first`` resets the state before."""
+        if first:
+            self.reset()
+        assert isinstance(self.estimator, Gaussians)
+        prediction, T = prediction.to(self._device), torch.from_numpy(frame.T_world_cam)
+        maps = maps_of(self.estimator.used(prediction), self.estimator.ufm)
+        self.estimator.ufm.mean_uncertainty(pose=T, intrinsics=prediction.K, **maps)
+
+    def reset(self) -> None:
+        """Reset the state."""
+        assert isinstance(self.estimator, Pointwise | Gaussians)
+        self.estimator.ufm.reset()
+        if self._landmarks is not None:
+            self._landmarks.reset()
 
     def memory(self) -> dict[str, float]:
         """Bytes of the state, that of anchors included; number of points or components; bytes of the smoothing map."""
@@ -80,8 +92,8 @@ class TimedParts:
         size: of the depth maps, "224 x 224" [px].
     """
 
-    def __init__(self, warm_up: int) -> None:
-        self.warm_up, self.size = warm_up, ""
+    def __init__(self, warm_up: int, clock: Clock) -> None:
+        self.warm_up, self.size, self._clock = warm_up, "", clock
         self.calls: dict[Part, list[Callable[[], Any]]] = {}
         self.staged: dict[str, StagedStep] = {}
         self.memory: dict[str, dict[str, float]] = {}
@@ -98,9 +110,9 @@ class TimedParts:
             call = partial(_finish, calls[part], device)
             self.calls.setdefault(part, []).append(call)
             synchronize(device)
-            started = time.perf_counter()
+            started = self._clock()
             results[part] = call()
-            self._ms.setdefault(part, []).append(1e3 * (time.perf_counter() - started))
+            self._ms.setdefault(part, []).append(1e3 * (self._clock() - started))
         return results
 
 
@@ -124,16 +136,21 @@ def time_parts(
     warm_up: int,
     device: torch.device,
     multiview_device: torch.device,
+    samples: bool = False,
+    clock: Clock = time.perf_counter,
 ) -> TimedParts:
-    """Run every part of every row on every frame. Arguments as ``measure.measure``. Raises FrameError: no image."""
-    parts, steps = TimedParts(warm_up), dict[str, MultiviewStep]()
+    """Run every part of every row on every frame. Arguments as ``measure.measure``; with ``samples``, the part
+    ``SAMPLE`` of UfM* without anchors, too; ``clock`` returns seconds. Raises FrameError: no image."""
+    parts, steps, sampled = TimedParts(warm_up, clock), dict[str, MultiviewStep](), dict[str, MultiviewStep]()
     forms = {row.method.base: {DEPTH} for row in rows}
     for row in rows:
         forms[row.method.base].add(inference_of(row))
         if row.method.fusion != ALONE:
             steps[row.label], twin = (MultiviewStep(row, multiview_device) for _ in range(2))
             if isinstance(twin.estimator, Gaussians) and not row.setting.anchors:
-                parts.staged[row.label] = StagedStep(twin.estimator.ufm, twin, multiview_device)
+                parts.staged[row.label] = StagedStep(twin.estimator.ufm, twin, multiview_device, clock)
+                if samples:
+                    sampled[row.label] = MultiviewStep(row, multiview_device)
     for turn, frame in enumerate(frames):
         prepared = {base: networks[base].prepare(frame, device) for base in forms}
         inferences: dict[Part, Callable[[], DepthPrediction]] = {
@@ -149,6 +166,10 @@ def time_parts(
             inputs[row.label] = image, frame, replace(maps[base, inference_of(row)], intrinsics=K)
         multiview: dict[Part, Callable[[], Any]] = {
             (label, MULTIVIEW): partial(step, *inputs[label], first=turn == 0) for label, step in steps.items()
+        }
+        multiview |= {
+            (label, SAMPLE): partial(step.sample, *inputs[label][1:], first=turn == 0)
+            for label, step in sampled.items()
         }
         parts.run(turn, multiview, multiview_device)
         for label, staged in parts.staged.items():

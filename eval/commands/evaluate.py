@@ -32,8 +32,8 @@ from ufmstar_torch.eval.methods.suite import listing, suite_named
 from ufmstar_torch.eval.sequences.frame import parse_slice
 from ufmstar_torch.eval.suite.job import EvalJob, require_methods, with_recalibrations
 from ufmstar_torch.eval.suite.record import ResultsError
-from ufmstar_torch.eval.suite.shards import EvalOutcome, evaluate_suite
-from ufmstar_torch.eval.suite.work_items import ALL, Shard, find_work, read_names
+from ufmstar_torch.eval.suite.tasks import EvalOutcome, evaluate_suite
+from ufmstar_torch.eval.suite.work_items import find_work, read_names
 
 # Options that are fields of a job with the same name.
 _OF_JOB = ("device", "bins", "examples", "samples", "runtime", "precision")
@@ -130,13 +130,13 @@ class EvalOptions(MachineOptions):
     """The rows of a table or figure of the paper, on sequences of your own.
 
     A sequence's rows are written when its last frame is done: whatever ends the program, --resume computes what is
-    missing. The work can be divided: --processes on one computer, --shard in a cluster's job array.
+    missing. The sequences can be divided: --processes on one computer, --scheduler on a Dask cluster.
 
     Attributes:
         device: Run on cpu or cuda; each of several --processes takes the next GPU in turn.
         threads: Each process uses this many CPU threads (default: all cores, divided among --processes).
         processes: Run this many processes on this computer.
-        shard: Evaluate only the i-th of n parts of the sequences, i/n from 1/n to n/n.
+        scheduler: Run on the Dask cluster of this scheduler, tcp://HOST:8786, whose workers see the same files.
         dry_run: Show rows and sequences, and stop.
     """
 
@@ -145,7 +145,7 @@ class EvalOptions(MachineOptions):
     )
 
     processes: int = 1
-    shard: Text = None
+    scheduler: Text = None
     dry_run: Flag = False
     what: SuiteOptions
     data: DataOptions
@@ -161,16 +161,10 @@ class EvalOptions(MachineOptions):
             if not values[name]:
                 raise ValueError(f"--{name} is missing; ufmstar eval --help, and --list for the suites")
         parse_slice(self.data.frames)
-        _ = self.part
         if self.output.resume and self.output.overwrite:
             raise ValueError("--resume and --overwrite contradict each other")
-        if self.shard and self.output.overwrite:
-            raise ValueError("--overwrite goes without shards: another one may have begun")
-
-    @property
-    def part(self) -> Shard:
-        """The shard. Raises ValueError: no such part."""
-        return ALL if self.shard is None else Shard.parse(self.shard)
+        if self.scheduler is not None and self.processes > 1:
+            raise ValueError("--processes are of this computer, --scheduler has its own: give one of them")
 
 
 read = reader(EvalOptions, "ufmstar eval")
@@ -221,7 +215,7 @@ def job_from(options: EvalOptions) -> EvalJob:
 
 def _evaluate(options: EvalOptions) -> int:
     how: dict[str, Any] = {"resume": options.output.resume, "overwrite": options.output.overwrite}
-    how |= {"processes": options.processes, "threads": options.threads}
+    how |= {"processes": options.processes, "scheduler": options.scheduler, "threads": options.threads}
     with Bars() as bars, stop_signals(bars.say) as stop:
         job = job_from(options)
         for base in job.unused:
@@ -233,7 +227,7 @@ def _evaluate(options: EvalOptions) -> int:
             warm_up_command(config, bars.show, anchors)
         if sys.stderr.isatty():
             how["progress"] = bars.show
-        outcome = evaluate_suite(job, shard=options.part, **how, stop=stop, report=bars.say)
+        outcome = evaluate_suite(job, **how, stop=stop, report=bars.say)
     return _report(job, outcome, options)
 
 
@@ -250,9 +244,9 @@ def _report(job: EvalJob, outcome: EvalOutcome, options: EvalOptions) -> int:
     if job.missing_bases:
         print(f"left out, without a --network: the rows of {', '.join(job.missing_bases)}")
     print(f"{job.out}: eval.json, records/DATASET/SEQUENCE/ with a record for every row", flush=True)
-    if outcome.complete and job.suite.efficiency:
+    if outcome.finished and job.suite.efficiency:
         _measure(job, options.threads)
-    if outcome.complete and not options.output.no_report:
+    if outcome.finished and not options.output.no_report:
         try:
             print(written(job.out, write_report(job.out)))
         except (ImportError, ResultsError) as error:
@@ -265,8 +259,6 @@ def _report(job: EvalJob, outcome: EvalOutcome, options: EvalOptions) -> int:
     if outcome.failed or not outcome.finished:
         print("ufmstar eval: not all sequences are complete; --resume tries the rest again", file=sys.stderr)
         return 1
-    if not outcome.complete:
-        print("ufmstar eval: this shard is complete, others are not: the last one makes the report", file=sys.stderr)
     return 0
 
 
@@ -286,15 +278,15 @@ def _dry_run(options: EvalOptions) -> int:
     job = job_from(options)
     for base in job.unused:
         print(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")
-    networks, items = job.load(torch.device("cpu")), options.part.of(job.items)
+    networks = job.load(torch.device("cpu"))
     print(f"{job.suite.name}: {job.suite.title}\n{len(job.suite.rows)} rows:")
     for row in job.suite.rows:
         print(f"  {row.label}  [{networks[row.method.base].label}]")
     if job.missing_bases:
         print(f"left out, without a --network: the rows of {', '.join(job.missing_bases)}")
-    print(f"{len(items)} of {len(job.items)} sequences:")
+    print(f"{len(job.items)} sequences:")
     total = 0
-    for item in items:
+    for item in job.items:
         try:
             frames = len(range(len(item.open()))[job.frames])
         except (OSError, ValueError) as error:
@@ -302,5 +294,5 @@ def _dry_run(options: EvalOptions) -> int:
             continue
         print(f"  {item.label}: {frames} frames")
         total += frames
-    print(f"{total} frames, {len(items) * len(job.suite.rows)} records")
+    print(f"{total} frames, {len(job.items) * len(job.suite.rows)} records")
     return 0

@@ -249,8 +249,8 @@ def _write(out: Path, result: LiveResult) -> None:
     """Write the maps of an image to OUT/STAMP.npz."""
     of = result.out
     maps = {"depth": of.depth, "variance": of.variance, "disagreement": of.disagreement}
-    if of.ufm.posterior_depth is not None:
-        maps |= {"network_depth": of.prediction.depth, "ufm_variance": of.ufm.variance}
+    if of.posterior_outlier is not None:
+        maps |= {"network_depth": of.network_depth, "ufm_variance": of.ufm_variance}
     arrays = {name: value[0].cpu().numpy() for name, value in maps.items()}
     camera = {"T_world_cam": result.T_world_cam, "intrinsics": result.out.intrinsics[0].cpu().numpy()}
     write_atomic(out / f"{result.stamp:.6f}.npz", lambda file: np.savez(file, allow_pickle=False, **arrays, **camera))
@@ -258,7 +258,7 @@ def _write(out: Path, result: LiveResult) -> None:
 
 def _shown(result: LiveResult, number: int, figures: dict[str, float]) -> RunFrame:
     """The result in the viewer's form."""
-    out, valid = result.out, result.out.ufm.valid[0]
+    out, valid = result.out, result.out.valid[0]
     depth, sigma = (torch.where(valid, values[0], torch.nan).cpu().float().numpy() for values in (out.depth, out.std))
     about = (f"{result.stamp:.6f}", number, result.stamp, result.T_world_cam)
     K = out.intrinsics[0].cpu().double().numpy()
@@ -273,7 +273,7 @@ def _figures(result: LiveResult, live: LiveDepth) -> dict[str, float]:
         "latency_ms": round(1000 * result.latency, 2),
         "depth_m": round(float(depth.nanmedian()), 3),
         "sigma_m": round(float(std.nanmedian()), 3),
-        "components": int(result.out.ufm.statistics.components[0]),
+        "components": int(result.out.statistics.components[0]),
         "dropped": sum(counts.dropped.values()),
         "skipped": sum(counts.skipped.values()),
     }

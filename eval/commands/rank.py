@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -11,8 +12,8 @@ from ufmstar_torch.eval.commands.depth import OWN_DEPTH
 from ufmstar_torch.eval.commands.options import Count, Flag, Positional, Texts, reader, require_least, usage_errors
 from ufmstar_torch.eval.commands.run import StreamOptions, job_from
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-from ufmstar_torch.eval.engine.progress import ProgressSink
-from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
+from ufmstar_torch.eval.engine.progress import frame_progress
+from ufmstar_torch.eval.engine.stream import Stopped, frame_results
 from ufmstar_torch.eval.run.depth_check import DepthCheck
 from ufmstar_torch.eval.run.files import write_bytes_atomic, write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
@@ -21,7 +22,6 @@ from ufmstar_torch.eval.run.panels import contact_sheet
 from ufmstar_torch.eval.run.pictures import SHEET
 from ufmstar_torch.eval.run.rank import ImageScores, require_part
 from ufmstar_torch.eval.run.run import warm_up_job
-from ufmstar_torch.eval.run.run_folder import Checkpoint
 from ufmstar_torch.frames.warnings import LOGGER
 
 SCORES, SETTINGS = "scores.csv", "rank.json"
@@ -102,9 +102,13 @@ def _scores(options: RankOptions) -> ImageScores:
             source, scores.sequence = job.source, path
             if job.image_fit is not None and job.image_fit.problem:
                 LOGGER.warning("%s: %s", path, job.image_fit.problem)
-            stream, check = FrameStream(job.sequence, job.indices, [job.row(Checkpoint())]), DepthCheck(job)
+            check, shown = DepthCheck(job), frame_progress(bars.show, len(job.indices))
             try:
-                stream.drive([scores, check, ProgressSink(bars.show)], stop=stop)
+                with closing(frame_results(job.sequence, job.indices, [job.row()[0]], stop=stop)) as results:
+                    for result in results:
+                        scores.add(result)
+                        check.add(result)
+                        shown(result)
             except Stopped:
                 raise KeyboardInterrupt from None
             if (fit := check.fit()) is not None and fit.problem:

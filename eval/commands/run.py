@@ -17,7 +17,7 @@ from ufmstar_torch.eval.commands.opening import OpeningOptions
 from ufmstar_torch.eval.commands.options import Flag, MachineOptions, Positional, Text, as_dict, reader, usage_errors
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.engine.anchors import landmarks_of, sensor_of
-from ufmstar_torch.eval.engine.predictions import DepthSource
+from ufmstar_torch.eval.engine.predictions import CacheError, DepthSource
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.machine import share_threads
@@ -59,7 +59,7 @@ class StreamOptions(MachineOptions):
 
     def settings(self) -> dict[str, Any]:
         """Return the options that define the result, as plain values of a configuration file."""
-        left_out = ("resume", "overwrite", "sequence", "sequences")
+        left_out = ("overwrite", "sequence", "sequences")
         plain = {name: value for name, value in as_dict(self).items() if name not in left_out}
         ufm = {name: value for name, value in self.config.to_dict().items() if value or name not in SECTIONS}
         return plain | {"set": ufm}
@@ -76,8 +76,7 @@ class RunOptions(StreamOptions):
     Attributes:
         sequence: The folder of the sequence, or a video file, or tour:SEED for rendered rooms.
         out: Write everything to this folder.
-        resume: Continue the run in --out.
-        overwrite: Replace the run in --out.
+        overwrite: Replace another run in --out; the predictions in its cache are kept.
         no_video: Leave preview.mp4 out.
         no_sheet: Leave contact_sheet.png out.
     """
@@ -86,16 +85,10 @@ class RunOptions(StreamOptions):
 
     sequence: Positional[str]
     out: str
-    resume: Flag = False
     overwrite: Flag = False
     no_video: Flag = False
     no_sheet: Flag = False
     uncertainty: PosteriorOptions
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.resume and self.overwrite:
-            raise ValueError("--resume and --overwrite contradict each other")
 
 
 read = reader(RunOptions, "ufmstar run")
@@ -108,9 +101,8 @@ def main(options: RunOptions) -> int:
         share_threads()
     with usage_errors(ImportError, OSError, ValueError):
         job = replace(job_from(options, options.sequence), video=not options.no_video, sheet=not options.no_sheet)
-    how = {"resume": options.resume, "overwrite": options.overwrite}
-    with usage_errors(FolderError), Bars() as bars, stop_signals(bars.say) as stop:
-        summary = run(job, options.out, **how, progress=bars.show, stop=stop)
+    with usage_errors(CacheError, FolderError), Bars() as bars, stop_signals(bars.say) as stop:
+        summary = run(job, options.out, overwrite=options.overwrite, progress=bars.show, stop=stop)
     return _report(summary, options.out)
 
 
