@@ -5,7 +5,8 @@ from __future__ import annotations
 import sys
 
 from ufmstar_torch.eval.bench.benchmark import BenchSettings, format_report, run_benchmark
-from ufmstar_torch.eval.commands.options import reader, usage_errors
+from ufmstar_torch.eval.commands.errors import usage_errors
+from ufmstar_torch.eval.commands.options import reader
 from ufmstar_torch.eval.run.files import write_json_atomic
 
 read = reader(BenchSettings, "ufmstar bench")

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 from ufmstar_torch.eval.check.data_check import check_data, lines, page
+from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import OpeningOptions
-from ufmstar_torch.eval.commands.options import Flag, Positional, reader, usage_errors
+from ufmstar_torch.eval.commands.options import Flag, Positional, reader
 from ufmstar_torch.eval.run.files import to_json
 from ufmstar_torch.eval.sequences.layout import find_sequences, layouts_of, parts_of, require_layout
 

@@ -13,7 +13,8 @@ from typing import Any
 from ufmstar_torch import models
 from ufmstar_torch.eval.bench.onboard import GRAPH, PICTURE, run_onboard
 from ufmstar_torch.eval.commands import evaluate
-from ufmstar_torch.eval.commands.options import File, Flag, MachineOptions, as_dict, reader, require_least, usage_errors
+from ufmstar_torch.eval.commands.errors import usage_errors
+from ufmstar_torch.eval.commands.options import File, Flag, MachineOptions, as_dict, reader, require_least
 from ufmstar_torch.eval.commands.terminal import Bars
 from ufmstar_torch.eval.run.files import to_json, write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Literal
 import torch
 
 from ufmstar_torch.eval.bench.measure import EFFICIENCY, Plan, measure_job
+from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import OpeningOptions
 from ufmstar_torch.eval.commands.options import (
     Count,
@@ -21,7 +22,6 @@ from ufmstar_torch.eval.commands.options import (
     joined,
     reader,
     require_least,
-    usage_errors,
 )
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.engine.load import NetworkChoice

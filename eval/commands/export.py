@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import OpeningOptions
-from ufmstar_torch.eval.commands.options import Positional, Text, reader, require_positive, usage_errors
+from ufmstar_torch.eval.commands.options import Positional, Text, reader, require_positive
 from ufmstar_torch.eval.report.text import supported
 from ufmstar_torch.eval.run import export
 from ufmstar_torch.eval.run.export_bag import export_bag

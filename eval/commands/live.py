@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from ufmstar_torch.anchors.sources import DENSE
 from ufmstar_torch.eval.check.image_fit import image_fit, track_corners
 from ufmstar_torch.eval.commands.depth import NetworkOptions, PosteriorOptions
+from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import OpeningOptions
 from ufmstar_torch.eval.commands.options import (
     File,
@@ -29,7 +30,6 @@ from ufmstar_torch.eval.commands.options import (
     reader,
     require_least,
     require_positive,
-    usage_errors,
 )
 from ufmstar_torch.eval.commands.terminal import Bars
 from ufmstar_torch.eval.engine.anchors import landmarks_of

@@ -8,7 +8,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ufmstar_torch.eval.commands.options import Count, Flag, Number, Positional, Text, Texts, reader, usage_errors
+from ufmstar_torch.eval.commands.errors import usage_errors
+from ufmstar_torch.eval.commands.options import Count, Flag, Number, Positional, Text, Texts, reader
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.reconstruct.keyframes import write_keyframes

@@ -9,7 +9,8 @@ from typing import Any, Literal
 
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.commands.options import Positional, reader, usage_errors
+from ufmstar_torch.eval.commands.errors import usage_errors
+from ufmstar_torch.eval.commands.options import Positional, reader
 from ufmstar_torch.eval.engine.estimators import ufm_star_config
 from ufmstar_torch.eval.engine.judge import CONFIDENCE, METRICS
 from ufmstar_torch.eval.methods.method import UFM_STAR

@@ -13,8 +13,9 @@ from ufmstar_torch.anchors.landmarks import LandmarkSource
 from ufmstar_torch.anchors.sources import DENSE
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.depth import SECTIONS, MapOptions, NetworkOptions, PosteriorOptions, UfMOptions
+from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import OpeningOptions
-from ufmstar_torch.eval.commands.options import Flag, MachineOptions, Positional, Text, as_dict, reader, usage_errors
+from ufmstar_torch.eval.commands.options import Flag, MachineOptions, Positional, Text, as_dict, reader
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.engine.anchors import landmarks_of, sensor_of
 from ufmstar_torch.eval.engine.predictions import CacheError, DepthSource
