@@ -13,7 +13,7 @@ from layouts import write_tum
 from onnx_files import small_network, write_fastdepth
 
 from ufmstar_torch import cli
-from ufmstar_torch.eval.bench.benchmark import BenchSettings
+from ufmstar_torch.eval.bench.settings import BenchSettings
 from ufmstar_torch.eval.bench.timing import STAGES, StagedStep, paired_ratio, pinned_threads, spread
 from ufmstar_torch.eval.commands.bench import main, read
 

@@ -21,7 +21,7 @@ from ufmstar_torch.frames.networks import NetworksInTurn
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models import Ensemble, wrap_network
 from ufmstar_torch.models.alignment import AlignedNetwork, Alignment
-from ufmstar_torch.runtime.stateful import flat
+from ufmstar_torch.runtime.checked import flat
 
 pytestmark = pytest.mark.numerics
 

@@ -15,7 +15,7 @@ from layouts import write_generic
 from runs import Brightness, outputs, read_summary
 from shared_data import require_shared
 
-from ufmstar_torch import SPGFConfig, UfMStarConfig
+from ufmstar_torch import SPGFConfig, UfMStarConfig, cli
 from ufmstar_torch.eval.commands.run import read
 from ufmstar_torch.eval.engine import load as sources
 from ufmstar_torch.models import Preprocess
@@ -55,6 +55,22 @@ def test_help_lists_the_commands(ufmstar):
     assert "\n  bench        " in out
     assert ufmstar()[0] == 2
     assert ufmstar("--version")[:2] == (0, "0.1.0\n")
+
+
+HEAVY = ("torch", "numba", "scipy", "cv2", "PIL", "pandas", "matplotlib", "onnx", "transformers", "lightning")
+
+
+@pytest.mark.parametrize("words", [*([name, "--help"] for name in cli.COMMANDS), ["eval", "--list"]], ids=" ".join)
+def test_help_imports_no_heavy_package(words):
+    # train's options contain settings that are defined beside networks
+    heavy = [name for name in HEAVY if words[0] != "train" or name != "torch"]
+    program = (
+        "import contextlib, io, sys; from ufmstar_torch.cli import main\n"
+        f"with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit): main({words!r})\n"
+        f"print(len(out.getvalue()) > 200, [name for name in {heavy!r} if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("True []\n", "")
 
 
 @pytest.mark.slow

@@ -262,7 +262,7 @@ def test_pictures_have_a_column_for_what_anchors_add(tour, finished):
 def test_images_are_needed(tour, monkeypatch, tmp_path, caplog):
     words = [TOUR, "--depth", "self", "--out", str(tmp_path / "out")]
     blind = with_entries(tour, lambda _, e: dataclasses.replace(e, load_image=None))
-    monkeypatch.setattr("ufmstar_torch.eval.commands.run.open_sequence", lambda *_, **__: blind)
+    monkeypatch.setattr("ufmstar_torch.eval.sequences.open.open_sequence", lambda *_, **__: blind)
     with pytest.raises(ValueError, match=r"--anchors corners searches images, of which the sequence .* has none"):
         job_from(read([*words, "--anchors", "corners"]), TOUR)
     assert not caplog.messages

@@ -90,7 +90,7 @@ def test_a_dry_run_counts_and_writes_nothing(ufmstar, rooms, tmp_path):
 def test_several_roots_and_networks_and_a_file_of_options(rooms, tmp_path):
     words = words_for(rooms, "out", "--root", "tour:1?frames=2&size=32x48", "a=tour:2?frames=2", "--sequences", "1")
     job = job_from(read(list(map(str, words[1:]))))
-    assert [item.dataset for item in job.items] == ["a", "rooms", "tour"]
+    assert [item.dataset for item in job.items] == ["rooms", "tour", "a"]
     in_file = {"suite": "depth-only", "root": [f"rooms={rooms}"], "network": [TRUTH], "out": "out", "seed": 3}
     (tmp_path / "eval.json").write_text(json.dumps(in_file))
     options = read(["--config", str(tmp_path / "eval.json"), "--seed", "4"])

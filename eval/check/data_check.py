@@ -263,7 +263,11 @@ def _end(report: DataReport) -> str:
         return _count(len(report.problems), "problem")
     if report.compared:
         return "fine"
-    return f"not checked: {'no depth, no metric scale' if report.depth_range is None else 'nothing was compared'}"
+    if report.depth_range is not None:
+        return "not checked: nothing was compared"
+    if (report.checked.get("images") or {}).get("pairs"):
+        return "poses and images agree; scale cannot be checked without depth"
+    return "not checked: without depth, neither poses nor scale can be compared"
 
 
 def _size(size: tuple[int, int] | None) -> str:

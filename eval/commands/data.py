@@ -7,12 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from ufmstar_torch.eval.check.data_check import check_data, lines, page
 from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import OpeningOptions
 from ufmstar_torch.eval.commands.options import Flag, Positional, reader
-from ufmstar_torch.eval.run.files import to_json
-from ufmstar_torch.eval.sequences.layout import find_sequences, layouts_of, parts_of, require_layout
 
 # With one of these options the path is one sequence, whatever is below its folder.
 _OF_ONE = ("trajectory", "images", "drive")
@@ -47,6 +44,9 @@ read = reader(CheckOptions, "ufmstar data")
 
 def main(options: CheckOptions) -> int:
     """Check, and print the reports. Returns the exit code."""
+    from ufmstar_torch.eval.check.data_check import lines, page
+    from ufmstar_torch.eval.run.files import to_json
+
     with usage_errors(OSError, ValueError):
         reports, several = _check(options)
     if options.json:
@@ -64,6 +64,9 @@ def _check(options: CheckOptions) -> tuple[list, bool]:
         OSError: no such path.
         ValueError: an option out of range, or nothing below the folder has a known layout.
     """
+    from ufmstar_torch.eval.check.data_check import check_data
+    from ufmstar_torch.eval.sequences.layout import find_sequences, layouts_of, parts_of, require_layout
+
     path, opening = options.path, options.opening.changed()
     require_layout(options.opening.layout, options.opening.plugin)
     one = path.startswith("tour:") or any(name in opening for name in _OF_ONE)

@@ -11,18 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from ufmstar_torch import models
-from ufmstar_torch.eval.bench.onboard import GRAPH, PICTURE, run_onboard
 from ufmstar_torch.eval.commands import evaluate
 from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.options import File, Flag, MachineOptions, as_dict, reader, require_least
 from ufmstar_torch.eval.commands.terminal import Bars
-from ufmstar_torch.eval.run.files import to_json, write_json_atomic
-from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
-from ufmstar_torch.eval.run.machine import hardware, share_threads, versions
 
 _WEIGHTS = ("weights", "demo.safetensors")
 _WALK = 150  # frames of a whole walk; the first --frames of them are used, so that consecutive frames overlap
-_ROOMS = {"familiar": "home", "unfamiliar": "hall"}  # style by data set
+_ROOMS = {"unfamiliar": "hall", "familiar": "home"}  # style by data set
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,12 +64,20 @@ read = reader(DemoOptions, "ufmstar demo")
 
 def main(options: DemoOptions) -> int:
     """Run the demo, and print its table; the exit code."""
+    from ufmstar_torch.eval.report.page import PAGE
+    from ufmstar_torch.eval.run.folder import FolderError
+
     with usage_errors(FileNotFoundError, FolderError):
         file = options.weights or Path(models.__file__).parent.joinpath(*_WEIGHTS)
         if not file.is_file():
             missing = f"the package was installed without {'/'.join(_WEIGHTS)}; --weights FILE names another"
             raise FileNotFoundError(f"--weights: no such file: {file}" if options.weights else missing)
-        return _onboard(options, file) if options.onboard else evaluate.main(evaluate.read(_words(options, file)))
+        if options.onboard:
+            return _onboard(options, file)
+        code = evaluate.main(evaluate.read(_words(options, file)))
+    if (page := options.out / PAGE).is_file():
+        print(f"open {page} in a browser")
+    return code
 
 
 def _words(options: DemoOptions, weights: Path) -> list[str]:
@@ -90,7 +94,11 @@ def _words(options: DemoOptions, weights: Path) -> list[str]:
 
 def _onboard(options: DemoOptions, weights: Path) -> int:
     """Run ``--onboard``, write its folder, and print its table. Returns the exit code."""
+    from ufmstar_torch.eval.bench.onboard import GRAPH, PICTURE, run_onboard
     from ufmstar_torch.eval.report.text import onboard_table
+    from ufmstar_torch.eval.run.files import to_json, write_json_atomic
+    from ufmstar_torch.eval.run.folder import FolderKind, output_folder
+    from ufmstar_torch.eval.run.machine import hardware, share_threads, versions
 
     if options.threads is None:
         share_threads()

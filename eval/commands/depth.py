@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
-
-import torch
+from typing import TYPE_CHECKING, Any, Literal
 
 from ufmstar_torch.config import SPGFConfig, UfMStarConfig
 from ufmstar_torch.eval.commands.options import (
@@ -20,16 +18,14 @@ from ufmstar_torch.eval.commands.options import (
     assigned,
     require_least,
 )
-from ufmstar_torch.eval.engine.load import NetworkChoice
-from ufmstar_torch.eval.engine.maps import MapSource, folder_source, own_depth
-from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.setting import started
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_size
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
-from ufmstar_torch.frames.warnings import LOGGER
-from ufmstar_torch.models.any_network import PROGRAMS
-from ufmstar_torch.models.inference import Inference
-from ufmstar_torch.posterior.recalibrate import Recalibration, recalibration_path
+
+if TYPE_CHECKING:
+    from ufmstar_torch.eval.engine.maps import MapSource
+    from ufmstar_torch.eval.engine.predictions import DepthSource
+    from ufmstar_torch.posterior.recalibrate import Recalibration
 
 OWN_DEPTH = ("self", "ground-truth")
 # Sections that are off in ``UfMStarConfig()``.
@@ -73,15 +69,27 @@ class NetworkOptions:
         for name in ("samples", "offload"):
             if getattr(self, name) and self.model != "trained":
                 raise ValueError(f"--{name} goes with --model trained only")
-        if self.trust_code and self.model not in PROGRAMS:
-            raise ValueError(f"--trust-code goes with --model {' or '.join(PROGRAMS)} only")
+        if self.trust_code:
+            self._require_program()
         if self.mode == "full" and len(self.weights) < 2 and self.model != "trained":
             raise ValueError("--mode full needs several --weights")
         if self.samples is not None and self.mode != "full":
             raise ValueError("--samples goes with --mode full only")
 
+    def _require_program(self) -> None:
+        """Raises ValueError: the kind of network is no program."""
+        from ufmstar_torch.models.any_network import PROGRAMS
+
+        if self.model not in PROGRAMS:
+            raise ValueError(f"--trust-code goes with --model {' or '.join(PROGRAMS)} only")
+
     def load(self, machine: MachineOptions) -> DepthSource:
         """Load the networks onto a device; errors as ``NetworkChoice.load``."""
+        import torch
+
+        from ufmstar_torch.eval.engine.load import NetworkChoice
+        from ufmstar_torch.models.inference import Inference
+
         choice = NetworkChoice("", str(self.model), self.weights, self.spec, self.trust_code)
         inference = Inference(self.runtime, self.precision, machine.threads)
         how: dict[str, Any] = {"mode": self.mode, "samples": self.samples, "offload": self.offload}
@@ -120,6 +128,8 @@ class MapOptions:
     def source(self, sequence: FrameSequence, indices: range) -> MapSource:
         """The maps of the frames ``indices``. Raises NotADirectoryError, ValueError: the folder does not exist, or maps
         are missing or do not fit."""
+        from ufmstar_torch.eval.engine.maps import folder_source, own_depth
+
         size = parse_size(self.size)
         if self.depth in OWN_DEPTH:
             if len(sequence.without_depth) == len(sequence):
@@ -182,6 +192,9 @@ class UfMOptions:
             FileNotFoundError: the named file does not exist.
             ValueError: the file is no recalibration, or was fitted with other settings or to another network.
         """
+        from ufmstar_torch.frames.warnings import LOGGER
+        from ufmstar_torch.posterior.recalibrate import Recalibration, recalibration_path
+
         name = self.recalibration
         if name == "none" or (name is None and not (weights and recalibration_path(weights[0]).is_file())):
             return None

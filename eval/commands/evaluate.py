@@ -7,9 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-import torch
-
-from ufmstar_torch.eval.bench.measure import EFFICIENCY, Plan, measure_job
 from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import OpeningOptions
 from ufmstar_torch.eval.commands.options import (
@@ -24,15 +21,13 @@ from ufmstar_torch.eval.commands.options import (
     require_least,
 )
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-from ufmstar_torch.eval.engine.load import NetworkChoice
-from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.methods.method import UFM_STAR
 from ufmstar_torch.eval.methods.setting import DEFAULTS, started
 from ufmstar_torch.eval.methods.suite import listing, suite_named
 from ufmstar_torch.eval.sequences.frame import parse_slice
 from ufmstar_torch.eval.suite.job import EvalJob, require_methods, with_recalibrations
 from ufmstar_torch.eval.suite.record import ResultsError
-from ufmstar_torch.eval.suite.tasks import EvalOutcome, evaluate_suite
+from ufmstar_torch.eval.suite.tasks import EvalOutcome
 from ufmstar_torch.eval.suite.work_items import find_work, read_names
 
 # Options that are fields of a job with the same name.
@@ -182,6 +177,9 @@ def main(options: EvalOptions) -> int:
 def job_from(options: EvalOptions) -> EvalJob:
     """The job of the options. Opens no sequence. Raises FileNotFoundError, ValueError: a file does not exist, options
     contradict each other, a base is named twice, no row has a network, or there is no sequence."""
+    from ufmstar_torch.eval.engine.load import NetworkChoice
+    from ufmstar_torch.eval.suite.job import EvalJob
+
     what, data, output, values = options.what, options.data, options.output, as_dict(options)
     suite = with_recalibrations(suite_named(str(what.suite), what.base, what.ufm_preset), joined(what.recalibration))
     require_methods(suite, options.opening.plugin)
@@ -214,6 +212,9 @@ def job_from(options: EvalOptions) -> EvalJob:
 
 
 def _evaluate(options: EvalOptions) -> int:
+    from ufmstar_torch.eval.engine.warm_up import warm_up_command
+    from ufmstar_torch.eval.suite.tasks import evaluate_suite
+
     how: dict[str, Any] = {"resume": options.output.resume, "overwrite": options.output.overwrite}
     how |= {"processes": options.processes, "scheduler": options.scheduler, "threads": options.threads}
     with Bars() as bars, stop_signals(bars.say) as stop:
@@ -264,6 +265,8 @@ def _report(job: EvalJob, outcome: EvalOutcome, options: EvalOptions) -> int:
 
 def _measure(job: EvalJob, threads: int | None) -> None:
     """Measure time, energy and memory, unless their file exists. If that fails, print the reason."""
+    from ufmstar_torch.eval.bench.measure import EFFICIENCY, Plan, measure_job
+
     if (job.out / EFFICIENCY).exists():
         return
     print("ufmstar eval: measuring time, energy and memory ...", file=sys.stderr)
@@ -275,6 +278,8 @@ def _measure(job: EvalJob, threads: int | None) -> None:
 
 def _dry_run(options: EvalOptions) -> int:
     """Print the rows with their networks, and the sequences with their number of frames."""
+    import torch
+
     job = job_from(options)
     for base in job.unused:
         print(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")

@@ -11,16 +11,6 @@ from typing import Any, ClassVar, Literal
 from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import OpeningOptions
 from ufmstar_torch.eval.commands.options import Positional, Text, reader, require_positive
-from ufmstar_torch.eval.report.text import supported
-from ufmstar_torch.eval.run import export
-from ufmstar_torch.eval.run.export_bag import export_bag
-from ufmstar_torch.eval.run.rerun_log import export_rerun
-from ufmstar_torch.eval.sequences.open import open_sequence
-
-_EXPORTERS: dict[str, Callable[..., str]] = {
-    "depth": export.export_depth, "cloud": export.export_cloud, "tum": export.export_trajectory,
-    "transforms": export.export_transforms, "mcap": export_bag, "rrd": export_rerun,
-}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,26 +55,44 @@ read = reader(ExportOptions, "ufmstar export")
 
 def main(options: ExportOptions) -> int:
     """Export, and print what was written; the exit code."""
+    from ufmstar_torch.eval.run.export import GateCount, gated_frames, run_summary, with_images
+    from ufmstar_torch.eval.sequences.open import open_sequence
+
     out, to = options.out, options.to
     with usage_errors(FileNotFoundError, ValueError):
-        counts = export.GateCount()
-        frames = counts.of(export.gated_frames(out, options.max_sigma, options.max_relative_sigma))
+        counts = GateCount()
+        frames = counts.of(gated_frames(out, options.max_sigma, options.max_relative_sigma))
         if to not in ("depth", "tum") and options.sequence is not None:
-            frames = export.with_images(frames, open_sequence(options.sequence, **options.opening.changed()))
+            frames = with_images(frames, open_sequence(options.sequence, **options.opening.changed()))
         elif to not in ("depth", "tum"):
             print("no colours: --sequence SEQUENCE names the recording with the images")
         how = {"voxel": options.voxel} if to == "cloud" else {}
-        print(_EXPORTERS[to](frames, out, **how))
+        print(_exporter(to)(frames, out, **how))
         if min(options.max_sigma, options.max_relative_sigma) < math.inf and to != "tum":
             print(f"the limits of sigma keep {counts.share:.1%} of the pixels with a depth")
-            if reason := _unsupported(export.run_summary(out)):
+            if reason := _unsupported(run_summary(out)):
                 remedy = "`ufmstar run` without --plain makes a sigma that anchors test (docs/thresholds.md)"
                 print(f"warning: nothing supports this sigma, {reason}: the pixels that are left may be bad; {remedy}")
     return 0
 
 
+def _exporter(to: str) -> Callable[..., str]:
+    """The function that writes frames in the form ``to`` into a folder, and returns a line about it."""
+    from ufmstar_torch.eval.run.export import export_cloud, export_depth, export_trajectory, export_transforms
+    from ufmstar_torch.eval.run.export_bag import export_bag
+    from ufmstar_torch.eval.run.rerun_log import export_rerun
+
+    exporters: dict[str, Callable[..., str]] = {
+        "depth": export_depth, "cloud": export_cloud, "tum": export_trajectory,
+        "transforms": export_transforms, "mcap": export_bag, "rrd": export_rerun,
+    }  # fmt: skip
+    return exporters[to]
+
+
 def _unsupported(summary: Mapping[str, Any]) -> str:
     """Why nothing supports the sigma of a run; "" if held-out anchors or a recalibration do."""
+    from ufmstar_torch.eval.report.text import supported
+
     if supported(summary) if "posterior" in summary else summary.get("recalibrated"):
         return ""
     calibration = (summary.get("posterior") or {}).get("calibration")

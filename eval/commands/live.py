@@ -11,14 +11,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from time import monotonic
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
-
-from ufmstar_torch.anchors.sources import DENSE
-from ufmstar_torch.eval.check.image_fit import image_fit, track_corners
 from ufmstar_torch.eval.commands.depth import NetworkOptions, PosteriorOptions
 from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import OpeningOptions
@@ -32,22 +26,18 @@ from ufmstar_torch.eval.commands.options import (
     require_positive,
 )
 from ufmstar_torch.eval.commands.terminal import Bars
-from ufmstar_torch.eval.engine.anchors import landmarks_of
-from ufmstar_torch.eval.engine.realtime import RealTime
-from ufmstar_torch.eval.engine.warm_up import warm_up_command
-from ufmstar_torch.eval.run.export import RunFrame
-from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
-from ufmstar_torch.eval.run.folder import FolderKind, output_folder
-from ufmstar_torch.eval.run.machine import share_threads
-from ufmstar_torch.eval.run.rerun_log import RerunLog, open_viewer
-from ufmstar_torch.eval.run.writers import is_frame
-from ufmstar_torch.eval.sequences import live as sources
 from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
-from ufmstar_torch.eval.sequences.live import LiveEvent
-from ufmstar_torch.eval.sequences.open import open_sequence
-from ufmstar_torch.frames.warnings import LOGGER
-from ufmstar_torch.live import LiveDepth, LiveResult, LiveStatistics
-from ufmstar_torch.uncertain_depth import UncertainDepth
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from ufmstar_torch.eval.engine.realtime import RealTime
+    from ufmstar_torch.eval.run.export import RunFrame
+    from ufmstar_torch.eval.run.rerun_log import RerunLog
+    from ufmstar_torch.eval.sequences.live import LiveEvent
+    from ufmstar_torch.live import LiveDepth, LiveResult, LiveStatistics
+    from ufmstar_torch.uncertain_depth import UncertainDepth
 
 _STANDARD_INPUT, _SUMMARY = "-", "realtime.json"
 _ARRAYS = ("depth", "variance", "disagreement", "T_world_cam", "intrinsics")  # of an image's file
@@ -129,7 +119,14 @@ read = reader(LiveOptions, "ufmstar live")
 
 def main(options: LiveOptions) -> int:
     """Run until the source ends, and print the real-time table; the exit code."""
+    from ufmstar_torch.eval.engine.realtime import RealTime
     from ufmstar_torch.eval.report.text import realtime_table
+    from ufmstar_torch.eval.run.files import write_json_atomic
+    from ufmstar_torch.eval.run.folder import FolderKind, output_folder
+    from ufmstar_torch.eval.run.machine import share_threads
+    from ufmstar_torch.eval.run.rerun_log import RerunLog, open_viewer
+    from ufmstar_torch.eval.run.writers import is_frame
+    from ufmstar_torch.live import LiveDepth, LiveResult
 
     if options.threads is None:
         share_threads()
@@ -208,6 +205,11 @@ def _run(options: LiveOptions, live: LiveDepth, events: Iterator[LiveEvent]) -> 
 
 def _events(options: LiveOptions, K: NDArray[np.float64] | None) -> Iterator[LiveEvent]:
     """The source's images and poses; errors as ``open_sequence``. ``K``: intrinsics of the option."""
+    from ufmstar_torch.eval.check.image_fit import image_fit, track_corners
+    from ufmstar_torch.eval.sequences import live as sources
+    from ufmstar_torch.eval.sequences.open import open_sequence
+    from ufmstar_torch.frames.warnings import LOGGER
+
     opening = options.opening
     if options.recorded:
         sequence = open_sequence(options.source, **opening.changed())
@@ -227,6 +229,11 @@ def _events(options: LiveOptions, K: NDArray[np.float64] | None) -> Iterator[Liv
 
 def _model(options: LiveOptions) -> UncertainDepth:
     """The networks with UfM*, warmed up; errors as ``NetworkChoice.load``."""
+    from ufmstar_torch.anchors.sources import DENSE
+    from ufmstar_torch.eval.engine.anchors import landmarks_of
+    from ufmstar_torch.eval.engine.warm_up import warm_up_command
+    from ufmstar_torch.uncertain_depth import UncertainDepth
+
     chosen, source = options.network, options.network.load(options)
     config, anchors = options.uncertainty.config(), options.uncertainty.anchors
     model = UncertainDepth(
@@ -247,6 +254,10 @@ def _model(options: LiveOptions) -> UncertainDepth:
 
 def _write(out: Path, result: LiveResult) -> None:
     """Write the maps of an image to OUT/STAMP.npz."""
+    import numpy as np
+
+    from ufmstar_torch.eval.run.files import write_atomic
+
     of = result.out
     maps = {"depth": of.depth, "variance": of.variance, "disagreement": of.disagreement}
     if of.posterior_outlier is not None:
@@ -258,6 +269,11 @@ def _write(out: Path, result: LiveResult) -> None:
 
 def _shown(result: LiveResult, number: int, figures: dict[str, float]) -> RunFrame:
     """The result in the viewer's form."""
+    import numpy as np
+    import torch
+
+    from ufmstar_torch.eval.run.export import RunFrame
+
     out, valid = result.out, result.out.valid[0]
     depth, sigma = (torch.where(valid, values[0], torch.nan).cpu().float().numpy() for values in (out.depth, out.std))
     about = (f"{result.stamp:.6f}", number, result.stamp, result.T_world_cam)

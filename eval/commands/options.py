@@ -25,7 +25,7 @@ import tyro
 from tyro.conf import Positional as Positional
 from tyro.conf import UseAppendAction, arg
 
-from ufmstar_torch.runtime.stateful import flat
+from ufmstar_torch.runtime.checked import flat
 
 _CONFIG_BYTES = 1_000_000  # the settings of all commands together have some kilobytes
 # Options that allow code to run: a configuration file, which may come from elsewhere, must not set them.

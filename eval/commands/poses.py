@@ -6,30 +6,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
-
 from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.options import Count, Flag, Number, Positional, Text, Texts, reader
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-from ufmstar_torch.eval.engine.progress import Progress
-from ufmstar_torch.eval.reconstruct.keyframes import write_keyframes
-from ufmstar_torch.eval.reconstruct.reconstruct import (
-    POSES,
-    gaps,
-    landmarks,
-    reconstruct,
-    require_pycolmap,
-    scale_model,
-)  # fmt: skip
-from ufmstar_torch.eval.run.files import write_atomic, write_bytes_atomic, write_json_atomic
-from ufmstar_torch.eval.run.folder import FolderError, output_folder
-from ufmstar_torch.eval.run.machine import available_cores
 from ufmstar_torch.eval.sequences.frame import parse_slice
-from ufmstar_torch.eval.sequences.generic import INTRINSICS, open_images
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics, read_intrinsics
-from ufmstar_torch.eval.sequences.lens import Lens, parse_distortion
 from ufmstar_torch.eval.sequences.options import Options, resolve
-from ufmstar_torch.eval.sequences.poses import read_trajectory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,6 +87,9 @@ read = reader(PosesOptions, "ufmstar poses")
 
 def main(options: PosesOptions) -> int:
     """Reconstruct, write the folder, and print the result. Returns the exit code."""
+    from ufmstar_torch.eval.reconstruct.reconstruct import POSES, require_pycolmap
+    from ufmstar_torch.eval.run.folder import FolderError, output_folder
+
     require_pycolmap()
     with usage_errors(FolderError, FileNotFoundError, ValueError):
         images, size = _images(options)
@@ -116,6 +101,8 @@ def main(options: PosesOptions) -> int:
 
 def _images(options: PosesOptions) -> tuple[list[Any], tuple[int, int]]:
     """The entries of the images with their times, and their (H, W). Raises ValueError: there are no images."""
+    from ufmstar_torch.eval.sequences.generic import open_images
+
     path = Path(options.source)
     if not path.exists():
         raise FileNotFoundError(f"no such file or folder: {path}")
@@ -135,6 +122,15 @@ def _plain(name: str) -> str:
 
 
 def _reconstruct(options: PosesOptions, images: list[Any], size: tuple[int, int]) -> dict[str, Any]:
+    import numpy as np
+
+    from ufmstar_torch.eval.engine.progress import Progress
+    from ufmstar_torch.eval.reconstruct.keyframes import write_keyframes
+    from ufmstar_torch.eval.reconstruct.reconstruct import POSES, gaps, landmarks, reconstruct, scale_model
+    from ufmstar_torch.eval.run.files import write_atomic, write_bytes_atomic, write_json_atomic
+    from ufmstar_torch.eval.run.machine import available_cores
+    from ufmstar_torch.eval.sequences.poses import read_trajectory
+
     root = Path(options.source) if Path(options.source).is_dir() else Path(options.source).parent
     lens = _lens(options, root, size)
     if lens is not None:  # COLMAP's mapper fails on some lenses; `run` need not undistort again
@@ -181,6 +177,9 @@ def _reconstruct(options: PosesOptions, images: list[Any], size: tuple[int, int]
 
 def _lens(options: PosesOptions, root: Path, size: tuple[int, int]) -> Any:
     """The camera; None = estimate it. Raises ValueError: the intrinsics do not fit the images."""
+    from ufmstar_torch.eval.sequences.generic import INTRINSICS
+    from ufmstar_torch.eval.sequences.lens import Lens, parse_distortion
+
     source = parse_intrinsics(options.intrinsics, "--intrinsics")
     if source is None:
         source = next((str(root / name) for name in INTRINSICS if (root / name).is_file()), None)

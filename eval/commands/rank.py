@@ -79,6 +79,7 @@ read = reader(RankOptions, "ufmstar rank")
 
 def main(options: RankOptions) -> int:
     """Score the sequences, and write table and pictures; the exit code."""
+
     if options.threads is None:
         share_threads()
     kind = FolderKind("ufmstar rank", "ranking", SETTINGS, (SCORES, SHEET))
@@ -91,6 +92,8 @@ def main(options: RankOptions) -> int:
 
 def _scores(options: RankOptions) -> ImageScores:
     """Stream the sequences."""
+    from ufmstar_torch.eval.run.rank import ImageScores
+
     scores, source = ImageScores(options.by, options.measured), None
     with Bars() as bars, stop_signals(bars.say) as stop:
         for path in options.sequences:

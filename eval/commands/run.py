@@ -5,29 +5,20 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
-import torch
-
-from ufmstar_torch.anchors.landmarks import LandmarkSource
-from ufmstar_torch.anchors.sources import DENSE
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.depth import SECTIONS, MapOptions, NetworkOptions, PosteriorOptions, UfMOptions
 from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import OpeningOptions
 from ufmstar_torch.eval.commands.options import Flag, MachineOptions, Positional, Text, as_dict, reader
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-from ufmstar_torch.eval.engine.anchors import landmarks_of, sensor_of
-from ufmstar_torch.eval.engine.predictions import CacheError, DepthSource
-from ufmstar_torch.eval.run.folder import FolderError
-from ufmstar_torch.eval.run.job import RunJob
-from ufmstar_torch.eval.run.machine import share_threads
-from ufmstar_torch.eval.run.run import run
-from ufmstar_torch.eval.run.scale import network_scale, require_metric
-from ufmstar_torch.eval.run.summary import FINISHED, INTERRUPTED
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_slice
-from ufmstar_torch.eval.sequences.open import open_sequence, scale_poses
-from ufmstar_torch.frames.warnings import LOGGER
+
+if TYPE_CHECKING:
+    from ufmstar_torch.anchors.landmarks import LandmarkSource
+    from ufmstar_torch.eval.engine.predictions import DepthSource
+    from ufmstar_torch.eval.run.job import RunJob
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +89,11 @@ Stream = TypeVar("Stream", bound=StreamOptions)
 
 def main(options: RunOptions) -> int:
     """Run, and print the results' table; the exit code."""
+    from ufmstar_torch.eval.engine.predictions import CacheError
+    from ufmstar_torch.eval.run.folder import FolderError
+    from ufmstar_torch.eval.run.machine import share_threads
+    from ufmstar_torch.eval.run.run import run
+
     if options.threads is None:
         share_threads()
     with usage_errors(ImportError, OSError, ValueError):
@@ -115,6 +111,14 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
         FileNotFoundError, NotADirectoryError: no such file or folder.
         ModuleNotFoundError: an optional package is missing.
     """
+    import torch
+
+    from ufmstar_torch.anchors.sources import DENSE
+    from ufmstar_torch.eval.engine.anchors import sensor_of
+    from ufmstar_torch.eval.run.job import RunJob
+    from ufmstar_torch.eval.run.scale import network_scale, require_metric
+    from ufmstar_torch.eval.sequences.open import open_sequence, scale_poses
+
     sequence = open_sequence(path, **options.opening.changed())
     options = _without_images(options, sequence)
     ufm = options.uncertainty
@@ -154,6 +158,8 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
 
 def _without_images(options: Stream, sequence: FrameSequence) -> Stream:
     """The options, plain if the default anchors are searched in images that the sequence lacks."""
+    from ufmstar_torch.frames.warnings import LOGGER
+
     ufm = options.uncertainty
     if not isinstance(ufm, PosteriorOptions) or ufm.plain or ufm.anchors is not None or _has_images(sequence):
         return options
@@ -169,6 +175,9 @@ def _has_images(sequence: FrameSequence) -> bool:
 def _landmarks(value: str, sequence: FrameSequence) -> str | LandmarkSource:
     """The source of anchors of ``--anchors``. Raises ValueError: the images to search are missing; others as
     ``landmarks_of``."""
+    from ufmstar_torch.anchors.sources import DENSE
+    from ufmstar_torch.eval.engine.anchors import landmarks_of, sensor_of
+
     if sensor_of(value, sequence) is not None:
         return DENSE
     source = landmarks_of(value, sequence.folder, sequence.pose_scale)
@@ -182,6 +191,7 @@ def _landmarks(value: str, sequence: FrameSequence) -> str | LandmarkSource:
 def _report(summary: Mapping[str, Any], out: str) -> int:
     """Print the table and where the outputs are; the exit code."""
     from ufmstar_torch.eval.report.text import run_table
+    from ufmstar_torch.eval.run.summary import FINISHED, INTERRUPTED
 
     if summary["frames"]["done"]:
         print(run_table(summary))

@@ -1,4 +1,4 @@
-"""Estimators of a row's variance: the network alone, UfM, and UfM*."""
+"""Estimators of a row's variance: the network alone, UfM, UfM*, and a share of the depth."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch import Tensor
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.predictions import DepthSource
-from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
+from ufmstar_torch.eval.methods.method import ALONE, RELATIVE, RHO, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import configured
 from ufmstar_torch.eval.methods.ufm import UfM
@@ -79,6 +79,8 @@ def make_estimator(
         return Alone(uses_variances=uses)
     if method.fusion == UFM:
         return Pointwise(method.max_points, uses_variances=uses)
+    if method.fusion == RELATIVE:
+        return Relative(uses_variances=False)
     if method.fusion != UFM_STAR:
         estimator: Estimator = plugins[method.fusion](row, device)
         return estimator
@@ -126,6 +128,16 @@ class Alone(Estimator):
         for part in (a, e):
             valid = valid if part is None else valid & part.isfinite() & (part >= 0)
         return output_of(used.depth, used.variance, valid, aleatoric=a, epistemic=e)
+
+
+class Relative(Estimator):
+    """The baseline V = (RHO d)^2, which compares no views."""
+
+    def update(
+        self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None
+    ) -> UncertaintyOutput:
+        depth = prediction.depth
+        return output_of(depth, (RHO * depth) ** 2, (depth > 0) & depth.isfinite())
 
 
 class Pointwise(Estimator):

@@ -54,7 +54,7 @@ class FinishedRun:
         except FrameError:  # the recording can no longer be read
             frame = None
         maps = {"depth": stored["depth"], "sigma": np.sqrt(stored["variance"]), "measured": stored["measured"]}
-        note = f"K = {record['components']}"
+        note = f"{record['components']} components"
         if "anchored" in stored:
             note += f", {record['anchors']['used']} anchors"
         if "network_depth" in stored:

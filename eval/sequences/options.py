@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.images import check_scale
 from ufmstar_torch.eval.sequences.intrinsics import DEPTH_FILES, FILES, IntrinsicsLike, camera_file, parse_intrinsics
 from ufmstar_torch.gaussians.conventions import CONVENTIONS, OURS
 
@@ -100,6 +99,12 @@ class Options:
             if name in self.changed():
                 other = "use layout='generic' to combine images, depth and a trajectory freely"
                 raise ValueError(f"layout {layout!r} takes no {name}: its files hold that; {other}")
+
+
+def check_scale(depth_scale: float | None) -> None:
+    """Raises ValueError: metres per unit is neither None nor in (0, 1]."""
+    if depth_scale is not None and not 0 < depth_scale <= 1:
+        raise ValueError(f"depth_scale is in metres per unit (0.001: millimetres, 1/5000: TUM), got {depth_scale}")
 
 
 def with_camera_files(options: Options, folder: Path) -> Options:

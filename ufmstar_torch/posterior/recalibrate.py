@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.runtime.checked import Checked, choice
-from ufmstar_torch.runtime.stateful import flat, plain
+from ufmstar_torch.runtime.checked import Checked, choice, flat
+from ufmstar_torch.runtime.stateful import plain
 
 VARIANCE: Final = "variance"
 CONFIDENCE: Final = "confidence"
