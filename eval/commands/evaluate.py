@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import OpeningOptions
 from ufmstar_torch.eval.commands.options import (
     Count,
@@ -18,7 +19,6 @@ from ufmstar_torch.eval.commands.options import (
     joined,
     reader,
     require_least,
-    usage_errors,
 )
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.methods.method import UFM_STAR

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.depth import SECTIONS, MapOptions, NetworkOptions, PosteriorOptions, UfMOptions
+from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import OpeningOptions
-from ufmstar_torch.eval.commands.options import Flag, MachineOptions, Positional, Text, as_dict, reader, usage_errors
+from ufmstar_torch.eval.commands.options import Flag, MachineOptions, Positional, Text, as_dict, reader
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_slice
 
