@@ -186,7 +186,7 @@ class PoseErrors(SavedState):
         measured = solution.error[-CAMERA:] + np.append(self._camera[:3], 0)
         weighted = (1 - _PART) * precision @ self._camera + _PART * posterior @ measured
         combined = (1 - _PART) * precision + _PART * posterior
-        self._covariance = np.linalg.inv((1 - _FADE) * combined + _FADE * prior)
+        self._covariance = np.asarray(np.linalg.inv((1 - _FADE) * combined + _FADE * prior), np.float64)
         self._camera = self._covariance @ weighted * (1 - _FADE)
 
     def _learn_noise(
