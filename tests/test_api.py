@@ -7,7 +7,16 @@ import inspect
 import pytest
 
 import ufmstar_torch
-from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch import (
+    AnchorConfig,
+    ConfidenceConfig,
+    MergeConfig,
+    PosteriorConfig,
+    UfMStar,
+    UfMStarConfig,
+    UncertainDepth,
+)
+from ufmstar_torch.runtime.stateful import flat
 
 PUBLIC = {
     "DepthPrediction",
@@ -65,6 +74,12 @@ def test_signatures():
     images = ["image", "pose", "intrinsics", "valid", "features", "anchors"]
     assert names(UncertainDepth.forward) == images
     assert names(UncertainDepth.mean_uncertainty) == [*images, "pixels", "fraction", "seed", "average"]
+
+
+def test_few_settings():
+    """The core has at most 50 settings, those of all sections together."""
+    sections = {"anchors": AnchorConfig(), "confidence": ConfidenceConfig(), "posterior": PosteriorConfig()}
+    assert len(flat(UfMStarConfig(**sections, merge=MergeConfig()).to_dict())) <= 50
 
 
 def test_the_papers_defaults():

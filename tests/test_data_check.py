@@ -123,7 +123,7 @@ def test_unregistered_depth(tour):
     spoil_depth(tour, lambda depth: register_depth(depth, K, K_depth, T, SIZE))
     result = check_data(tour, pairs=2)
     assert any("not registered to the images" in problem for problem in result.problems)
-    assert any("--depth-intrinsics" in remedy for remedy in result.remedies)
+    assert any("--reader depth_intrinsics" in remedy for remedy in result.remedies)
 
 
 def test_broken_and_missing_frames_are_reported(tour, capsys):

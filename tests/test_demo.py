@@ -58,7 +58,7 @@ def test_a_second_demo_computes_nothing(done, monkeypatch, capsys):
     monkeypatch.setattr(evaluate, "_report", lambda *_: 0)  # takes most of the time
     assert cli.main(words) == 0
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*.pt")} == before
-    assert "--resume: the evaluation in" not in capsys.readouterr().err
+    assert "the evaluation in" not in capsys.readouterr().err
 
 
 # ---- refusals ----

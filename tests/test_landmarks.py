@@ -172,7 +172,7 @@ def too_far(frame):
     return 1.3 * frame.depth, None, frame.intrinsics
 
 
-def test_a_run_with_a_file_equals_a_loop_by_hand_and_resumes(tour, file, tmp_path):
+def test_a_run_with_a_file_equals_a_loop_by_hand_also_after_a_stop(tour, file, tmp_path):
     landmarks = LandmarkMap.read(file)
 
     def job(frames=slice(None)):
@@ -195,7 +195,7 @@ def test_a_run_with_a_file_equals_a_loop_by_hand_and_resumes(tour, file, tmp_pat
     assert f"in view and {len(landmarks.sigma):.1f} in the map" in run_table(summary)
     requested = iter([False] * 3 + [True])
     assert run(job(), tmp_path / "again", stop=lambda: next(requested))["state"] == "interrupted"
-    run(job(), tmp_path / "again", resume=True)
+    run(job(), tmp_path / "again")
     assert outputs(tmp_path / "again") == outputs(tmp_path / "out")
 
 

@@ -181,9 +181,9 @@ def test_run_uses_the_map_beside_the_weights(evaluated, tmp_path, capsys, caplog
         capsys.readouterr()
         assert cli.main([*default, "--out", str(tmp_path / "named"), "--recalibration", str(file)]) == 2
         assert "anchors.half_life = None (now 30.0)" in capsys.readouterr().err
-        assert cli.main([*words, "--out", str(tmp_path / "other"), "--ufm.ema_alpha", "0.7"]) == 2
+        assert cli.main([*words, "--out", str(tmp_path / "other"), "--set", "ema_alpha=0.7"]) == 2
         assert "ema_alpha = " in capsys.readouterr().err
-        assert cli.main([*words, "--out", str(tmp_path / "plain"), "--resume"]) == 2
+        assert cli.main([*words, "--out", str(tmp_path / "plain")]) == 2
     finally:
         file.unlink()
     fitted, other = (json.loads((tmp_path / n / "summary.json").read_text())["warnings"] for n in ("fitted", "mapped"))

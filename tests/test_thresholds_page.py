@@ -71,8 +71,9 @@ def test_rules_of_a_wall(script, outputs):
 
 def test_gates_divide_the_pixels_and_state_their_errors(script, outputs):
     frame, out = frame_of(script, outputs[-1], 2.0), outputs[-1]
-    parts = script.gates(out.depth[0], (0.07 * out.depth[0]).square(), frame)
-    assert [len(part) for part in parts] == [0, out.depth[0].numel(), 0, 0]
+    depth = out.network_depth[0]
+    parts = script.gates(depth, (0.07 * depth).square(), frame)
+    assert [len(part) for part in parts] == [0, depth.numel(), 0, 0]
     torch.testing.assert_close(parts[1], torch.full_like(parts[1], 0.3 / 1.3), rtol=1e-5, atol=0)
 
 

@@ -33,7 +33,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
 }
 _HELP = """usage: ufmstar COMMAND ...
 
-Calibrated per-pixel variance for monocular depth, from the disagreement between views (UfM*).
+UfM* corrects the depth of monocular networks and states its standard deviation at every pixel, from a video with poses.
+Without the correction (--plain), a constant deviation was better calibrated on each of four recordings (README.md).
 
 commands:
 {commands}

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +15,7 @@ from ufmstar_torch.eval.bench.measure import Plan, measure
 from ufmstar_torch.eval.bench.networks import ONCE, TimedNetwork
 from ufmstar_torch.eval.bench.parts import MULTIVIEW
 from ufmstar_torch.eval.bench.streams import time_streams
-from ufmstar_torch.eval.bench.timing import CLOCKS, most_threads
+from ufmstar_torch.eval.bench.timing import most_threads
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.methods.method import BASES, Method
 from ufmstar_torch.eval.methods.row import Row
@@ -43,35 +43,35 @@ class BenchSettings:
     docs/results/speed.md explains each figure.
 
     Attributes:
-        sequence: folder of a recording, or tour:SEED
-        model: kind of network, as in `ufmstar run`; without --weights fastdepth or monodepth2
-        weights: file or directory of the network's weights
-        spec: JSON file that declares what the weights do not contain, as in `ufmstar run`
-        trust_code: exported, torchscript: let the file run its code; only for files whose origin you trust
-        runtime: auto: ONNX Runtime for weights in ONNX files, torch for the rest; or one of the two
-        sizes: sides of the square images without --weights [px], multiples of 32
-        backends: implementations of the step that are timed
-        frames: number of timed frames
-        history: number of frames before them
-        threads: number of CPU threads; default: the cores of this process
-        clock: wall, or cpu: the processor's time for this process, for one thread on a machine with other load
-        device: cpu, cuda or cuda:N, for network and UfM*
-        streams: numbers of simultaneous streams on which UfM* alone is also timed
-        json: file for the report
+        sequence: Measure on the recording in this folder, or on tour:SEED.
+        model: The network is of this kind, as for `ufmstar run`; without --weights fastdepth or monodepth2.
+        weights: The file or directory of the network's weights.
+        spec: This JSON file declares what the weights do not contain, as for `ufmstar run`.
+        trust_code: Let an exported or torchscript file run its code; only for files whose origin you trust.
+        runtime: Use torch or ONNX Runtime (auto: ONNX Runtime for weights in ONNX files).
+        sizes: Without --weights, the images are squares of these sides [px], multiples of 32.
+        backends: Time these implementations of the step.
+        frames: Time this many frames.
+        history: Pass this many frames before them.
+        threads: Use this many CPU threads (default: the cores of this process).
+        clock: Measure wall time, or cpu: the processor time of one thread, on a machine with other load.
+        device: Run network and UfM* on cpu, cuda or cuda:N.
+        streams: Also time UfM* alone on these numbers of simultaneous streams.
+        json: Write the report to this file.
     """
 
     sequence: str = TOUR
     model: str = "fastdepth"
     weights: Path | None = None
     spec: Path | None = None
-    trust_code: bool = field(default=False, metadata={"typed": True})
-    runtime: str = field(default="auto", metadata={"choices": ("auto", "torch", "onnx")})
+    trust_code: bool = False
+    runtime: Literal["auto", "torch", "onnx"] = "auto"
     sizes: tuple[int, ...] = (224, 512)
-    backends: tuple[str, ...] = field(default=("auto",), metadata={"choices": ("auto", "numba", "triton", "torch")})
-    frames: int = field(default=40, metadata={"least": 1})
-    history: int = field(default=60, metadata={"least": 1})
+    backends: tuple[Literal["auto", "numba", "triton", "torch"], ...] = ("auto",)
+    frames: int = 40
+    history: int = 60
     threads: int | None = None
-    clock: str = field(default="wall", metadata={"choices": tuple(CLOCKS)})
+    clock: Literal["wall", "cpu"] = "wall"
     device: str = "cpu"
     streams: tuple[int, ...] = ()
     json: Path | None = None
@@ -81,6 +81,9 @@ class BenchSettings:
             raise ValueError(f"--model {self.model} needs --weights; without, it is one of {', '.join(ARCHITECTURES)}")
         if self.clock == "cpu" and (self.device != "cpu" or self.threads != 1):
             raise ValueError("--clock cpu needs --threads 1 on the CPU: it is the time of all threads together")
+        for name in ("frames", "history"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
         if any(count < 1 for count in self.streams):
             raise ValueError(f"--streams must be positive, got {list(self.streams)}")
         if not self.sizes or any(size < 64 or size % 32 for size in self.sizes):

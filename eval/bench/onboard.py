@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.eval.bench.quantise import quantise
 from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.engine.realtime import RealTime
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
@@ -30,7 +31,6 @@ from ufmstar_torch.eval.tour import tour_sequence
 from ufmstar_torch.live import LiveDepth
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.models.quantise import quantise
 from ufmstar_torch.models.trained import load_trained
 from ufmstar_torch.uncertain_depth import UncertainDepth
 
@@ -72,7 +72,7 @@ def run_onboard(out: Path, weights: Path, seconds: float, seed: int, progress: R
 
     Args:
         out: folder for the quantised graph and the picture.
-        weights: file of ``ufmstar train``, whose first network is quantised; or a FastDepth (.onnx, .tflite).
+        weights: file of ``ufmstar train``, whose first network is quantised; or a FastDepth (.onnx).
         seconds: duration of the live run [s].
         seed: of the rooms.
         progress: receives the progress.
@@ -103,7 +103,7 @@ def run_onboard(out: Path, weights: Path, seconds: float, seed: int, progress: R
 def _network(weights: Path, out: Path, seed: int) -> tuple[DepthNetwork, dict[str, Any]]:
     """The network, and its description with the depth shift of quantisation."""
     threads = torch.get_num_threads()
-    if weights.suffix in (".onnx", ".tflite"):
+    if weights.suffix == ".onnx":
         return load_network("fastdepth", weights, threads=threads), {"file": weights.name, "threads": threads}
     network = load_trained(weights)[0]
     size = network.preprocess.size or _HALF_VGA

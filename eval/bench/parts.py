@@ -53,11 +53,7 @@ class MultiviewStep:
             K = torch.from_numpy(frame.intrinsics)
             anchors = self._landmarks.update(image, T, K, UfMStarConfig.rotation_tolerance)
             anchors = anchors.moved(K, prediction.K).to(self._device)
-        prediction = prediction.to(self._device)
-        if isinstance(self.estimator, Gaussians):
-            self.estimator.step(prediction, T, anchors)
-        else:
-            self.estimator.update(prediction, T, anchors)
+        self.estimator.update(prediction.to(self._device), T, anchors)
 
     def sample(self, frame: Frame, prediction: DepthPrediction, *, first: bool = False) -> None:
         """Average the uncertainty of a frame's map over 1,000 pixels; ``first`` resets the state before."""

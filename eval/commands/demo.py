@@ -13,7 +13,7 @@ from typing import Any
 from ufmstar_torch import models
 from ufmstar_torch.eval.bench.onboard import GRAPH, PICTURE, run_onboard
 from ufmstar_torch.eval.commands import evaluate
-from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, option, reader, usage_errors
+from ufmstar_torch.eval.commands.options import File, Flag, MachineOptions, as_dict, reader, require_least, usage_errors
 from ufmstar_torch.eval.commands.terminal import Bars
 from ufmstar_torch.eval.run.files import to_json, write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
@@ -32,27 +32,28 @@ class DemoOptions(MachineOptions):
     UfM's and UfM*'s, and makes the report of an evaluation. Nothing else is needed; one to two minutes on two cores.
 
     Attributes:
-        out: folder for the results
-        overwrite: replace an earlier demo there
-        frames: number of frames of each of the two walks
-        seed: of the rooms; the networks were trained on others
-        weights: another ensemble (.safetensors of `ufmstar train`); with --onboard any of its networks, or a FastDepth
-            (.onnx, .tflite)
-        onboard: live instead, as on a small robot: one network, quantised, at 30 images/s among things of many sizes
-        seconds: of --onboard
-        device: cpu, cuda or cuda:N
-        threads: number of CPU threads; default: all cores, with --onboard but one
+        out: Write the results to this folder.
+        overwrite: Replace an earlier demo there.
+        frames: Each of the two walks has this many frames.
+        seed: The rooms are drawn with this seed; the networks were trained on others.
+        weights: Use another ensemble (.safetensors of `ufmstar train`); with --onboard any of its networks, or a
+            FastDepth (.onnx).
+        onboard: Run live, as on a small robot: one quantised network, 30 images/s, things of many sizes.
+        seconds: With --onboard, walk this long [s].
+        device: Run on cpu, cuda or cuda:N.
+        threads: Use this many CPU threads (default: all cores, with --onboard all but one).
     """
 
     out: Path = Path("ufmstar_demo")
-    overwrite: bool = False
+    overwrite: Flag = False
     frames: int = 36
-    seed: int = option(100_003, least=0)
-    weights: Path | None = None
-    onboard: bool = False
+    seed: int = 100_003
+    weights: File = None
+    onboard: Flag = False
     seconds: float = 120.0
 
     def __post_init__(self) -> None:
+        require_least(self, seed=0)
         if not 2 <= self.frames <= _WALK:
             raise ValueError(f"--frames must be 2 to {_WALK}, got {self.frames}")
         if not 1 <= self.seconds < float("inf"):

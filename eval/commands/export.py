@@ -6,15 +6,15 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
-from ufmstar_torch.eval.commands.options import option, positional, reader, usage_errors
+from ufmstar_torch.eval.commands.opening import OpeningOptions
+from ufmstar_torch.eval.commands.options import Positional, Text, reader, require_positive, usage_errors
 from ufmstar_torch.eval.report.text import supported
 from ufmstar_torch.eval.run import export
 from ufmstar_torch.eval.run.export_bag import export_bag
 from ufmstar_torch.eval.run.rerun_log import export_rerun
 from ufmstar_torch.eval.sequences.open import open_sequence
-from ufmstar_torch.eval.sequences.options import Options
 
 _EXPORTERS: dict[str, Callable[..., str]] = {
     "depth": export.export_depth, "cloud": export.export_cloud, "tum": export.export_trajectory,
@@ -31,27 +31,28 @@ class ExportOptions:
     the recording that --sequence names, opened with the same options as for `ufmstar run`.
 
     Attributes:
-        out: folder of `ufmstar run`
-        sequence: the run's recording, for the colours of cloud, mcap and rrd, and the images of transforms
-        to: depth: depth and sigma as 16-bit PNGs, 0 = left out; cloud: cloud.ply with sigma and colour; tum:
-            trajectory.txt; transforms: images, depth, sigma and poses for nerfstudio; mcap: a ROS 2 bag; rrd: a rerun
-            recording
-        max_sigma: largest standard deviation of a pixel [m]
-        max_relative_sigma: largest standard deviation of a pixel, as a share of its depth
-        voxel: side of the cloud's voxels [m], each of which has one point
+        out: The folder of `ufmstar run`.
+        to: Write depth and sigma as 16-bit PNGs (depth; 0 = left out), cloud.ply with sigma and colour (cloud),
+            trajectory.txt (tum), images, depth, sigma and poses for nerfstudio (transforms), a ROS 2 bag (mcap), or a
+            rerun recording (rrd).
+        sequence: Take colours and images from this recording, that of the run.
+        max_sigma: Leave pixels with a larger standard deviation out [m].
+        max_relative_sigma: Leave pixels with a larger standard deviation out, as a share of the depth.
+        voxel: The cloud has one point in each voxel of this side [m].
     """
 
     USAGE: ClassVar[str] = "ufmstar export OUT --to depth|cloud|tum|transforms|mcap|rrd [--sequence SEQUENCE] [options]"
 
-    out: Path = positional()
-    sequence: str | None = None
-    to: str = option(choices=tuple(_EXPORTERS))
-    max_sigma: float = option(float("inf"), positive=True)
-    max_relative_sigma: float = option(float("inf"), positive=True)
-    voxel: float = option(0.02, positive=True)
-    opening: Options
+    out: Positional[Path]
+    to: Literal["depth", "cloud", "tum", "transforms", "mcap", "rrd"]
+    sequence: Text = None
+    max_sigma: float = float("inf")
+    max_relative_sigma: float = float("inf")
+    voxel: float = 0.02
+    opening: OpeningOptions
 
     def __post_init__(self) -> None:
+        require_positive(self, "max_sigma", "max_relative_sigma", "voxel")
         if self.sequence is None and self.to == "transforms":
             raise ValueError("--to transforms needs the images: --sequence SEQUENCE, the recording of the run")
         if self.sequence is None and (names := self.opening.changed()):

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ufmstar_torch.eval.commands.options import positional, reader, usage_errors
+from ufmstar_torch.eval.commands.options import Count, Flag, Number, Positional, Text, Texts, reader, usage_errors
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.reconstruct.keyframes import write_keyframes
@@ -39,40 +39,40 @@ class PosesOptions:
     result with --pose-scale or --scale-from network only.
 
     Attributes:
-        source: video file, or folder of images in the order of their names
-        out: folder for the result, which `ufmstar run` reads; anchors are in OUT/landmarks.npz
-        intrinsics: of the images, kept as they are: a file, or fx fy cx cy [px]; default: K.txt in the folder, or else
-            estimated
-        distortion: of the images' lens, undone in OUT/images: k1 k2 p1 p2 [k3 [k4 k5 k6]], or fisheye k1 k2 k3 k4
-        length: A B METRES, two places and their distance; a place is NAME, where the camera was at that image, or
-            NAME:U,V, what a pixel of OUT/images/NAME.jpg shows
-        trajectory: file with metric positions of the camera (SLAM's, VIO's, GPS's) in TUM or KITTI format
-        images: folder of images or video within the source
-        fps: frames per second of images without timestamps
-        time_offset: added to the images' times [s]
-        max_pose_gap: positions are interpolated between samples at most this far apart [s]
-        frames: START:STOP:STEP, which images, counted from 0 as Python does
-        overwrite: replace the reconstruction in --out
-        threads: number of CPU threads; default: all cores
+        source: A video file, or a folder of images in the order of their names.
+        out: Write the result, which `ufmstar run` reads, to this folder; anchors are in OUT/landmarks.npz.
+        intrinsics: The camera of the images is in this file, or is fx fy cx cy [px], and is not refined (default:
+            K.txt in the folder, or else it is estimated).
+        distortion: Undo this lens distortion in OUT/images: k1 k2 p1 p2 [k3 [k4 k5 k6]], or fisheye k1 k2 k3 k4.
+        length: The distance of two places is A B METRES; a place is NAME, where the camera was at that image, or
+            NAME:U,V, what a pixel of OUT/images/NAME.jpg shows.
+        trajectory: Take the scale from metric positions of the camera (SLAM's, VIO's, GPS's), in TUM or KITTI format.
+        images: The images are in this folder or video within the source.
+        fps: Images without timestamps come at this rate [1/s].
+        time_offset: Add this to the times of the images [s].
+        max_pose_gap: Interpolate positions between samples at most this far apart [s].
+        frames: Take these images, START:STOP:STEP, counted from 0 as Python does.
+        overwrite: Replace the reconstruction in --out.
+        threads: Use this many CPU threads (default: all cores).
     """
 
     USAGE: ClassVar[str] = (
         "ufmstar poses VIDEO|FOLDER --out DIR [--intrinsics FILE] [--length A B METRES | --trajectory FILE] [options]"
     )
 
-    source: str = positional()
+    source: Positional[str]
     out: Path
-    intrinsics: tuple[str, ...] = ()
-    distortion: tuple[str, ...] = ()
-    length: tuple[str, ...] = ()
-    trajectory: str | None = None
-    images: str | None = None
-    fps: float | None = None
+    intrinsics: Texts = ()
+    distortion: Texts = ()
+    length: Texts = ()
+    trajectory: Text = None
+    images: Text = None
+    fps: Number = None
     time_offset: float = 0.0
     max_pose_gap: float = 0.1
-    frames: str | None = None
-    overwrite: bool = False
-    threads: int | None = None
+    frames: Text = None
+    overwrite: Flag = False
+    threads: Count = None
 
     def __post_init__(self) -> None:
         parse_intrinsics(self.intrinsics, "--intrinsics")

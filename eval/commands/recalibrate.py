@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.commands.options import option, positional, reader, usage_errors
+from ufmstar_torch.eval.commands.options import Positional, reader, usage_errors
 from ufmstar_torch.eval.engine.estimators import ufm_star_config
 from ufmstar_torch.eval.engine.judge import CONFIDENCE, METRICS
 from ufmstar_torch.eval.methods.method import UFM_STAR
@@ -27,16 +27,16 @@ class RecalibrateOptions:
     are of each sequence under the map that was fitted to the others.
 
     Attributes:
-        out: folder of `ufmstar eval`
-        row: the row, as the table names it: UfM*-DepthOnly, say
-        to: file of the map; WEIGHTS.recalibration.json beside the weights is used without being named
-        covariate: input of the map: the variance, or the network's confidence, from which it gives a factor of it
+        out: The folder of `ufmstar eval`.
+        row: Fit to this row, as the table names it: UfM*-DepthOnly, say.
+        to: Write the map to this file; `ufmstar run` finds WEIGHTS.recalibration.json beside the weights.
+        covariate: Map the variance, or the network's confidence to a factor of the variance.
     """
 
-    out: Path = positional()
+    out: Positional[Path]
     row: str
     to: Path
-    covariate: str = option("variance", choices=("variance", CONFIDENCE))
+    covariate: Literal["variance", "confidence"] = "variance"
 
 
 read = reader(RecalibrateOptions, "ufmstar recalibrate")

@@ -104,8 +104,6 @@ SETTINGS = {
     "regression": ("regression", ""),
     "unmeasured": ("not measured:", ""),
     "unmeasured_relative": ("ρ", "of the depth"),
-    "near_radius": ("search radius", "m"),
-    "far_radius": ("far search radius", "m"),
     "variance_floor": ("variance floor", "m²"),
     "segment.min_pixels": ("smallest segment", "px"),
     "segment.min_rows": ("smallest segment", "rows"),

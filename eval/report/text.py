@@ -64,7 +64,7 @@ def run_table(summary: Mapping[str, Any]) -> str:
     if uncertainty["unmeasured_share"]:
         lines.append(
             f"not compared: {uncertainty['unmeasured_share']:.0%} of the pixels show what one view alone has seen; "
-            "there M is that of --ufm.unmeasured, and the sigma of UfM* is striped in the pictures"
+            "there M is that of the setting unmeasured, and the sigma of UfM* is striped in the pictures"
         )
     if summary["anchors"] is not None:
         lines += _anchor_lines(summary)
@@ -123,7 +123,7 @@ def _metric_lines(summary: Mapping[str, Any]) -> list[str]:
     if (metrics["nll"] or 0) > NLL_OF_FEW:
         lines.append(
             f"NLL: dominated by the {uncertainty['near_zero_share']:.2%} of the pixels with a sigma between "
-            f"0 and {1000 * NEAR_ZERO:g} mm; --ufm.variance_floor 1e-4 bounds what they cost"
+            f"0 and {1000 * NEAR_ZERO:g} mm; --set variance_floor=1e-4 bounds what they cost"
         )
     return lines
 

@@ -1,4 +1,4 @@
-"""The sequences of an evaluation, and their shards."""
+"""The sequences of an evaluation."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import hashlib
 import random
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -46,39 +46,6 @@ class WorkItem:
         sequence = open_sequence(self.path, **self.opening.changed())
         require_metric(sequence)
         return sequence
-
-
-@dataclass(frozen=True)
-class Shard:
-    """One of several equal parts of the sequences.
-
-    Raises:
-        ValueError: no such part.
-    """
-
-    index: int = 1  # which, from 1
-    count: int = 1  # number of parts
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.index <= self.count:
-            raise ValueError(f"--shard must be 1/n to n/n, got {self}")
-
-    @classmethod
-    def parse(cls, text: str) -> Shard:
-        """Parse "i/n", i from 1 to n. Raises ValueError: another form."""
-        if not (match := re.fullmatch(r"(\d+)/(\d+)", text)):
-            raise ValueError(f"--shard must be i/n, 1/4 to 4/4 for four parts, got {text!r}")
-        return cls(int(match[1]), int(match[2]))
-
-    def __str__(self) -> str:
-        return f"{self.index}/{self.count}"
-
-    def of(self, items: Sequence[WorkItem]) -> list[WorkItem]:
-        """The shard's items: every n-th, so that similar neighbours are in different shards."""
-        return list(items[self.index - 1 :: self.count])
-
-
-ALL = Shard()
 
 
 def find_work(

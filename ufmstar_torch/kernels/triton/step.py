@@ -1,4 +1,4 @@
-"""A step on a GPU in about ten launches, without synchronisation.
+"""A step on a GPU without synchronisation: 11 compiled kernels, and with torch's operations some 90 launches.
 
 The mixture has a fixed number of slots. The device counts the components that a frame adds, and copies the counts to
 the host after the frame's last change of the mixture. The host reads them at the next frame, so that it waits only if
