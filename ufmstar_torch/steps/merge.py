@@ -61,9 +61,11 @@ def after_frame(
     state: UfMStarState, frame: FrameInput, config: UfMStarConfig, kernels: MergeKernels | None = None
 ) -> tuple[UfMStarState, dict[str, Tensor]]:
     """Merge the streams that are due after a frame, and count the components."""
-    state = merged(state, frame.fault == 0, config, kernels)
-    alone = state.mixture.valid & (state.views == 0)
-    return state, {"components": state.mixture.components, "single_view": alone.sum(1)}
+    after = merged(state, frame.fault == 0, config, kernels)
+    if after is state:
+        return state, {}
+    mixture = after.mixture
+    return after, {"components": mixture.components, "single_view": (mixture.valid & (mixture.views == 0)).sum(1)}
 
 
 def merged(
@@ -82,11 +84,11 @@ def merged(
     assert config.merge is not None
     if state.mean.device.type == "meta":
         return state
-    due = fine & (state.frames % config.merge.every == 0)
-    if not bool(due.any()):
+    frames, every = zip(fine.tolist(), state.frames.tolist(), strict=True), config.merge.every
+    if not any(due := [used and number % every == 0 for used, number in frames]):
         return state
     sums = torch.cat([state.mean.new_zeros(*state.weight.shape, 0), *state.by_component.values()], -1)
-    mixture, sums = merge(state.mixture, sums, due, config, kernels)
+    mixture, sums = merge(state.mixture, sums, torch.tensor(due), config, kernels)
     parts = sums.split([value.shape[-1] for value in state.by_component.values()], -1) if state.by_component else ()
     return state.with_tensors(mixture.tensors() | dict(zip(state.by_component, parts, strict=True)))
 
