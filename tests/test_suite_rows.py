@@ -202,7 +202,7 @@ def test_a_in_h_agrees_with_the_oracle():
         answer = estimator.update(maps, torch.tensor(T))
         _, M = judge.step(depth, T, K, features=a[None])
         A = oracle.aleatoric_in_h(judge.mixture_cam, depth, depth > 0, K, a, prior_weight=1.0)
-        np.testing.assert_allclose(answer.maps["aleatoric"][0].numpy(), A, rtol=1e-5)
+        np.testing.assert_allclose(answer.aleatoric[0].numpy(), A, rtol=1e-5)
         np.testing.assert_allclose(answer.variance[0].numpy(), M + A, rtol=1e-3, atol=1e-5)
         frame = maps.depth, torch.tensor(T), torch.tensor(K), maps.aleatoric_variance
         mean = sampled.mean_uncertainty(*frame, features=torch.ones(1, 1, *depth.shape), fraction=1.0)
