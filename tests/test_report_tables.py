@@ -382,11 +382,27 @@ class TestThePapersNumbers:
         half = 2.776 * 250**0.5 / 5**0.5  # Student's t of four degrees of freedom, variance of 0, 10, ..., 40
         assert cells["energy [mJ] ↓"] == f"1927 ± {half:.0f}"  # 1857 of the network, 50 to 90 of the step
         assert cells["memory [MB] ↓"] == "1245"
-        assert "memory on all sequences, energy on 5 of them" in table.notes[-1]
+        assert "on all selected frames of 5 sequences" in table.notes[-1]
+        assert result.efficiency["plan"]["frames"] == 500
         assert result.efficiency["rows"][0]["latency"]["multiview"]["median_ms"] == 24.0
         assert result.efficiency["sequence"]["name"] == "5 sequences"
         without = over_sequences({("d", "s"): measured_line(mvd=(24.0, None), dnn=(252.0, None))})
         assert without["sequences"][0]["energy_mj"] == {"UfM*-Ensemble": None}
+
+    def test_memory_is_one_number_in_all_tables(self):
+        """The main table adds the network's and the state's columns of the table of efficiency, whatever the records
+        have, because both are measured over the same frames."""
+        sizes = {("d", "a"): 10e6, ("d", "b"): 30e6}
+        networks = {"network_uncertainty_bytes": 5e6}
+        runs = {
+            where: measured_line(mvd=(24.0, 50.0), memory={"mvd": size, **networks}) for where, size in sizes.items()
+        }
+        result = in_memory({(UFM_STAR, where): {"nll": 1.0} for where in runs}, efficiency=over_sequences(runs))
+        main = parsed(markdown(main_table(result)))["UfM*-Ensemble"]
+        costs = parsed(markdown(all_tables(result)["efficiency"][0]))["UfM*-Ensemble"]
+        assert (costs["Memory: DNN unc. [MB]"], costs["Memory: MVD [MB]"]) == ("5.0", "20.0")
+        assert (costs["Memory: MVD, mean [MB]"], costs["Memory: DNN buffers [MB]"]) == ("10.0", "1.0")
+        assert main["memory [MB] ↓"].split(" ±")[0] == "25.0"
 
     def test_table_2_stands_below_what_was_measured(self, tmp_path):
         result = in_memory({(ALONE, ("d", "s")): {"nll": 1.0}}, efficiency=measured_line())

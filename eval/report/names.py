@@ -16,7 +16,7 @@ LOWER, HIGHER = "↓", "↑"  # the better direction
 class Quantity:
     """A figure, its name and unit in tables and figures."""
 
-    key: str  # of ``Record.values``: a figure, or "state.bytes_mean", "ms.network", "frames.done"
+    key: str  # of ``Record.values``: a figure, or "state.bytes_end", "ms.network", "frames.done"
     name: str
     decimals: int | None  # None = three significant digits
     better: str = ""  # "↓", "↑", or "" for neither
@@ -45,7 +45,7 @@ ENERGY = Quantity("energy_mj", "energy", None, LOWER, "mJ")
 MEMORY = Quantity("memory_mb", "memory", None, LOWER, "MB")
 
 # The paper's columns, and further columns that are usual in the field.
-_STATE = Quantity("state.bytes_mean", "state", None, "", "MB", 1e-6)
+_STATE = Quantity("state.bytes_end", "state", None, "", "MB", 1e-6)  # after the last frame
 MAIN = (Quantity("delta1", "δ₁", 3, HIGHER), NLL, ECE_DELTA, ECE_Q, _STATE)
 EXTRA = (
     Quantity("delta1_ratio", "δ₁ (ratio)", 3, HIGHER),
@@ -61,6 +61,7 @@ EXTRA = (
     # Shares of UfM*'s frames: without a segment, and (after the first) without a match of a segment with a component.
     Quantity("frames.without_segment", "no segment", 1, "", "%", 100.0),
     Quantity("frames.without_match", "no match", 1, "", "%", 100.0),
+    Quantity("state.bytes_mean", "state, mean over frames", None, "", "MB", 1e-6),
     Quantity("ms.network", "network", 1, "", "ms"),
     Quantity("ms.uncertainty", "uncertainty", 1, "", "ms"),
 )

@@ -118,19 +118,17 @@ def _means(records: Records, quantities: Iterable[Quantity], group: str = "") ->
 
 
 def _costs(efficiency: Mapping[str, Any], records: Records, group: str) -> Columns:
-    """Energy and memory of the rows' uncertainty: energy over the measured sequences, memory over all sequences; dashes
+    """Energy and memory of the rows' uncertainty over the measured sequences, as in the table of efficiency; dashes
     where nothing was measured."""
     measured = {line["row"]: line for line in efficiency.get("rows", ())}
     energy, memory = {}, {}
     for row, listed in records.items():
         if row.label in measured:
             keys = {(record.dataset, record.sequence) for record in listed}
-            energies = [one for one in efficiency.get("sequences", ()) if (one["dataset"], one["sequence"]) in keys]
-            joules = mean_over(v for one in energies if (v := one["energy_mj"].get(row.label)) is not None)
-            network = measured[row.label]["memory"].get("network_uncertainty_bytes")
-            sizes = () if network is None else (network + (r.state.get("bytes_mean") or 0.0) for r in listed)
-            energy[row] = Cell.of(joules, ENERGY)
-            memory[row] = Cell.of(mean_over(1e-6 * size for size in sizes), MEMORY)
+            runs = [one for one in efficiency.get("sequences", ()) if (one["dataset"], one["sequence"]) in keys]
+            joules, sizes = ([one[name].get(row.label) for one in runs] for name in ("energy_mj", "memory_bytes"))
+            energy[row] = Cell.of(mean_over(v for v in joules if v is not None), ENERGY)
+            memory[row] = Cell.of(mean_over(1e-6 * v for v in sizes if v is not None), MEMORY)
     return {(group, ENERGY): energy, (group, MEMORY): memory}
 
 
@@ -182,9 +180,9 @@ def _notes(results: Results, records: Records) -> list[str]:
 def _cost_note(efficiency: Mapping[str, Any]) -> str:
     used = set(efficiency["devices"]["units"].values())
     missing = "; ".join(dict.fromkeys(why for unit, why in efficiency["power"]["missing"].items() if unit in used))
-    measured = f", energy on {len(efficiency.get('sequences', ()))} of them"
-    words = f"; energy is not measurable here: {missing}" if missing else measured
-    return f"Energy and memory are what uncertainty adds to depth alone, memory on all sequences{words}."
+    words = f"; energy is not measurable here: {missing}" if missing else ""
+    measured = f"on all selected frames of {count(len(efficiency.get('sequences', ())), 'sequence')}"
+    return f"Energy, and memory after the last frame, are what uncertainty adds to depth alone, {measured}{words}."
 
 
 # ---- files ----
