@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ufmstar_torch.eval.report import style
 from ufmstar_torch.eval.run.colours import FAINT, INK
-from ufmstar_torch.gaussian import pointwise_disagreement, wasserstein_variance
+from ufmstar_torch.gaussians.gaussian import pointwise_disagreement, wasserstein_variance
 
 FILE = Path(__file__).parent / "images" / "disagreement_cases.png"
 # Error in depth [m] of the left and the right half in the first view, then in the second.

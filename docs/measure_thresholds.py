@@ -36,9 +36,9 @@ from ufmstar_torch.eval.report.figures_gates import gates_figure, intervals_figu
 from ufmstar_torch.eval.report.style import new_figure
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.open import open_sequence
+from ufmstar_torch.frames.output import UfMStarOutput
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.trained import load_trained
-from ufmstar_torch.output import UfMStarOutput
 from ufmstar_torch.posterior.conformal import LEVELS, TRANSFER
 
 # Ten tours for the tables, and ten others for ``--fit``.

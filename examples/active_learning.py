@@ -12,9 +12,9 @@ import torch
 from jsonargparse import auto_cli
 
 from ufmstar_torch import UfMStar
-from ufmstar_torch.choose import choose
 from ufmstar_torch.eval.metrics import RMSE, mean_and_ci
 from ufmstar_torch.eval.tour import tour_sequence
+from ufmstar_torch.frames.choose import choose
 from ufmstar_torch.models import load_trained
 from ufmstar_torch.train import loss_of
 

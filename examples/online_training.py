@@ -15,8 +15,8 @@ from jsonargparse import auto_cli
 from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.metrics import mean_and_ci
 from ufmstar_torch.eval.tour import tour_sequence
+from ufmstar_torch.frames.online import TrainDecision, image_statistics
 from ufmstar_torch.models import load_trained
-from ufmstar_torch.online import TrainDecision, image_statistics
 from ufmstar_torch.train import loss_of
 
 

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from ufmstar_torch.eval.run.export import gated_frames
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.limits import require_bytes
+from ufmstar_torch.files.limits import require_bytes
 
 VOXEL, TRUNCATION = 0.08, 0.4  # [m]; the truncation is about the posterior's mean sigma
 WEIGHTS = {"all alike": np.ones_like, "1/sigma^2": lambda sigma: 1 / np.maximum(sigma, 0.01) ** 2}

@@ -17,12 +17,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.arguments import require_flag, require_float, require_mask, require_number, require_whole
-from ufmstar_torch.checked import Checked, number
+from ufmstar_torch.frames.arguments import require_flag, require_float, require_mask, require_number, require_whole
+from ufmstar_torch.frames.prediction import DepthPrediction, infer
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import as_map
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.prediction import DepthPrediction, infer
+from ufmstar_torch.runtime.checked import Checked, number
 
 KINDS = ("inverse", "affine")
 # Reweighted fits: with a third of outliers on one side, each fit reduces the error to .85, and 25 to less than .02.

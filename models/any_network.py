@@ -13,15 +13,15 @@ from zipfile import BadZipFile
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.arguments import require_flag
+from ufmstar_torch.frames.arguments import require_flag
+from ufmstar_torch.frames.networks import require_switchable
+from ufmstar_torch.frames.prediction import DepthPrediction, infer
+from ufmstar_torch.frames.prediction import takes_intrinsics as declares_intrinsics
+from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.models.hugging_face import from_hugging_face, of_transformers
 from ufmstar_torch.models.network import DeclaredNetwork, DepthNetwork
 from ufmstar_torch.models.outputs import METRIC, OutputSpec, PlainSpec, ProgramSpec, Spread
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.networks_in_turn import require_switchable
-from ufmstar_torch.prediction import DepthPrediction, infer
-from ufmstar_torch.prediction import takes_intrinsics as declares_intrinsics
-from ufmstar_torch.stream_warnings import LOGGER
 
 # Programs in files, by name of the network (``load_network``), and what their format can do.
 PROGRAMS = {

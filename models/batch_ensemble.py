@@ -18,12 +18,12 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 
+from ufmstar_torch.frames.networks import combine
+from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models.batch_layer import BatchLayer, Selection
 from ufmstar_torch.models.distribution import DepthDistribution, images_of
 from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.networks_in_turn import combine
-from ufmstar_torch.prediction import DepthPrediction
 
 # [1] Standard deviation of the factors around 1, as in the published implementations. A smaller one keeps the members
 # nearer to pretrained weights and to each other; random signs would destroy trained weights.

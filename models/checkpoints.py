@@ -14,12 +14,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.arguments import as_path, require_kind
-from ufmstar_torch.atomic import write_atomic
-from ufmstar_torch.optional import optional
-from ufmstar_torch.tensor_files import DAMAGE as DAMAGE
-from ufmstar_torch.tensor_files import CheckpointError as CheckpointError
-from ufmstar_torch.tensor_files import read_tensors
+from ufmstar_torch.files.atomic import write_atomic
+from ufmstar_torch.files.tensors import DAMAGE as DAMAGE
+from ufmstar_torch.files.tensors import CheckpointError as CheckpointError
+from ufmstar_torch.files.tensors import read_tensors
+from ufmstar_torch.frames.arguments import as_path, require_kind
+from ufmstar_torch.runtime.optional import optional
 
 # Keys under which training programs store the weights in a checkpoint, and prefixes that wrappers add to every key.
 _CONTAINERS = ("state_dict", "model_state_dict", "model")

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 from torch import Tensor
 
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.frames.prediction import DepthPrediction
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from ufmstar_torch.frames.networks import combine
+from ufmstar_torch.frames.prediction import DepthPrediction, infer
 from ufmstar_torch.models.distribution import DepthDistribution
 from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.networks_in_turn import combine
-from ufmstar_torch.prediction import DepthPrediction, infer
 
 SAMPLES = 10  # passes of the paper's multi-inference baseline
 

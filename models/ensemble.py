@@ -11,11 +11,11 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
+from ufmstar_torch.frames.networks import combine
+from ufmstar_torch.frames.prediction import DepthPrediction, infer, takes_intrinsics
 from ufmstar_torch.models.checkpoints import CheckpointError
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.networks_in_turn import combine
-from ufmstar_torch.prediction import DepthPrediction, infer, takes_intrinsics
 
 
 class Ensemble(DepthNetwork):

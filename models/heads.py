@@ -14,10 +14,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ufmstar_torch.arguments import require_whole
+from ufmstar_torch.frames.arguments import require_whole
+from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models.distribution import DepthDistribution, EvidentialDepth, GaussianDepth, PointDepth, images_of
 from ufmstar_torch.models.network import Backbone, DepthNetwork
-from ufmstar_torch.prediction import DepthPrediction
 
 # [log m^2] Standard deviations from 1 mm to 1 km, which covers all plausible ones. Within them, exp(s) and exp(-s)
 # times a squared depth stay in the range of float32.

@@ -16,14 +16,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ufmstar_torch.checked import Checked, number
+from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models.alignment import KINDS, AlignedNetwork, Alignment
 from ufmstar_torch.models.checkpoints import DAMAGE, CheckpointError, some
 from ufmstar_torch.models.network import DepthNetwork, require_image
 from ufmstar_torch.models.outputs import METRIC, PlainSpec, as_map
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.optional import optional
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.runtime.checked import Checked, number
+from ufmstar_torch.runtime.optional import optional
 
 _LINEAR, _CUBIC = 2, 3  # Pillow's numbers, which the configurations use
 # The supported architectures, and whether they always predict metric depth. Others, such as models with a second input,

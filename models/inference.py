@@ -16,13 +16,13 @@ from typing import Any
 import torch
 from torch import nn
 
-from ufmstar_torch.checked import Checked, choice, number
 from ufmstar_torch.models.batch_ensemble import BatchEnsembleMember
 from ufmstar_torch.models.fastdepth import FastDepth
 from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.litert_network import LiteRTNetwork
 from ufmstar_torch.models.network import Backbone, DepthNetwork
 from ufmstar_torch.models.onnx_network import OnnxNetwork, providers_for
+from ufmstar_torch.runtime.checked import Checked, choice, number
 
 ONNX, TORCH = "onnx", "torch"
 BF16 = "bf16"

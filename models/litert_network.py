@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models.network import DeclaredNetwork, require_image
 from ufmstar_torch.models.outputs import PlainSpec, ProgramSpec
-from ufmstar_torch.optional import optional
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.runtime.optional import optional
 
 
 class LiteRTNetwork(DeclaredNetwork):

@@ -6,7 +6,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.arguments import as_path
+from ufmstar_torch.frames.arguments import as_path
 from ufmstar_torch.models.network import DepthNetwork
 
 # Name -> module and function of its loader.

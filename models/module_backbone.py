@@ -16,14 +16,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ufmstar_torch.checked import Checked
+from ufmstar_torch.frames.prediction import DepthPrediction, takes_intrinsics
 from ufmstar_torch.models.dropout import DecoderDropout
 from ufmstar_torch.models.heads import resized
 from ufmstar_torch.models.hugging_face import Checkpoint, HuggingFaceDepth, HuggingFaceSpec, read_checkpoint
 from ufmstar_torch.models.network import INITIAL_DEPTH, Backbone, in_eval_mode
 from ufmstar_torch.models.outputs import as_map
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.prediction import DepthPrediction, takes_intrinsics
+from ufmstar_torch.runtime.checked import Checked
 
 _PROBE = (480, 640)  # [px] of the grey image for a test inference
 

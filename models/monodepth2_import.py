@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.checked import Checked, number
+from ufmstar_torch.files.tensors import read_tensors
 from ufmstar_torch.models.alignment import AlignedNetwork, Alignment
 from ufmstar_torch.models.checkpoints import channels_of, fill, load_state_dict_file
 from ufmstar_torch.models.monodepth2 import (
@@ -30,7 +30,7 @@ from ufmstar_torch.models.monodepth2 import (
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import PlainSpec
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.tensor_files import read_tensors
+from ufmstar_torch.runtime.checked import Checked, number
 
 # Keys of encoder.pth other than weights.
 _NO_WEIGHTS = ("height", "width", "use_stereo")

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
+from ufmstar_torch.frames.networks import require_switchable
+from ufmstar_torch.frames.prediction import DepthPrediction, stated_range, states_confidence, takes_intrinsics
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.networks_in_turn import require_switchable
-from ufmstar_torch.prediction import DepthPrediction, stated_range, states_confidence, takes_intrinsics
 
 if TYPE_CHECKING:
     from ufmstar_torch.models.outputs import OutputSpec

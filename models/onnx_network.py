@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.checked import choice
+from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models.network import DeclaredNetwork, require_image
 from ufmstar_torch.models.outputs import PlainSpec, ProgramSpec
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.optional import optional
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.runtime.checked import choice
+from ufmstar_torch.runtime.optional import optional
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession, NodeArg

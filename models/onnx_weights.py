@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from ufmstar_torch.optional import optional
+from ufmstar_torch.runtime.optional import optional
 
 if TYPE_CHECKING:
     from onnx import ModelProto

@@ -16,10 +16,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ufmstar_torch.arguments import as_tensor
-from ufmstar_torch.checked import Checked, choice, number, section
+from ufmstar_torch.frames.arguments import as_tensor
+from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.runtime.checked import Checked, choice, number, section
 
 METRIC = "metric"
 Spread = Literal["variance", "std", "log_variance", "log_std", "relative_std"]
@@ -46,7 +46,7 @@ class OutputSpec(Checked):
             units of the depth output; or "relative_std", a standard deviation over the depth (to first order that of
             the logarithm of depth). "confidence" is not allowed, since it is not a spread: use ``confidence``.
         confidence: name of an output of any unit that ranks the pixels, a confidence or an uncertainty; its relation to
-            the variance is learnt from anchors (``ufmstar_torch.confidence``).
+            the variance is learnt from anchors (``ufmstar_torch.anchors.confidence``).
         max_depth: [m] largest depth that the network can predict: ``UncertainDepth`` and the commands ignore pixels
             beyond it; None = unknown.
         resize: resize outputs of another resolution to that of the input, by nearest-neighbour sampling; otherwise such

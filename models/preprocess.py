@@ -20,10 +20,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ufmstar_torch.arguments import CameraLike, ImageLike, as_image, as_intrinsics
-from ufmstar_torch.camera import crop_intrinsics, resize_intrinsics
-from ufmstar_torch.checked import Checked, number
-from ufmstar_torch.limits import require_pixels
+from ufmstar_torch.files.limits import require_pixels
+from ufmstar_torch.frames.arguments import CameraLike, ImageLike, as_image, as_intrinsics
+from ufmstar_torch.gaussians.camera import crop_intrinsics, resize_intrinsics
+from ufmstar_torch.runtime.checked import Checked, number
 
 # [1] Tolerance of the range [0, 1] of float images, for overshooting filters and noise; excludes a range of 0..255.
 _RANGE_SLACK = 0.5

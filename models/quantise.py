@@ -13,12 +13,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec
 from ufmstar_torch.models.outputs import METRIC, OutputSpec
-from ufmstar_torch.optional import optional
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.runtime.optional import optional
 
 _IMAGE, _DEPTH, _VARIANCE = "image", "depth", "aleatoric_variance"
 

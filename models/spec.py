@@ -7,13 +7,13 @@ from typing import Any
 
 from torch import nn
 
-from ufmstar_torch.checked import Checked, choice, number, section
-from ufmstar_torch.limits import require_pixels
+from ufmstar_torch.files.limits import require_pixels
 from ufmstar_torch.models.batch_ensemble import INIT_STD, BatchEnsemble
 from ufmstar_torch.models.heads import HEADS, UncertaintyNetwork, with_head
 from ufmstar_torch.models.module_backbone import ModuleBackbone, ModuleSpec
 from ufmstar_torch.models.network import MULTIPLE, Backbone, fits
 from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.runtime.checked import Checked, choice, number, section
 
 MOST_MEMBERS = 1000  # of an ensemble
 _SMALLEST = {"fastdepth": 32, "monodepth2": 64}  # [px]

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.arguments import as_path
+from ufmstar_torch.frames.arguments import as_path
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble
 from ufmstar_torch.models.checkpoints import (
     CheckpointError,

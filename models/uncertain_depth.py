@@ -8,11 +8,12 @@ from typing import Any, Literal
 import numpy as np
 from torch import Tensor, nn
 
-from ufmstar_torch import networks_in_turn, pipeline
+from ufmstar_torch import uncertain_depth as pipeline
+from ufmstar_torch.frames import networks as networks_in_turn
+from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models.any_network import refuse_relative, wrap_network
 from ufmstar_torch.models.hugging_face import of_transformers
 from ufmstar_torch.models.outputs import METRIC, OutputSpec
-from ufmstar_torch.prediction import DepthPrediction
 
 
 class UncertainDepth(pipeline.UncertainDepth):

@@ -16,15 +16,20 @@ import numpy as np
 import pytest
 import torch
 
-from ufmstar_torch import UfMStar, UfMStarConfig, gaussian
-from ufmstar_torch.correspond import Correspondence
-from ufmstar_torch.frame import CheckKernel
-from ufmstar_torch.kernels import correspond_cpu, fuse_cpu, regress_cpu, rigid_cpu, segment_cpu
+from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch.frames.frame import CheckKernel
+from ufmstar_torch.gaussians import gaussian
+from ufmstar_torch.gaussians.mixture import GaussianMixture
+from ufmstar_torch.kernels.cpu import correspond as correspond_cpu
+from ufmstar_torch.kernels.cpu import fuse as fuse_cpu
+from ufmstar_torch.kernels.cpu import regress as regress_cpu
+from ufmstar_torch.kernels.cpu import rigid as rigid_cpu
+from ufmstar_torch.kernels.cpu import segment as segment_cpu
 from ufmstar_torch.kernels.host import moved
 from ufmstar_torch.kernels.select import select_check, select_kernels
-from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.segment_input import SegmentInput
-from ufmstar_torch.step_parts import REFERENCE, Kernels
+from ufmstar_torch.steps.correspond import Correspondence
+from ufmstar_torch.steps.segment_input import SegmentInput
+from ufmstar_torch.steps.step_parts import REFERENCE, Kernels
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"  # must be set before triton is imported
 

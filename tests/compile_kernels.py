@@ -12,7 +12,7 @@ from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig,
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.anchors.tracker import LandmarkTracker
-from ufmstar_torch.warm_up import along_wall
+from ufmstar_torch.runtime.warm_up import along_wall
 
 NEAR = UfMStarConfig(backend="numba", regression="neighbourhood")
 EXACT = UfMStarConfig(backend="numba")

@@ -68,8 +68,7 @@ def _names_files(config: pytest.Config) -> bool:
 def _compiled(dtype: str) -> bool:
     """Return True if the kernels on disk were compiled after the last change of a file that they depend on."""
     done = CORE / "kernels" / "__pycache__" / f"{dtype}.compiled"
-    sources = [path for folder in ("", "kernels", "posterior") for path in (CORE / folder).glob("*.py")]
-    return done.is_file() and done.stat().st_mtime > max(path.stat().st_mtime for path in sources)
+    return done.is_file() and done.stat().st_mtime > max(path.stat().st_mtime for path in CORE.rglob("*.py"))
 
 
 TRITON = (

@@ -16,6 +16,6 @@ assert weights.exists(), "the demo's networks are missing from the archive"
 names = [m.name for m in pkgutil.walk_packages([str(home)], "ufmstar_torch.")]
 for name in names:
     importlib.import_module(name)
-expected = {"ufmstar_torch.kernels.segment_cpu", "ufmstar_torch.models.fastdepth", "ufmstar_torch.eval.sequences.tum"}
+expected = {"ufmstar_torch.kernels.cpu.segment", "ufmstar_torch.models.fastdepth", "ufmstar_torch.eval.sequences.tum"}
 assert expected <= set(names), f"missing from the archive: {sorted(expected - set(names))}"
 print(f"ufmstar_torch {ufmstar_torch.__version__}: {len(names)} modules import from the installed archive")

@@ -1,4 +1,4 @@
-"""The confidence of ``ufmstar_torch/confidence.py`` as NumPy loops: one stream, float64."""
+"""The confidence of ``ufmstar_torch/anchors/confidence.py`` as NumPy loops: one stream, float64."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Merging in NumPy float64 loops, from the derivation in ufmstar_torch/merge.py; imports neither torch nor the package.
+"""Merging in NumPy float64 loops, from the derivation in ufmstar_torch/steps/merge.py. It imports neither
+torch nor the package.
 
 Components are dicts as in ``oracle`` with one more entry, "sums": the sums over anchors.
 """

@@ -1,11 +1,11 @@
-"""Triangulation in NumPy, all tracks at once: the oracle of ``ufmstar_torch.kernels.triangulate_cpu``."""
+"""Triangulation in NumPy, all tracks at once: the oracle of ``ufmstar_torch.anchors.kernels.triangulate``."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.kernels.triangulate_cpu import DAMPING, STEPS, Triangulated
+from ufmstar_torch.anchors.kernels.triangulate import DAMPING, STEPS, Triangulated
 
 
 def triangulate(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ufmstar_torch.correspond import Correspondence
-from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.gaussians.mixture import GaussianMixture
+from ufmstar_torch.steps.correspond import Correspondence
 
 
 def covariances(count: int, seed: int, decades: float = 4.0, largest: float = 0.1) -> Tensor:

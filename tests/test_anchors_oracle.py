@@ -14,10 +14,10 @@ from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.anchors import AnchorInput, Anchors, check_anchors
 from ufmstar_torch.anchors.evidence import Evidence, inliers
 from ufmstar_torch.anchors.extension import learn
-from ufmstar_torch.frame import check_frame
-from ufmstar_torch.kernels import anchors_cpu
-from ufmstar_torch.kernels.regress_cpu import regress_maps, views_of
-from ufmstar_torch.regress import distribute
+from ufmstar_torch.anchors.kernels import learn as anchors_cpu
+from ufmstar_torch.frames.frame import check_frame
+from ufmstar_torch.kernels.cpu.regress import regress_maps, views_of
+from ufmstar_torch.steps.regress import distribute
 
 pytestmark = pytest.mark.numerics
 

@@ -10,7 +10,7 @@ from torch import nn
 import scenes
 from ufmstar_torch import AnchorConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.anchors.anchors import Anchors
-from ufmstar_torch.camera import resize_intrinsics
+from ufmstar_torch.gaussians.camera import resize_intrinsics
 
 H, W = 48, 64
 ON = UfMStarConfig(anchors=AnchorConfig(), unmeasured="paper")  # evidence alone

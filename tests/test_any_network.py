@@ -19,6 +19,7 @@ from onnx_files import small_network
 from torch import Tensor, nn
 
 from ufmstar_torch import UncertainDepth
+from ufmstar_torch.frames.prediction import DepthPrediction, infer
 from ufmstar_torch.models import (
     AlignedNetwork,
     Alignment,
@@ -36,7 +37,6 @@ from ufmstar_torch.models import (
 )
 from ufmstar_torch.models.any_network import load_exported, load_torchscript
 from ufmstar_torch.models.outputs import SPREADS, ProgramSpec
-from ufmstar_torch.prediction import DepthPrediction, infer
 
 METRIC = ProgramSpec(OutputSpec("metric"))
 

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from ufmstar_torch import UncertainDepth
+from ufmstar_torch.frames.networks import combine
 from ufmstar_torch.models import (
     Backbone,
     BatchEnsemble,
@@ -28,7 +29,6 @@ from ufmstar_torch.models import (
 )
 from ufmstar_torch.models.batch_ensemble import converted_layers
 from ufmstar_torch.models.batch_layer import BatchLayer, Selection
-from ufmstar_torch.networks_in_turn import combine
 
 N = 3
 

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.anchors.bundle import PoseRefinement
 from ufmstar_torch.anchors.dense import DenseEvidence
+from ufmstar_torch.anchors.kernels.bundle import equations, inverse_depths, moved
 from ufmstar_torch.anchors.tracker import LandmarkTracker
-from ufmstar_torch.kernels.bundle_cpu import equations, inverse_depths, moved
 
 K = np.array([[260.0, 0, 160], [0, 260, 120], [0, 0, 1]])
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import oracle
 import scenes
-from ufmstar_torch import camera
+from ufmstar_torch.gaussians import camera
 
 pytestmark = pytest.mark.numerics
 

@@ -15,7 +15,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from ufmstar_torch import atomic
+from ufmstar_torch.files import atomic
 from ufmstar_torch.models import CheckpointError, load_state_dict_file, load_weights, save_checkpoint
 
 FORMATS = ["w.pth", "w.pt", "w.safetensors"]

@@ -12,19 +12,12 @@ from modules import CONFIG, H, K, W, frame, same
 from PIL import Image
 from torch import nn
 
-from ufmstar_torch import (
-    AnchorConfig,
-    ConfidenceConfig,
-    DepthPrediction,
-    UfMStar,
-    UfMStarConfig,
-    UncertainDepth,
-    pipeline,
-)
-from ufmstar_torch.camera import crop_intrinsics, resize_intrinsics
+from ufmstar_torch import AnchorConfig, ConfidenceConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch import uncertain_depth as pipeline
+from ufmstar_torch.frames.networks import combine
+from ufmstar_torch.gaussians.camera import crop_intrinsics, resize_intrinsics
 from ufmstar_torch.models import Preprocess, load_network, save_checkpoint, wrap_network
-from ufmstar_torch.networks_in_turn import combine
-from ufmstar_torch.recalibrate import Recalibration
+from ufmstar_torch.posterior.recalibrate import Recalibration
 
 DEPTH, POSE, _ = frame(0)
 IMAGE = torch.randint(0, 255, (1, 3, H, W), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)

@@ -11,8 +11,8 @@ from random_gaussians import as_lists, mixture
 import oracle
 import scenes
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.correspond import correspond
-from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.gaussians.mixture import GaussianMixture
+from ufmstar_torch.steps.correspond import correspond
 
 pytestmark = pytest.mark.numerics
 

@@ -15,11 +15,11 @@ from pages import blocks
 from shared_data import require_shared
 
 from ufmstar_torch.cli import main
-from ufmstar_torch.conventions import CONVENTIONS
 from ufmstar_torch.eval.check.data_check import check_data, lines
 from ufmstar_torch.eval.sequences.ground_truth import register_depth
 from ufmstar_torch.eval.tour import export_tour
 from ufmstar_torch.eval.tour.sequence import open_tour
+from ufmstar_torch.gaussians.conventions import CONVENTIONS
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data.md"
 SIZE = (120, 160)

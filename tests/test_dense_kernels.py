@@ -8,9 +8,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from ufmstar_torch.kernels import dense_cpu
-from ufmstar_torch.kernels.dense_cpu import Search, Views, best_pixels, measure
-from ufmstar_torch.kernels.landmarks_cpu import patches, sight
+from ufmstar_torch.anchors.kernels import dense as dense_cpu
+from ufmstar_torch.anchors.kernels.dense import Search, Views, best_pixels, measure
+from ufmstar_torch.anchors.kernels.landmarks import patches, sight
 
 K = np.array([[90.0, 0, 47.5], [0, 90.0, 35.5], [0, 0, 1]])
 SEARCH = Search(start=0.5, low=-0.01, high=2.0, sigmas=3.5, least_score=0.85, rival=1.2, match=1.0)

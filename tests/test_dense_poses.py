@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.anchors.dense_poses import PoseErrors
-from ufmstar_torch.kernels.anchor_check_cpu import check_anchors, confirmed, farther
-from ufmstar_torch.kernels.dense_cpu import Measured, Views
-from ufmstar_torch.kernels.poses_cpu import Shown, linearised, solved
+from ufmstar_torch.anchors.kernels.check import check_anchors, confirmed, farther
+from ufmstar_torch.anchors.kernels.dense import Measured, Views
+from ufmstar_torch.anchors.kernels.poses import Shown, linearised, solved
 
 K = np.array([[250.0, 0, 159.5], [0, 252.0, 119.5], [0, 0, 1]])
 SHARES = np.arange(3)

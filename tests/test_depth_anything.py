@@ -14,8 +14,8 @@ from safetensors.torch import load_file, save_file
 
 from scenes import camera_pose, render
 from ufmstar_torch import UncertainDepth, cli
-from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.engine.load import NetworkChoice, sha256
+from ufmstar_torch.gaussians.camera import resize_intrinsics
 from ufmstar_torch.models import (
     CheckpointError,
     DepthAnything,

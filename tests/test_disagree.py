@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import oracle
-from ufmstar_torch.disagree import overlap_disagreement
-from ufmstar_torch.gaussian import wasserstein_squared
+from ufmstar_torch.gaussians.gaussian import wasserstein_squared
+from ufmstar_torch.steps.disagree import overlap_disagreement
 
 pytestmark = pytest.mark.numerics
 

@@ -10,8 +10,8 @@ import torch
 from pages import blocks
 
 import scenes
-from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.commands.run import read
+from ufmstar_torch.gaussians.camera import resize_intrinsics
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "anchors.md"
 H, W = 48, 64

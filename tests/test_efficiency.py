@@ -22,10 +22,10 @@ from ufmstar_torch.eval.bench.parts import MULTIVIEW, time_parts
 from ufmstar_torch.eval.engine.evaluate import Judge, evaluate_sequence
 from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.image_check import reduced, shows_something
+from ufmstar_torch.frames.image_check import reduced, shows_something
+from ufmstar_torch.frames.networks import NetworksInTurn
 from ufmstar_torch.models.any_network import wrap_network
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.networks_in_turn import NetworksInTurn
 
 NO_METER = SimpleNamespace(missing={CPU: "no permission to read RAPL", GPU: "no NVML"})
 QUICK = Plan(frames=4, warm_up=2, threads=1, seconds=0.02, windows=2)

@@ -25,6 +25,7 @@ from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report.efficiency import megabytes
 from ufmstar_torch.eval.sequences.frame import Frame
+from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble, converted_layers
 from ufmstar_torch.models.dropout import MonteCarloDropout
 from ufmstar_torch.models.ensemble import LazyMember
@@ -32,7 +33,6 @@ from ufmstar_torch.models.fastdepth import FastDepth
 from ufmstar_torch.models.heads import with_head
 from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec
 from ufmstar_torch.models.outputs import OutputSpec
-from ufmstar_torch.prediction import DepthPrediction
 
 
 def step_memory(name, size, K):

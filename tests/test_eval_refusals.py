@@ -13,7 +13,6 @@ import torch
 from tiny_suite import row, rows_of
 
 from ufmstar_torch import AnchorConfig, Recalibration, UfMStarConfig
-from ufmstar_torch.choose import choose
 from ufmstar_torch.eval.bench.measure import measure
 from ufmstar_torch.eval.commands.poses import read as read_poses
 from ufmstar_torch.eval.engine.load import NetworkChoice
@@ -25,7 +24,8 @@ from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.suite.work_items import Shard
 from ufmstar_torch.eval.tour import make_tour, render, tour_path
 from ufmstar_torch.eval.tour.view import intrinsics
-from ufmstar_torch.online import TrainDecision
+from ufmstar_torch.frames.choose import choose
+from ufmstar_torch.frames.online import TrainDecision
 
 NAN, INF = math.nan, math.inf
 EYE, K = torch.eye(4, dtype=torch.float64), torch.from_numpy(intrinsics(24, 32))

@@ -13,10 +13,10 @@ from random_gaussians import as_lists, covariances, mixture, random_pairs, views
 
 import oracle
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.correspond import Correspondence
-from ufmstar_torch.fuse import append, fuse
-from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.views import view_weights
+from ufmstar_torch.gaussians.mixture import GaussianMixture
+from ufmstar_torch.steps.correspond import Correspondence
+from ufmstar_torch.steps.fuse import append, fuse
+from ufmstar_torch.steps.views import view_weights
 
 pytestmark = pytest.mark.numerics
 

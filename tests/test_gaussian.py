@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from random_gaussians import covariances, means
 
 import oracle
-from ufmstar_torch import gaussian
-from ufmstar_torch.gaussian import pointwise_disagreement
+from ufmstar_torch.gaussians import gaussian
+from ufmstar_torch.gaussians.gaussian import pointwise_disagreement
 
 pytestmark = pytest.mark.numerics
 

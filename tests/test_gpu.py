@@ -15,8 +15,8 @@ from walks import SPGF, walks
 import scenes
 from ufmstar_torch import AnchorConfig, DepthPrediction, PosteriorConfig, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.anchors import Anchors
-from ufmstar_torch.capture import Captured
-from ufmstar_torch.stream_warnings import EVERY
+from ufmstar_torch.frames.warnings import EVERY
+from ufmstar_torch.runtime.capture import Captured
 
 pytestmark = [
     pytest.mark.gpu,

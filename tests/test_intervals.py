@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 
 from ufmstar_torch import AnchorConfig, PosteriorConfig, Recalibration, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.posterior import conformal
 from ufmstar_torch.posterior.distribution import DepthDistribution
-from ufmstar_torch.prediction import DepthPrediction
 
 CONFIG = UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())
 K = torch.tensor([[40.0, 0, 24], [0, 40, 18], [0, 0, 1]])
@@ -215,7 +215,7 @@ def test_uncertain_depth_has_the_same_intervals():
     model = UncertainDepth(None, CONFIG)
     for depth, T, anchors in frames():
         out = model.update(DepthPrediction(depth), T, K, anchors=anchors)
-    from ufmstar_torch.pipeline import UncertainPrediction
+    from ufmstar_torch.uncertain_depth import UncertainPrediction
 
     prediction = UncertainPrediction(DepthPrediction(depth), out, None)
     for a, b in zip(prediction.interval(0.9), out.interval(0.9), strict=True):

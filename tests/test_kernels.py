@@ -14,11 +14,14 @@ import torch
 from modules import frame as input_frame
 from modules import same
 
-from ufmstar_torch import SPGFConfig, UfMStar, frame
-from ufmstar_torch.kernels import check_cpu, select, step_cpu
+from ufmstar_torch import SPGFConfig, UfMStar
+from ufmstar_torch.frames import frame
+from ufmstar_torch.kernels import select
+from ufmstar_torch.kernels.cpu import check as check_cpu
+from ufmstar_torch.kernels.cpu import step as step_cpu
 from ufmstar_torch.kernels.host import moved, on_host
-from ufmstar_torch.segment_input import SegmentInput
-from ufmstar_torch.step_parts import REFERENCE
+from ufmstar_torch.steps.segment_input import SegmentInput
+from ufmstar_torch.steps.step_parts import REFERENCE
 
 pytestmark = pytest.mark.numerics
 

@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.anchors import landmark_source
 from ufmstar_torch.anchors.dense import DenseConfig, DenseEvidence, _pixels
+from ufmstar_torch.anchors.kernels.dense import LEAST_CONTRAST
 from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.sequences.open import open_sequence
-from ufmstar_torch.kernels.dense_cpu import LEAST_CONTRAST
 
 SMALL = {
     "corners": lambda: LandmarkTracker(TrackerConfig(max_points=40, window=4)),

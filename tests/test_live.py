@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from ufmstar_torch import AnchorConfig, DepthPrediction, LiveDepth, UfMStarConfig, UncertainDepth
+from ufmstar_torch.frames.clock import StreamClock, Verdict
 from ufmstar_torch.live import BACKWARDS, CLOSED, DOUBTFUL, GAP, LATE, LOST, NEWER
-from ufmstar_torch.stream_clock import StreamClock, Verdict
 
 K = (50.0, 50.0, 31.5, 23.5)
 PICTURE = np.zeros((48, 64, 3), np.uint8)

@@ -14,9 +14,9 @@ from random_gaussians import as_lists, covariances, mixture
 
 import scenes
 from ufmstar_torch import AnchorConfig, MergeConfig, UfMStar, UfMStarConfig
-from ufmstar_torch.merge import merge, merged
-from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.regress import regress
+from ufmstar_torch.gaussians.mixture import GaussianMixture
+from ufmstar_torch.steps.merge import merge, merged
+from ufmstar_torch.steps.regress import regress
 
 pytestmark = pytest.mark.numerics
 

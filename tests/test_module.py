@@ -16,9 +16,9 @@ from torch.utils._pytree import tree_leaves
 from walks import SPGF
 
 from ufmstar_torch import AnchorConfig, MergeConfig, SPGFConfig, UfMStar, UfMStarConfig
-from ufmstar_torch.camera import unproject
-from ufmstar_torch.fuse import make_room
-from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.gaussians.camera import unproject
+from ufmstar_torch.gaussians.mixture import GaussianMixture
+from ufmstar_torch.steps.fuse import make_room
 
 pytestmark = pytest.mark.numerics
 

@@ -12,9 +12,9 @@ from torch import Tensor
 
 import scenes
 from ufmstar_torch import ConfidenceConfig, PosteriorConfig, SPGFConfig, UfMStar, UfMStarConfig
-from ufmstar_torch.camera import resize_intrinsics
-from ufmstar_torch.gaussian import barycenter
-from ufmstar_torch.segment_input import SegmentInput
+from ufmstar_torch.gaussians.camera import resize_intrinsics
+from ufmstar_torch.gaussians.gaussian import barycenter
+from ufmstar_torch.steps.segment_input import SegmentInput
 
 INF, NAN = torch.inf, torch.nan
 DEPTH, POSE, CAMERA = frame(0)

@@ -12,7 +12,7 @@ import torch
 import scenes
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
-from ufmstar_torch.online import TrainDecision, image_statistics
+from ufmstar_torch.frames.online import TrainDecision, image_statistics
 
 DEPTHS, POSES, K = scenes.sequence(2, 48, 64, 0.05)
 

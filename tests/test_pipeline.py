@@ -12,8 +12,8 @@ import scenes
 from ufmstar_torch import DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.sequences.frame import Frame
+from ufmstar_torch.frames.networks import NetworksInTurn, combine, weights_mark
 from ufmstar_torch.models import Preprocess
-from ufmstar_torch.networks_in_turn import NetworksInTurn, combine, weights_mark
 
 H, W = 30, 40
 CONFIG = UfMStarConfig(segment=SPGF, unmeasured="paper")

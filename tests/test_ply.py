@@ -16,7 +16,7 @@ from ufmstar_torch.eval.run.gaussians import (
     write_mixture_npz,
     write_mixture_ply,
 )
-from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.gaussians.mixture import GaussianMixture
 
 KINDS = {"float": "<f4", "int": "<i4", "uchar": "u1"}
 

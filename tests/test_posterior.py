@@ -12,7 +12,7 @@ import torch
 from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.anchors.anchors import check_anchors
-from ufmstar_torch.frame import check_frame
+from ufmstar_torch.frames.frame import check_frame
 from ufmstar_torch.kernels.host import moved
 from ufmstar_torch.posterior import field
 from ufmstar_torch.posterior.running import FEATURES, SIZE, Running

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from torch import Tensor
 
-from ufmstar_torch.camera import unproject
+from ufmstar_torch.gaussians.camera import unproject
 from ufmstar_torch.models import Preprocess
 
 NYU = Preprocess.nyu()

@@ -14,9 +14,9 @@ import torch
 
 import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig
-from ufmstar_torch.choose import choose
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.tour import export_tour
+from ufmstar_torch.frames.choose import choose
 from ufmstar_torch.models import NetworkSpec, build_network, save_trained
 
 SPEC = NetworkSpec(widths=0.1, positive="softplus", size=(64, 96), preprocess="resize")

@@ -11,7 +11,7 @@ from pages import blocks
 from scipy.spatial.transform import Rotation
 
 import scenes
-from ufmstar_torch.camera import resize_intrinsics
+from ufmstar_torch.gaussians.camera import resize_intrinsics
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()

@@ -16,7 +16,7 @@ from tiny_suite import write_network, write_rooms
 from ufmstar_torch import Recalibration, UfMStar, UfMStarConfig, cli
 from ufmstar_torch.eval.metrics.ranking import SpearmanCorrelation
 from ufmstar_torch.eval.metrics.recalibration import figures, fit
-from ufmstar_torch.recalibrate import recalibration_path
+from ufmstar_torch.posterior.recalibrate import recalibration_path
 
 MAP = Recalibration((0.01, 0.1, 1.0), (0.2, 0.2, 4.0))
 

@@ -13,15 +13,15 @@ from random_gaussians import as_lists, mixture
 
 import oracle
 import scenes
-import ufmstar_torch.regress as regress_module
-from ufmstar_torch.camera import unproject
+import ufmstar_torch.steps.regress as regress_module
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.kernels import regress_cpu
-from ufmstar_torch.kernels.regress_cpu import fill_and_smooth
-from ufmstar_torch.kernels.vectors_cpu import vectors
-from ufmstar_torch.regress import Regression, distribute, regress, regress_image, shares, smooth
-from ufmstar_torch.sample import sample_pixels
-from ufmstar_torch.unmeasured import after_regression
+from ufmstar_torch.gaussians.camera import unproject
+from ufmstar_torch.kernels.cpu import regress as regress_cpu
+from ufmstar_torch.kernels.cpu.regress import fill_and_smooth
+from ufmstar_torch.kernels.cpu.vectors import vectors
+from ufmstar_torch.steps.regress import Regression, distribute, regress, regress_image, shares, smooth
+from ufmstar_torch.steps.sample import sample_pixels
+from ufmstar_torch.steps.unmeasured import after_regression
 
 pytestmark = pytest.mark.numerics
 

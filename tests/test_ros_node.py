@@ -18,7 +18,7 @@ from ros_stand_in import STORE, Node, received, ros
 
 from ufmstar_torch import DepthPrediction, UncertainDepth
 from ufmstar_torch.eval.sequences.bag import Bag
-from ufmstar_torch.pipeline import UncertainPrediction
+from ufmstar_torch.uncertain_depth import UncertainPrediction
 
 __all__ = ["ros"]
 EXAMPLES = Path(ros_node.__file__).parent

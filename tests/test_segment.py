@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from segment_scenes import REFERENCES, camera, clutter, reference, run_oracle
 
-from ufmstar_torch import segment, segment_fusion
 from ufmstar_torch.config import SPGFConfig
-from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.segment_input import SegmentInput
+from ufmstar_torch.gaussians.mixture import GaussianMixture
+from ufmstar_torch.steps import segment, segment_fusion
+from ufmstar_torch.steps.segment_input import SegmentInput
 
 pytestmark = pytest.mark.numerics
 

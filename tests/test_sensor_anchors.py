@@ -13,7 +13,6 @@ from runs import job_of, outputs, read_summary, records
 from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStarConfig, cli
 from ufmstar_torch.anchors import Landmarks, sensor_landmarks
 from ufmstar_torch.anchors.sensor import completed
-from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.engine.anchors import landmarks_of, sensor_of
 from ufmstar_torch.eval.engine.maps import MapSource
 from ufmstar_torch.eval.run.folder import FolderError
@@ -21,6 +20,7 @@ from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences.frame import in_memory
 from ufmstar_torch.eval.sequences.open import open_sequence
+from ufmstar_torch.gaussians.camera import resize_intrinsics
 
 K = np.array([[200.0, 0, 159.5], [0, 200, 119.5], [0, 0, 1]])
 CELL = np.array([320, 240]) / 28

@@ -10,9 +10,9 @@ import pytest
 from shared_data import require_shared
 
 from scenes import camera_pose
-from ufmstar_torch.conventions import OURS
 from ufmstar_torch.eval.check.check import check_sequence
 from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.gaussians.conventions import OURS
 
 
 def with_poses(sequence, convert):

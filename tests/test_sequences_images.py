@@ -14,10 +14,10 @@ import pytest
 from layouts import truncate, write_depth_png, write_image
 from PIL import Image
 
-from ufmstar_torch import limits
 from ufmstar_torch.eval.sequences import images
 from ufmstar_torch.eval.sequences.frame import FrameError
 from ufmstar_torch.eval.sequences.images import image_size, list_files, read_color, read_depth
+from ufmstar_torch.files import limits
 
 RNG = np.random.default_rng(0)
 

@@ -10,7 +10,7 @@ from layouts_more import rigid
 from scipy.spatial.transform import Rotation, Slerp
 
 from ufmstar_torch.eval.sequences.poses import associate, read_pose, read_trajectory
-from ufmstar_torch.trajectory import Trajectory, interpolate_pose
+from ufmstar_torch.gaussians.trajectory import Trajectory, interpolate_pose
 
 QUARTER = np.sqrt(0.5)
 # 90 degrees about z: x -> y, y -> -x.

@@ -17,7 +17,7 @@ from ufmstar_torch import UfMStarConfig
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.frame import FrameError, parse_size
 from ufmstar_torch.eval.sequences.images import image_size, read_color, read_depth
-from ufmstar_torch.limits import MOST_BYTES, MOST_PIXELS
+from ufmstar_torch.files.limits import MOST_BYTES, MOST_PIXELS
 from ufmstar_torch.models import CheckpointError, NetworkSpec, OnnxNetwork, Preprocess, load_trained
 from ufmstar_torch.models.checkpoints import load_state_dict_file
 

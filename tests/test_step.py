@@ -15,8 +15,8 @@ import oracle
 import scenes
 from ufmstar_torch import AnchorConfig, SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
-from ufmstar_torch.frame import check_values
-from ufmstar_torch.kernels import threads_cpu
+from ufmstar_torch.frames.frame import check_values
+from ufmstar_torch.kernels.cpu import threads as threads_cpu
 
 pytestmark = pytest.mark.numerics
 

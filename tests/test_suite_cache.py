@@ -13,7 +13,7 @@ from tiny_suite import CPU, evaluate, row, same
 
 from ufmstar_torch.eval.engine.predictions import CacheError, PredictionCache, frame_digest, sequence_digest
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.frames.prediction import DepthPrediction
 
 ROWS = [row(name) for name in ("Ensemble", "UfM*-Ensemble", "UfM*-MCD", "MC-Dropout", "Evidential", "UfM-DepthOnly")]
 PATH, CONTENT = Path("network", "sequence", "frame-7@all.npz"), "c" * 64

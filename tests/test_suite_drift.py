@@ -19,7 +19,7 @@ from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import Setting, default_of, setting_from
 from ufmstar_torch.eval.sequences.frame import Frame
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.frames.prediction import DepthPrediction
 
 NAME = "UfM*-DepthOnly"
 BOTH = Setting(rotation_drift=0.5, translation_drift=0.02, seed=3)

@@ -23,8 +23,8 @@ from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.methods.perturb import perturbed
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.sequences.frame import Frame
+from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models import Preprocess
-from ufmstar_torch.prediction import DepthPrediction
 
 PICTURE = np.random.default_rng(3).integers(0, 256, (72, 96, 3), dtype=np.uint8)
 POSE = np.block([[Rotation.from_rotvec([0.3, -1.0, 0.4]).as_matrix(), np.array([[1.0], [2], [3]])], [np.eye(4)[3:]]])

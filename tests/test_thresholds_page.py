@@ -12,7 +12,7 @@ from pages import blocks
 from test_intervals import CONFIG, K, frames
 
 from ufmstar_torch import UfMStar
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.frames.prediction import DepthPrediction
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 
@@ -35,7 +35,7 @@ def frame_of(script, out, truth):
 
 def test_the_planner_of_the_page_brakes_before_a_near_wall(outputs):
     """The wall is 2 m away; its image is as large as the page's map."""
-    from ufmstar_torch import pipeline
+    from ufmstar_torch import uncertain_depth as pipeline
 
     class Model:
         """Returns the last output, with depth and variance of a wall at a given distance."""

@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 from shared_data import require_shared
 
 from ufmstar_torch.anchors.dense import DenseEvidence
+from ufmstar_torch.anchors.kernels.bundle import moved
 from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.anchors.time_offset import TimeOffset
 from ufmstar_torch.eval.sequences.open import open_sequence
-from ufmstar_torch.kernels.bundle_cpu import moved
 
 RECORDINGS = "rgbd_dataset_freiburg1_xyz", "rgbd_dataset_freiburg3_teddy", "hololens_office", "tartanair_sample/P000"
 

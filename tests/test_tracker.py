@@ -14,10 +14,10 @@ from landmark_runs import walk
 from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.anchors.epipolar import off_lines
+from ufmstar_torch.anchors.kernels.triangulate import triangulate
 from ufmstar_torch.anchors.tracker import LandmarkTracker
-from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.sequences.open import open_sequence
-from ufmstar_torch.kernels.triangulate_cpu import triangulate
+from ufmstar_torch.gaussians.camera import resize_intrinsics
 
 HERE = np.array([1000.0, -500.0, 20.0])  # far from the world's origin
 K = np.array([[300.0, 0, 160], [0, 310, 120], [0, 0, 1]])

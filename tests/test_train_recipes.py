@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import nn
 
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.train import PRESETS, DataConfig, FitSettings, Job, Recipe, preset
 from ufmstar_torch.train.member import new_network
 from ufmstar_torch.train.module import move_average, share_of_rate

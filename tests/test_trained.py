@@ -19,6 +19,7 @@ from torch import nn
 
 from ufmstar_torch import UncertainDepth, cli
 from ufmstar_torch.eval.run.writers import read_frame
+from ufmstar_torch.frames.networks import combine
 from ufmstar_torch.models import (
     BatchEnsemble,
     CheckpointError,
@@ -33,7 +34,6 @@ from ufmstar_torch.models import (
 )
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.models.trained import load_for_training
-from ufmstar_torch.networks_in_turn import combine
 
 
 @pytest.fixture(scope="module")

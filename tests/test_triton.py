@@ -17,7 +17,7 @@ from walks import SPGF, walks
 
 import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig
-from ufmstar_torch.correspond import correspond
+from ufmstar_torch.steps.correspond import correspond
 
 DEVICE = "cpu" if INTERPRETED else "cuda"
 SIZE = (22, 30)
@@ -82,9 +82,9 @@ def test_capture_keeps_the_state_in_place(monkeypatch):
     """The bookkeeping of a capture, with a function instead of the graph; and the launches of a step."""
     from triton.runtime.jit import KernelInterface
 
-    from ufmstar_torch.capture import Captured
+    from ufmstar_torch.runtime.capture import Captured
 
-    monkeypatch.setattr("ufmstar_torch.capture._WARM_UP", 1)
+    monkeypatch.setattr("ufmstar_torch.runtime.capture._WARM_UP", 1)
     launched, launch = [], KernelInterface.__getitem__
     monkeypatch.setattr(
         KernelInterface, "__getitem__", lambda kernel, grid: launched.append(kernel.fn.__name__) or launch(kernel, grid)
@@ -132,7 +132,7 @@ def test_what_waits_for_a_slot_is_in_whatever_is_saved_or_copied(monkeypatch):
     new = int(ufm(*first).statistics.new)
     assert new > 2 == ufm.mean.shape[1], "some must wait"
     with monkeypatch.context() as broken:
-        broken.setattr("ufmstar_torch.kernels.step_device.fuse_bits", Mock(side_effect=RuntimeError("out of memory")))
+        broken.setattr("ufmstar_torch.kernels.triton.step.fuse_bits", Mock(side_effect=RuntimeError("out of memory")))
         with pytest.raises(RuntimeError, match="out of memory"):
             ufm(*second)
     twin = copy.deepcopy(ufm)

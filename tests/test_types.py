@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from ufmstar_torch.optional import EXTRAS
+from ufmstar_torch.runtime.optional import EXTRAS
 
 ROOT = Path(__file__).parent.parent
 SCRIPT = """
@@ -54,8 +54,8 @@ def own_network():
     model = UncertainDepth(wrap_network(lambda x: x[:, :1] + 1))
     print(model(torch.ones(1, 3, 48, 64), torch.eye(4), (50.0, 50.0, 32.0, 24.0)).std.median())
 def choosing():
-    from ufmstar_torch.choose import choose
-    from ufmstar_torch.online import TrainDecision
+    from ufmstar_torch.frames.choose import choose
+    from ufmstar_torch.frames.online import TrainDecision
     print("chosen", choose([1.0, 2.0]), TrainDecision(0.1)(torch.ones(3)))
 def metrics():
     from ufmstar_torch.eval.metrics import mean_and_ci
@@ -116,7 +116,7 @@ def test_a_type_checker_knows_what_a_call_returns_and_accepts_the_short_examples
         assert len([line for line in example.read_text().splitlines() if line]) < 64, name
     mypy = [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "own.py", *names]
     output = subprocess.run(mypy, cwd=tmp_path, capture_output=True, text=True, check=False).stdout
-    assert 'own.py:7: note: Revealed type is "ufmstar_torch.pipeline.UncertainPrediction"' in output, output
+    assert 'own.py:7: note: Revealed type is "ufmstar_torch.uncertain_depth.UncertainPrediction"' in output, output
     assert 'own.py:8: note: Revealed type is "torch._tensor.Tensor"' in output, output
     assert "own.py:9: error: Too few arguments" in output, output
     assert 'own.py:10: error: Argument "mode"' in output, output

@@ -24,13 +24,13 @@ import ufmstar_torch
 from ufmstar_torch import DepthPrediction, UfMStar, UncertainDepth
 from ufmstar_torch.kernels import compile_cpu
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, part
-from ufmstar_torch.warm_up import warm_up
+from ufmstar_torch.runtime.warm_up import warm_up
 
 COLD = """
 import json, torch
 from numba.core import event
 from ufmstar_torch import UfMStar
-from ufmstar_torch.warm_up import warm_up
+from ufmstar_torch.runtime.warm_up import warm_up
 steps = []
 with event.install_recorder("numba:compile") as compiled:
     warm_up(UfMStar(), (64, 64), 1, lambda done, total: steps.append((done, total)))
@@ -48,7 +48,7 @@ import json, sys
 from numba.core.dispatcher import Dispatcher
 from ufmstar_torch.anchors.sources import landmark_source
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.warm_up import along_wall
+from ufmstar_torch.runtime.warm_up import along_wall
 used, compiled = [], Dispatcher.compile
 Dispatcher.compile = lambda self, types: used.append(self.py_func.__name__) or compiled(self, types)
 frames, source = list(open_sequence("tour:3?frames=12&size=96x128")), landmark_source(sys.argv[1])

@@ -14,7 +14,7 @@ from torch import nn
 from walks import SPGF
 
 from ufmstar_torch import DepthPrediction, UfMStarConfig, UncertainDepth
-from ufmstar_torch.recalibrate import Recalibration
+from ufmstar_torch.posterior.recalibrate import Recalibration
 
 KINDS = {
     "plain": {"posterior": False},

@@ -26,8 +26,8 @@ from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.suite.job import EvalJob
 from ufmstar_torch.eval.suite.shards import evaluate_suite
 from ufmstar_torch.eval.suite.work_items import find_work
+from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models import NetworkSpec, build_network, save_trained
-from ufmstar_torch.prediction import DepthPrediction
 
 CPU = torch.device("cpu")
 TRUTH = "depth_only=ground-truth:24x32"

@@ -22,11 +22,11 @@ from triton.runtime.jit import KernelInterface
 
 import scenes
 from ufmstar_torch import UfMStarConfig
-from ufmstar_torch.correspond import Correspondence
-from ufmstar_torch.frame import check_frame
+from ufmstar_torch.frames.frame import check_frame
+from ufmstar_torch.gaussians.state import UfMStarState
 from ufmstar_torch.kernels.select import select_kernels
-from ufmstar_torch.segment_input import SegmentInput
-from ufmstar_torch.state import UfMStarState
+from ufmstar_torch.steps.correspond import Correspondence
+from ufmstar_torch.steps.segment_input import SegmentInput
 
 TARGET = GPUTarget("cuda", 90, 32)
 TYPES = {
@@ -66,8 +66,8 @@ K = torch.tensor(scenes.intrinsics(*SIZE)).expand(2, 3, 3)
 
 def cases() -> dict[str, Callable[[], object]]:
     """Calls that launch every kernel once, on small inputs."""
-    from ufmstar_torch.kernels import step_device
     from ufmstar_torch.kernels.triton import append, check, correspond, fuse, regress, segment
+    from ufmstar_torch.kernels.triton import step as step_device
 
     m = mixture(2, 40, 3, features=1)
     current = mixture(2, 20, 4, features=1)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.checked import Checked, choice, number
+from ufmstar_torch.runtime.checked import Checked, choice, number
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from torch.utils.data import DataLoader
 from ufmstar_torch.eval.check.check import check_sequence
 from ufmstar_torch.eval.sequences.nyu import PARTS
 from ufmstar_torch.eval.sequences.open import open_sequence
+from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.stream_warnings import LOGGER
 from ufmstar_torch.train.augment import Augmentation
 from ufmstar_torch.train.batches import EpochBatches
 from ufmstar_torch.train.data_config import DataConfig, Part

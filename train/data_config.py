@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 
-from ufmstar_torch.checked import Checked, choice, number
 from ufmstar_torch.eval.tour.style import style_of
+from ufmstar_torch.runtime.checked import Checked, choice, number
 from ufmstar_torch.train.augment import AugmentationConfig
 
 KINDS = ("nyu", "sequences", "tour")

@@ -16,10 +16,10 @@ from torch.nn.utils import get_total_norm
 from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
+from ufmstar_torch.frames.prediction import stated_range
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble
 from ufmstar_torch.models.distribution import DepthDistribution, GaussianDepth
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.prediction import stated_range
 from ufmstar_torch.train.distil import Teacher, distillation_sums
 from ufmstar_torch.train.losses import loss_sums
 from ufmstar_torch.train.presets import Recipe

@@ -14,8 +14,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from ufmstar_torch.checked import Checked, choice, number
 from ufmstar_torch.models.spec import NetworkSpec
+from ufmstar_torch.runtime.checked import Checked, choice, number
 
 # Batch and learning rate of monodepth2 are DecTrain's; FastDepth was trained with eight images per step.
 TRAINING: dict[str, dict[str, Any]] = {

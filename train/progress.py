@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.metrics import NLL, RMSE, AbsRel, Delta1
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.train.losses import gaussian_nll
 
 FIGURES = ("val_nll", "val_nll_constant", "val_nll_constant_best", "val_delta1", "val_rmse", "val_rel")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from torch import nn
 
-from ufmstar_torch.checked import Checked, number
+from ufmstar_torch.runtime.checked import Checked, number
 from ufmstar_torch.train.data_config import DataConfig
 from ufmstar_torch.train.presets import MOST_MEMBERS, Recipe
 

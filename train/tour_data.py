@@ -25,10 +25,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ufmstar_torch.array_files import read_npy
-from ufmstar_torch.atomic import write_atomic
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, make_sequence
 from ufmstar_torch.eval.tour.style import style_of
+from ufmstar_torch.files.arrays import read_npy
+from ufmstar_torch.files.atomic import write_atomic
 from ufmstar_torch.train.data_config import DataConfig
 from ufmstar_torch.train.sequence_data import SequenceFrames
 

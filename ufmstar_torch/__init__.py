@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from ufmstar_torch.lazy import lazy_names
+from ufmstar_torch.runtime.lazy import lazy_names
 
 if TYPE_CHECKING:
     from ufmstar_torch.config import AnchorConfig as AnchorConfig
@@ -11,14 +11,14 @@ if TYPE_CHECKING:
     from ufmstar_torch.config import PosteriorConfig as PosteriorConfig
     from ufmstar_torch.config import SPGFConfig as SPGFConfig
     from ufmstar_torch.config import UfMStarConfig as UfMStarConfig
+    from ufmstar_torch.frames.output import UfMStarOutput as UfMStarOutput
+    from ufmstar_torch.frames.prediction import DepthPrediction as DepthPrediction
+    from ufmstar_torch.gaussians.mixture import GaussianMixture as GaussianMixture
     from ufmstar_torch.live import LiveDepth as LiveDepth
     from ufmstar_torch.live import LiveResult as LiveResult
-    from ufmstar_torch.mixture import GaussianMixture as GaussianMixture
-    from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
-    from ufmstar_torch.pipeline import UncertainDepth as UncertainDepth
-    from ufmstar_torch.prediction import DepthPrediction as DepthPrediction
-    from ufmstar_torch.recalibrate import Recalibration as Recalibration
+    from ufmstar_torch.posterior.recalibrate import Recalibration as Recalibration
     from ufmstar_torch.ufmstar import UfMStar as UfMStar
+    from ufmstar_torch.uncertain_depth import UncertainDepth as UncertainDepth
 else:
     # The core takes networks that return a DepthPrediction; the networks' layer adds every other kind.
     __getattr__, __dir__ = lazy_names(__name__, UncertainDepth="ufmstar_torch.models.uncertain_depth")

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
-from ufmstar_torch.optional import naming_extra
+from ufmstar_torch.runtime.optional import naming_extra
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 # By name: module and purpose.

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
-from ufmstar_torch.checked import Checked, choice, number, section
-from ufmstar_torch.limits import require_bytes
+from ufmstar_torch.files.limits import require_bytes
 from ufmstar_torch.posterior.config import PosteriorConfig as PosteriorConfig
+from ufmstar_torch.runtime.checked import Checked, choice, number, section
 
 _SLOT = 84  # [bytes] of a component's state without features
 
@@ -170,7 +170,7 @@ class AnchorConfig(Checked):
 
 @dataclass(frozen=True)
 class ConfidenceConfig(Checked):
-    """A network's confidence as a factor of the variance (``ufmstar_torch.confidence``).
+    """A network's confidence as a factor of the variance (``ufmstar_torch.anchors.confidence``).
 
     Attributes:
         anchors: the last ones of a stream from which the factor is learnt
@@ -193,7 +193,7 @@ class ConfidenceConfig(Checked):
 
 @dataclass(frozen=True)
 class MergeConfig(Checked):
-    """Merging of components that overlap (``ufmstar_torch.merge``).
+    """Merging of components that overlap (``ufmstar_torch.steps.merge``).
 
     Attributes:
         loss: loss per pixel up to which two Gaussians are joined

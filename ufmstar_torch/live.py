@@ -19,7 +19,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.arguments import (
+from ufmstar_torch.files.atomic import remove_temporaries, write_atomic
+from ufmstar_torch.files.lock import hold
+from ufmstar_torch.files.tensors import read_tensors
+from ufmstar_torch.frames.arguments import (
     CameraLike,
     ImageLike,
     as_image,
@@ -28,15 +31,12 @@ from ufmstar_torch.arguments import (
     as_pose,
     require_number,
 )
-from ufmstar_torch.atomic import remove_temporaries, write_atomic
-from ufmstar_torch.camera import rotation_deviation
-from ufmstar_torch.file_lock import hold
-from ufmstar_torch.frame import FRAME_FAULTS, pose_fault
-from ufmstar_torch.pipeline import UncertainDepth, UncertainPrediction
-from ufmstar_torch.stream_clock import JUMP, StreamClock, Verdict
-from ufmstar_torch.stream_warnings import LOGGER
-from ufmstar_torch.tensor_files import read_tensors
-from ufmstar_torch.trajectory import SAME_TIME, Trajectory, interpolate_pose
+from ufmstar_torch.frames.clock import JUMP, StreamClock, Verdict
+from ufmstar_torch.frames.frame import FRAME_FAULTS, pose_fault
+from ufmstar_torch.frames.warnings import LOGGER
+from ufmstar_torch.gaussians.camera import rotation_deviation
+from ufmstar_torch.gaussians.trajectory import SAME_TIME, Trajectory, interpolate_pose
+from ufmstar_torch.uncertain_depth import UncertainDepth, UncertainPrediction
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock

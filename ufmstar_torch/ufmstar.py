@@ -10,27 +10,27 @@ from typing import TYPE_CHECKING, Any, cast
 import torch
 from torch import Tensor
 
-from ufmstar_torch import unmeasured
-from ufmstar_torch.arguments import Array, CameraLike, as_device, as_tensor, require_flag
-from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.extension import Extension
-from ufmstar_torch.extensions import extensions_of
-from ufmstar_torch.fixed_order import apply
-from ufmstar_torch.frame import CheckKernel, FrameInput, check_frame, raise_faults
+from ufmstar_torch.frames.arguments import Array, CameraLike, as_device, as_tensor, require_flag
+from ufmstar_torch.frames.extension import Extension
+from ufmstar_torch.frames.extensions import extensions_of
+from ufmstar_torch.frames.frame import CheckKernel, FrameInput, check_frame, raise_faults
+from ufmstar_torch.frames.network_variance import NetworkVariance
+from ufmstar_torch.frames.output import MeanUncertainty, StepOutput, UfMStarOutput
+from ufmstar_torch.frames.warnings import StreamWarnings
+from ufmstar_torch.gaussians.camera import invert_rigid
+from ufmstar_torch.gaussians.fixed_order import apply
+from ufmstar_torch.gaussians.mixture import GaussianMixture
+from ufmstar_torch.gaussians.state import NAMES, UfMStarState
 from ufmstar_torch.kernels.select import LateStep, select_check, select_step
-from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.network_variance import NetworkVariance
-from ufmstar_torch.one_caller import one_caller
-from ufmstar_torch.output import MeanUncertainty, StepOutput, UfMStarOutput
-from ufmstar_torch.regress import Regression, regress
-from ufmstar_torch.sample import mean_uncertainty, sample_pixels, sample_size
-from ufmstar_torch.state import NAMES, UfMStarState
-from ufmstar_torch.stateful import StatefulModule, full_precision, outliving
-from ufmstar_torch.step import Step
-from ufmstar_torch.step_parts import StepObserver
-from ufmstar_torch.stream_warnings import StreamWarnings
-from ufmstar_torch.warm_up import warm_up
+from ufmstar_torch.runtime.one_caller import one_caller
+from ufmstar_torch.runtime.stateful import StatefulModule, full_precision, outliving
+from ufmstar_torch.runtime.warm_up import warm_up
+from ufmstar_torch.steps import unmeasured
+from ufmstar_torch.steps.regress import Regression, regress
+from ufmstar_torch.steps.sample import mean_uncertainty, sample_pixels, sample_size
+from ufmstar_torch.steps.step import Step
+from ufmstar_torch.steps.step_parts import StepObserver
 
 
 @one_caller("forward", "mean_uncertainty", "query", "reset", "state", "__getstate__")
@@ -47,7 +47,7 @@ class UfMStar(StatefulModule):
         config: None = ``UfMStarConfig()``, which differs from the paper's settings as listed in
             :meth:`UfMStarConfig.paper`.
         extensions: extensions in addition to those of the config's sections, for example a
-            :class:`~ufmstar_torch.recalibrate.Recalibration` of V.
+            :class:`~ufmstar_torch.posterior.recalibrate.Recalibration` of V.
         dtype: of the state, torch.float32 or torch.float64.
         device: of the state until ``.to()``; None = that of the first frame.
 
@@ -233,7 +233,7 @@ class UfMStar(StatefulModule):
 
     @property
     def state(self) -> UfMStarState:
-        """The state, as an argument of ``ufmstar_torch.step``."""
+        """The state, as an argument of ``ufmstar_torch.steps.step``."""
         self._settle()
         return self._stored()
 

@@ -23,10 +23,10 @@ from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.run.machine import require_device
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError
+from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models import FastDepth, FastDepthWidths, MonodepthResNet, Preprocess
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.prediction import DepthPrediction
 
 TOUR = "tour:1"
 ARCHITECTURES = ("fastdepth", "monodepth2")  # can be timed with random weights

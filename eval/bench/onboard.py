@@ -32,7 +32,7 @@ from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.quantise import quantise
 from ufmstar_torch.models.trained import load_trained
-from ufmstar_torch.pipeline import UncertainDepth
+from ufmstar_torch.uncertain_depth import UncertainDepth
 
 FPS = 30.0
 GRAPH, PICTURE = "onboard_int8.onnx", "onboard.png"

@@ -26,8 +26,8 @@ from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
-from ufmstar_torch.image_check import reduced, shows_something
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.frames.image_check import reduced, shows_something
+from ufmstar_torch.frames.prediction import DepthPrediction
 
 MULTIVIEW = "multiview"
 # ``Setting.anchors`` that are measured: the name of their source of landmarks.

@@ -10,13 +10,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ufmstar_torch.capture import Captured
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.bench.measure import Plan
 from ufmstar_torch.eval.bench.networks import DEPTH, TimedNetwork
 from ufmstar_torch.eval.bench.timing import pinned_threads, spread
 from ufmstar_torch.eval.engine.clock import synchronize
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
+from ufmstar_torch.runtime.capture import Captured
 from ufmstar_torch.ufmstar import UfMStar
 
 _SLOTS = 1024  # a CUDA graph needs a fixed capacity
@@ -36,8 +36,8 @@ def time_streams(
         plan: as for ``measure.measure``, with threads.
 
     Returns:
-        For every count "streams", "step" and, on CUDA, "graph" (:class:`~ufmstar_torch.capture.Captured`): times [ms]
-        of one frame of all streams.
+        For every count "streams", "step" and, on CUDA, "graph" (:class:`~ufmstar_torch.runtime.capture.Captured`):
+        times [ms] of one frame of all streams.
     """
     config = UfMStarConfig(on_bad_frame="skip", initial_capacity=_SLOTS, max_components=_SLOTS)
     lines = []

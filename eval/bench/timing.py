@@ -20,7 +20,7 @@ from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.engine.clock import synchronize
 from ufmstar_torch.eval.run.machine import available_cores
 
-# The stages of a step, without gaps between them; see ``ufmstar_torch.step_parts.StepObserver``.
+# The stages of a step, without gaps between them; see ``ufmstar_torch.steps.step_parts.StepObserver``.
 STAGES = ("check", "segment", "correspond", "fuse", "append", "regress", "average")
 _CPU = torch.device("cpu")
 
@@ -68,8 +68,8 @@ def paired_ratio(numerator: Sequence[float], denominator: Sequence[float]) -> di
 
 
 class StagedStep:
-    """Times the stages of UfM*'s steps, as the observer (``ufmstar_torch.step_parts.StepObserver``) of a module on a
-    device. ``step`` runs the module once. The assembly of the output, after the last stage, is not timed."""
+    """Times the stages of UfM*'s steps, as the observer (``ufmstar_torch.steps.step_parts.StepObserver``) of a module
+    on a device. ``step`` runs the module once. The assembly of the output, after the last stage, is not timed."""
 
     def __init__(self, module: UfMStar, step: Callable[..., Any], device: torch.device = _CPU) -> None:
         self.module, self._step, self._device = module, step, device

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from ufmstar_torch.anchors.pose_fit import UNCHANGED
-from ufmstar_torch.conventions import OURS
 from ufmstar_torch.eval.check.check import SequenceCheck, check_sequence
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.intrinsics import pinhole_values
 from ufmstar_torch.eval.sequences.open import open_sequence
+from ufmstar_torch.gaussians.conventions import OURS
 
 # Largest number of frames that are decoded (evenly spaced, to take seconds), and of rendered ones.
 _DECODED, _RENDERED = 500, 12

@@ -16,11 +16,11 @@ from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.setting import DEFAULTS, PAPER, started
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_size
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
+from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.models.any_network import PROGRAMS
 from ufmstar_torch.models.inference import Inference
-from ufmstar_torch.recalibrate import Recalibration, recalibration_path
-from ufmstar_torch.stateful import flat
-from ufmstar_torch.stream_warnings import LOGGER
+from ufmstar_torch.posterior.recalibrate import Recalibration, recalibration_path
+from ufmstar_torch.runtime.stateful import flat
 
 PRESETS = ("tum", "tartanair_indoor", "tartanair_outdoor")
 OWN_DEPTH = ("self", "ground-truth")

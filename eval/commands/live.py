@@ -36,9 +36,9 @@ from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
 from ufmstar_torch.eval.sequences.live import LiveEvent
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.live import LiveDepth, LiveResult, LiveStatistics
-from ufmstar_torch.pipeline import UncertainDepth
-from ufmstar_torch.stream_warnings import LOGGER
+from ufmstar_torch.uncertain_depth import UncertainDepth
 
 _STANDARD_INPUT, _SUMMARY = "-", "realtime.json"
 _ARRAYS = ("depth", "variance", "disagreement", "T_world_cam", "intrinsics")  # of an image's file

@@ -22,7 +22,7 @@ from ufmstar_torch.eval.run.pictures import SHEET
 from ufmstar_torch.eval.run.rank import ImageScores, require_part
 from ufmstar_torch.eval.run.run import warm_up_job
 from ufmstar_torch.eval.run.run_folder import Checkpoint
-from ufmstar_torch.stream_warnings import LOGGER
+from ufmstar_torch.frames.warnings import LOGGER
 
 SCORES, SETTINGS = "scores.csv", "rank.json"
 _SHOWN = 10  # lines of the printed table

@@ -15,7 +15,7 @@ from ufmstar_torch.eval.engine.judge import CONFIDENCE, METRICS
 from ufmstar_torch.eval.methods.method import UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report.data import Results, load_results
-from ufmstar_torch.recalibrate import Recalibration
+from ufmstar_torch.posterior.recalibrate import Recalibration
 
 
 @dataclass(frozen=True, kw_only=True)

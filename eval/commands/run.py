@@ -26,7 +26,7 @@ from ufmstar_torch.eval.run.summary import FINISHED, INTERRUPTED
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_slice
 from ufmstar_torch.eval.sequences.open import open_sequence, scale_poses
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.stream_warnings import LOGGER
+from ufmstar_torch.frames.warnings import LOGGER
 
 
 @dataclass(frozen=True, kw_only=True)

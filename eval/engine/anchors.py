@@ -27,7 +27,7 @@ from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import depth_camera, resample_nearest
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.eval.sequences.options import resolve
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.frames.prediction import DepthPrediction
 
 # Number of anchors of ground truth in a frame, about that of a tracker, and their standard deviation as a share of the
 # depth, a range sensor's. Their depths are exact.

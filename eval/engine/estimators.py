@@ -18,11 +18,11 @@ from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import configured
 from ufmstar_torch.eval.methods.ufm import UfM
-from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.pipeline import maps_of
-from ufmstar_torch.prediction import DepthPrediction
-from ufmstar_torch.recalibrate import Recalibration
+from ufmstar_torch.frames.prediction import DepthPrediction
+from ufmstar_torch.gaussians.mixture import GaussianMixture
+from ufmstar_torch.posterior.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar
+from ufmstar_torch.uncertain_depth import maps_of
 
 # Maps [1, h, w] on the estimator's device, by their names in ``RowResult``; UfM* adds "statistics".
 Answer = dict[str, Any]

@@ -27,7 +27,7 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import CORNERS
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.plugins import Plugins
-from ufmstar_torch.frame import FRAME_FAULTS, check_frame
+from ufmstar_torch.frames.frame import FRAME_FAULTS, check_frame
 
 _TOLERANCE = UfMStarConfig().rotation_tolerance
 

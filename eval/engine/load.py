@@ -17,6 +17,7 @@ from ufmstar_torch.eval.engine.networks import NetworkSource, stochastic
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.method import BASES
 from ufmstar_torch.eval.sequences.frame import Size, parse_size
+from ufmstar_torch.frames.networks import NetworksInTurn
 from ufmstar_torch.models.any_network import PROGRAMS
 from ufmstar_torch.models.dropout import SAMPLES
 from ufmstar_torch.models.inference import Inference, runtime_of
@@ -24,7 +25,6 @@ from ufmstar_torch.models.load import DIRECTORIES, load_network, network_names
 from ufmstar_torch.models.monodepth2 import MonodepthResNet
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import load_trained, read_info
-from ufmstar_torch.networks_in_turn import NetworksInTurn
 
 _FORM = "BASE=MODEL:FILE[,FILE...]"
 _AS_USERS = Inference()

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.setting import CROP
 from ufmstar_torch.eval.sequences.depth_folder import DepthFolder, DepthMaps
@@ -19,7 +18,8 @@ from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence,
 from ufmstar_torch.eval.sequences.ground_truth import depth_camera, resample_nearest
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics, scale_intrinsics
 from ufmstar_torch.eval.sequences.own_output import own_output
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.frames.prediction import DepthPrediction
+from ufmstar_torch.gaussians.camera import resize_intrinsics
 
 TRUTH = "ground-truth"
 # Depth [H, W] float32 [m] (0 = no prediction), variance [H, W] float32 [m^2] or None, intrinsics [3, 3] float64 [px].

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import torch
 
 from ufmstar_torch.eval.engine.networks import stochastic
+from ufmstar_torch.frames.prediction import DepthPrediction, infer
 from ufmstar_torch.models.batch_ensemble import BatchEnsembleMember
 from ufmstar_torch.models.dropout import DecoderDropout, MonteCarloDropout, set_sampling
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.prediction import DepthPrediction, infer
 
 _PROBE = (480, 640)  # (h, w) [px] of the grey test image
 _NEEDED = {

@@ -17,13 +17,13 @@ from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.setting import CROP, OF_NETWORK, RESIZE
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
+from ufmstar_torch.frames.networks import NetworksInTurn
+from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models.dropout import MonteCarloDropout, set_sampling
 from ufmstar_torch.models.ensemble import LazyMember
 from ufmstar_torch.models.inference import BF16, runtime_of
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.networks_in_turn import NetworksInTurn
-from ufmstar_torch.prediction import DepthPrediction
 
 # Sample n of frame i has the seed i + 1,000,003 n. Seeds are unique in sequences with fewer frames than that, and stay
 # below 2^32, the limit of torch's generator on the CPU.

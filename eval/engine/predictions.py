@@ -16,14 +16,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.array_files import read_npz_whole
-from ufmstar_torch.atomic import write_atomic
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.eval.sequences.images import image_tensor
-from ufmstar_torch.image_check import reduced, shows_something
+from ufmstar_torch.files.arrays import read_npz_whole
+from ufmstar_torch.files.atomic import write_atomic
+from ufmstar_torch.frames.image_check import reduced, shows_something
+from ufmstar_torch.frames.networks import SAMPLES, combine
+from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.networks_in_turn import SAMPLES, combine
-from ufmstar_torch.prediction import DepthPrediction
 
 _SHOWN = 16  # hex digits of a digest in the name of a folder: 64 bits
 # Names of the arrays in a file, and of the tensors of a ``DepthPrediction``.

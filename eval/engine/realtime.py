@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ufmstar_torch.live import LiveResult, LiveStatistics
-from ufmstar_torch.pipeline import UncertainDepth
+from ufmstar_torch.uncertain_depth import UncertainDepth
 
 _SETTLED = 60  # results before the memory is first read, when all buffers and threads exist
 _STATM = Path("/proc/self/statm")

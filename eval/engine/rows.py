@@ -20,10 +20,10 @@ from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError
 from ufmstar_torch.eval.sequences.ground_truth import moving_at
-from ufmstar_torch.frame import FRAME_FAULTS
-from ufmstar_torch.output import FrameStatistics
+from ufmstar_torch.frames.frame import FRAME_FAULTS
+from ufmstar_torch.frames.output import FrameStatistics
+from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.posterior.distribution import DepthDistribution
-from ufmstar_torch.prediction import DepthPrediction
 
 # Prefixes of the tensors of a row's state.
 _IMAGES, _ESTIMATOR, _TRACKER, _DRIFT = "image_index", "ufm.", "tracker.", "drift."

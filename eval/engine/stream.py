@@ -23,7 +23,7 @@ from ufmstar_torch.eval.engine.rows import RowResult, RowRunner
 from ufmstar_torch.eval.methods.perturb import selects
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.frames.prediction import DepthPrediction
 
 
 class Stopped(Exception):

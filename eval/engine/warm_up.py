@@ -1,4 +1,4 @@
-"""Compiles the kernels that a command needs before its first frame (``ufmstar_torch.warm_up``)."""
+"""Compiles the kernels that a command needs before its first frame (``ufmstar_torch.runtime.warm_up``)."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from ufmstar_torch.anchors.sources import CORNERS, DENSE
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.progress import Progress
+from ufmstar_torch.runtime.warm_up import along_wall, warm_up
 from ufmstar_torch.ufmstar import UfMStar
-from ufmstar_torch.warm_up import along_wall, warm_up
 
 _SEARCHING = {CORNERS: LandmarkTracker, DENSE: DenseEvidence}
 

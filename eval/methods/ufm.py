@@ -16,11 +16,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ufmstar_torch.camera import relative_pose
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.methods.ufm_cloud import Cloud, View, take_in
-from ufmstar_torch.frame import check_frame, raise_faults
-from ufmstar_torch.stateful import full_precision, outliving
+from ufmstar_torch.frames.frame import check_frame, raise_faults
+from ufmstar_torch.gaussians.camera import relative_pose
+from ufmstar_torch.runtime.stateful import full_precision, outliving
 
 
 class UfMOutput(NamedTuple):

@@ -16,7 +16,7 @@ from scipy.special import ndtri
 
 from ufmstar_torch.eval.metrics.base import Array
 from ufmstar_torch.eval.metrics.ranking import HIGH, LOW
-from ufmstar_torch.recalibrate import CONFIDENCE, Recalibration
+from ufmstar_torch.posterior.recalibrate import CONFIDENCE, Recalibration
 
 # Levels at which the quantiles of |z| are compared with a standard normal variable's. The outer tenth is excluded:
 # gross errors of the depth would dominate the variance of all other pixels.

@@ -25,8 +25,8 @@ from ufmstar_torch.eval.sequences.attach import attach
 from ufmstar_torch.eval.sequences.colmap import SCALE_FILE
 from ufmstar_torch.eval.sequences.frame import Entry
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.optional import optional
-from ufmstar_torch.trajectory import Trajectory
+from ufmstar_torch.gaussians.trajectory import Trajectory
+from ufmstar_torch.runtime.optional import optional
 
 # Largest number of keyframes for which all pairs are matched; with more, each is matched with the next ten and those
 # 16, 32, ... 512 later.

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch import unmeasured
-from ufmstar_torch.array_files import read_npz_whole
 from ufmstar_torch.eval.run.colours import known_where, striped
+from ufmstar_torch.files.arrays import read_npz_whole
+from ufmstar_torch.steps import unmeasured
 
 Map = NDArray[np.float32]
 _SCENE = ("image", "truth", "K")

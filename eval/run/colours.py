@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.eval.run.files import write_atomic
-from ufmstar_torch.optional import optional
+from ufmstar_torch.runtime.optional import optional
 
 # Depth and uncertainty have different maps, so that their pictures cannot be confused.
 DEPTH_MAP = "viridis"

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.conventions import CONVENTIONS
 from ufmstar_torch.eval.run.colours import known_where
 from ufmstar_torch.eval.run.files import remove_temporaries, write_bytes_atomic, write_json_atomic
 from ufmstar_torch.eval.run.gaussians import vertex_table, write_ply
@@ -26,6 +25,7 @@ from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
 from ufmstar_torch.eval.sequences.intrinsics import pinhole_values
 from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
+from ufmstar_torch.gaussians.conventions import CONVENTIONS
 
 _LEAST_SIGMA = 1e-3  # [m] lower limit of sigma in a point's weight
 _HALF = 2**20  # a voxel's number on an axis is within +- this, so that three fit into 64 bits

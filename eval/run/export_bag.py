@@ -16,7 +16,7 @@ import numpy as np
 
 from ufmstar_torch.eval.run.export import RunFrame, export_folder
 from ufmstar_torch.eval.sequences.message_builder import MessageBuilder
-from ufmstar_torch.optional import optional
+from ufmstar_torch.runtime.optional import optional
 
 WORLD, CAMERA = "world", "camera"
 IMAGE, INFO, DEPTH, SIGMA = "/camera/image", "/camera/camera_info", "/camera/depth", "/camera/sigma"

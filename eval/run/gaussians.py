@@ -21,7 +21,7 @@ from torch import Tensor
 from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range
 from ufmstar_torch.eval.run.files import write_atomic, write_bytes_atomic
 from ufmstar_torch.eval.run.offset import offset_text, world_offset
-from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.gaussians.mixture import GaussianMixture
 
 # Lower limit of the standard deviation of an axis [m], because files store its logarithm and viewers divide by it.
 SIGMA_FLOOR = 1e-6

@@ -26,7 +26,7 @@ from ufmstar_torch.eval.methods.setting import CORNERS, Setting
 from ufmstar_torch.eval.run.scale import NetworkScale
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.plugins import load_plugins
-from ufmstar_torch.recalibrate import Recalibration
+from ufmstar_torch.posterior.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar
 
 

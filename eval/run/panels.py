@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch import unmeasured
 from ufmstar_torch.eval.run import colours
 from ufmstar_torch.eval.run.colours import FAINT, INK, ColourScale
+from ufmstar_torch.steps import unmeasured
 
 # Inches.
 _GAP, _MARGIN, _CAPTION, _BAR, _BARS, _TITLE = 0.06, 0.08, 0.2, 0.1, 0.62, 0.34

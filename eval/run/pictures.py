@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.engine.rows import RowResult
 from ufmstar_torch.eval.run.colours import INVALID_GREY, known_where
 from ufmstar_torch.eval.run.panels import FramePanel, MapColumn, contact_sheet, map_columns
@@ -26,6 +25,7 @@ from ufmstar_torch.eval.run.writers import frame_file, read_frame
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
 from ufmstar_torch.eval.sequences.intrinsics import pinhole
+from ufmstar_torch.gaussians.camera import resize_intrinsics
 
 SHEET = "contact_sheet.png"
 SHEET_ROWS, POSTERIOR_ROWS, SCALE_FRAMES = 6, 3, 12

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ufmstar_torch.choose import choose
 from ufmstar_torch.eval.engine.judge import UFM
 from ufmstar_torch.eval.engine.predictions import FramePredictions
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink
@@ -20,7 +19,8 @@ from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.panels import FramePanel
 from ufmstar_torch.eval.run.pictures import panel_of
 from ufmstar_torch.eval.sequences.frame import FrameError
-from ufmstar_torch.sample import sample_statistics
+from ufmstar_torch.frames.choose import choose
+from ufmstar_torch.steps.sample import sample_statistics
 
 # The quantities for ranking, V, M, A, E and B, and their maps in ``RowResult``.
 PARTS = {
@@ -86,7 +86,7 @@ class ImageScores(FrameSink):
                 del self._shown[_PICTURES]
 
     def chosen(self, count: int | None, *, diverse: bool) -> list[int]:
-        """Indices of the images to label, in the order of labelling (``ufmstar_torch.choose``)."""
+        """Indices of the images to label, in the order of labelling (``ufmstar_torch.frames.choose``)."""
         score = torch.tensor([image.score for image in self.images], dtype=torch.float64)
         count = None if count is None else min(count, len(score))
         if not diverse or bool(score.isnan().all()):

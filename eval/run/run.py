@@ -19,7 +19,7 @@ from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.pictures import FinishedRun, common_columns, draw_sheet, draw_video
 from ufmstar_torch.eval.run.run_folder import RUN, RunFolder
 from ufmstar_torch.eval.run.summary import FAILED, FINISHED, INTERRUPTED, write_summary
-from ufmstar_torch.stream_warnings import LOGGER
+from ufmstar_torch.frames.warnings import LOGGER
 
 Show = Callable[[Progress], None]
 Stop = Callable[[], bool]

@@ -37,7 +37,7 @@ from ufmstar_torch.eval.run.writers import (
     write_pngs,
 )
 from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
-from ufmstar_torch.tensor_files import read_tensors
+from ufmstar_torch.files.tensors import read_tensors
 
 # Outputs that are made from the finished frames.
 _MADE_AT_END = ("preview.mp4", "contact_sheet.png", "mixture.ply", "mixture.npz")

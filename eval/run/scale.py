@@ -9,7 +9,7 @@ import numpy as np
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.sequences.colmap import read_landmarks
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.frames.prediction import DepthPrediction
 
 _MOST_FRAMES, _FEWEST_FRAMES = 24, 3
 _FEWEST_LANDMARKS = 10  # smallest number of landmarks of a frame that is used

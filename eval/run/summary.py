@@ -20,8 +20,8 @@ from ufmstar_torch.eval.run.run_folder import RUN, RunFolder
 from ufmstar_torch.eval.run.writers import frame_file, read_frame
 from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.eval.sequences.intrinsics import pinhole
-from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.stream_warnings import hardly_compared
+from ufmstar_torch.frames.warnings import hardly_compared
+from ufmstar_torch.gaussians.mixture import GaussianMixture
 
 FINISHED, INTERRUPTED, FAILED = "finished", "interrupted", "failed"
 Records = Sequence[Mapping[str, Any]]

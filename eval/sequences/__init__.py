@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ufmstar_torch.lazy import lazy_names
+from ufmstar_torch.runtime.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from ufmstar_torch.conventions import CONVENTIONS as CONVENTIONS
     from ufmstar_torch.eval.sequences.depth_folder import DepthFolder as DepthFolder
     from ufmstar_torch.eval.sequences.frame import Frame as Frame
     from ufmstar_torch.eval.sequences.frame import FrameError as FrameError
@@ -17,7 +16,8 @@ if TYPE_CHECKING:
     from ufmstar_torch.eval.sequences.layout import find_sequences as find_sequences
     from ufmstar_torch.eval.sequences.open import open_sequence as open_sequence
     from ufmstar_torch.eval.sequences.poses import read_trajectory as read_trajectory
-    from ufmstar_torch.trajectory import Trajectory as Trajectory
-    from ufmstar_torch.trajectory import interpolate_pose as interpolate_pose
+    from ufmstar_torch.gaussians.conventions import CONVENTIONS as CONVENTIONS
+    from ufmstar_torch.gaussians.trajectory import Trajectory as Trajectory
+    from ufmstar_torch.gaussians.trajectory import interpolate_pose as interpolate_pose
 else:
     __getattr__, __dir__ = lazy_names(__name__)

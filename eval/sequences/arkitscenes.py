@@ -21,7 +21,7 @@ from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, depth_loader, li
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import associate, read_matrix, trajectory_of
-from ufmstar_torch.trajectory import Trajectory
+from ufmstar_torch.gaussians.trajectory import Trajectory
 
 _IMAGES, _CAMERAS, _DEPTHS, _POSES = "lowres_wide", "lowres_wide_intrinsics", "lowres_depth", "lowres_wide.traj"
 LOOKED_FOR = f"{_IMAGES}/, {_CAMERAS}/ and {_POSES}, also in VIDEO_frames/"

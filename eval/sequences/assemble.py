@@ -15,7 +15,7 @@ from ufmstar_torch.eval.sequences.intrinsics import pinhole, read_intrinsics, sc
 from ufmstar_torch.eval.sequences.lens import Lens, parse_distortion
 from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.poses import read_trajectory
-from ufmstar_torch.trajectory import Trajectory
+from ufmstar_torch.gaussians.trajectory import Trajectory
 
 
 def assemble(

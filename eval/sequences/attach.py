@@ -19,7 +19,7 @@ from ufmstar_torch.eval.sequences.frame import Entry, Loader, Skipped
 from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, list_files, read_color
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import read_pose
-from ufmstar_torch.trajectory import Trajectory, interpolate_pose
+from ufmstar_torch.gaussians.trajectory import Trajectory, interpolate_pose
 
 # Integer timestamps as file names: EuRoC and ROS write nanoseconds, some cameras microseconds [units/s].
 _NANOSECONDS_ABOVE, _MICROSECONDS_ABOVE = 1e17, 1e14

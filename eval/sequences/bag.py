@@ -27,9 +27,9 @@ from ufmstar_torch.eval.sequences.images import is_sidecar, natural_key
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import associate
-from ufmstar_torch.optional import optional
-from ufmstar_torch.stream_warnings import LOGGER
-from ufmstar_torch.trajectory import interpolate_pose
+from ufmstar_torch.frames.warnings import LOGGER
+from ufmstar_torch.gaussians.trajectory import interpolate_pose
+from ufmstar_torch.runtime.optional import optional
 
 LOOKED_FOR = "a .bag, .db3 or .mcap file, or a folder that holds one, or the numbered files of one (walk_0.db3, ...)"
 _SUFFIXES = (".bag", ".db3", ".mcap")

@@ -27,7 +27,7 @@ from ufmstar_torch.eval.sequences.images import depth_loader, listed_path, natur
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.poses import numbered_lines, poses_from_columns
-from ufmstar_torch.stream_warnings import LOGGER
+from ufmstar_torch.frames.warnings import LOGGER
 
 LOOKED_FOR = "cameras and images (.bin or .txt) in sparse/0/ (or another number), sparse/ or the folder itself"
 SCALE_FILE, MODELS = "poses.json", "sparse"

@@ -23,7 +23,7 @@ from ufmstar_torch.eval.sequences.images import first_image_size, listed_path
 from ufmstar_torch.eval.sequences.lens import FISHEYE, Lens
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import csv_rows, number, read_matrix, trajectory_of
-from ufmstar_torch.trajectory import Trajectory
+from ufmstar_torch.gaussians.trajectory import Trajectory
 
 LOOKED_FOR = "mav0/cam0/data.csv and sensor.yaml (also in mav0, or in a camera's folder itself)"
 _TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0", "leica0")

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ufmstar_torch.frame import CENTRE_RANGE
-from ufmstar_torch.limits import require_pixels
+from ufmstar_torch.files.limits import require_pixels
+from ufmstar_torch.frames.frame import CENTRE_RANGE
 
 Loader = Callable[[], np.ndarray]
 Size = tuple[int, int]

@@ -19,11 +19,11 @@ import numpy as np
 import torch
 from PIL import Image
 
-from ufmstar_torch.array_files import read_npy, read_npz
 from ufmstar_torch.eval.sequences.frame import Entry, Frame, FrameError, Loader, Size, Skipped
-from ufmstar_torch.limits import MOST_PIXELS, require_pixels
-from ufmstar_torch.optional import optional
-from ufmstar_torch.stream_warnings import LOGGER
+from ufmstar_torch.files.arrays import read_npy, read_npz
+from ufmstar_torch.files.limits import MOST_PIXELS, require_pixels
+from ufmstar_torch.frames.warnings import LOGGER
+from ufmstar_torch.runtime.optional import optional
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 DEPTH_SUFFIXES = (".png", ".exr", ".npy", ".npz", ".tif", ".tiff")

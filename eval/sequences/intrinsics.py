@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.sequences.frame import Size
 from ufmstar_torch.eval.sequences.poses import numbered_lines, read_matrix
+from ufmstar_torch.gaussians.camera import resize_intrinsics
 
 # A file's path, a matrix [3, 3] (or ScanNet's [4, 4]), or the numbers fx, fy, cx, cy [px].
 IntrinsicsLike = str | Path | np.ndarray | Sequence[float]

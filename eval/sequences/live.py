@@ -20,12 +20,12 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.conventions import CONVENTIONS, OURS
 from ufmstar_torch.eval.sequences.attach import stem_times
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.images import IMAGE_SUFFIXES, is_sidecar, listed_path, read_color
 from ufmstar_torch.eval.sequences.poses import in_metres, parse_pose, poses_from_columns
-from ufmstar_torch.stream_warnings import LOGGER
+from ufmstar_torch.frames.warnings import LOGGER
+from ufmstar_torch.gaussians.conventions import CONVENTIONS, OURS
 
 _FPS = 30.0  # of a recording without timestamps
 _POLL = 0.01  # [s] interval of polling a folder

@@ -16,7 +16,7 @@ from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.images import first_depth_size, is_sidecar, natural_key, positive
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.limits import require_bytes
+from ufmstar_torch.files.limits import require_bytes
 
 LOOKED_FOR = "val/SCENE/*.h5 or train/SCENE/*.h5 (the root, meaning val, the part's folder or the scene's)"
 PARTS = ("train", "val")

@@ -8,8 +8,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.arguments import as_path
-from ufmstar_torch.conventions import CONVENTIONS, OURS
 from ufmstar_torch.eval.sequences.assemble import undistort
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence
 from ufmstar_torch.eval.sequences.images import within
@@ -17,6 +15,8 @@ from ufmstar_torch.eval.sequences.layout import READERS, layout_of, readers
 from ufmstar_torch.eval.sequences.lens import Lens, parse_distortion
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import in_metres
+from ufmstar_torch.frames.arguments import as_path
+from ufmstar_torch.gaussians.conventions import CONVENTIONS, OURS
 
 # By option, the layouts that use it; other options are used by all.
 _USED_BY = {

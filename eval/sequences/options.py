@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ufmstar_torch.conventions import CONVENTIONS, OURS
 from ufmstar_torch.eval.sequences.images import check_scale
 from ufmstar_torch.eval.sequences.intrinsics import DEPTH_FILES, FILES, IntrinsicsLike, camera_file, parse_intrinsics
+from ufmstar_torch.gaussians.conventions import CONVENTIONS, OURS
 
 _WORD, _WORDS = {"type": str | None}, {"type": tuple[str, ...]}  # types on the command line
 

@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ufmstar_torch.arguments import as_path
-from ufmstar_torch.trajectory import Trajectory
+from ufmstar_torch.frames.arguments import as_path
+from ufmstar_torch.gaussians.trajectory import Trajectory
 
 # TUM writes quaternions with four decimals, so the norm is within 2e-4 of 1; an error of a hundred times that means
 # another order of columns or another unit.

@@ -22,9 +22,9 @@ from ufmstar_torch.eval.sequences.frame import FrameError
 from ufmstar_torch.eval.sequences.images import full_scale, grey_bytes, positive, read_color
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.poses import trajectory_of
-from ufmstar_torch.limits import require_pixels
-from ufmstar_torch.optional import optional
-from ufmstar_torch.trajectory import Trajectory, interpolate_pose
+from ufmstar_torch.files.limits import require_pixels
+from ufmstar_torch.gaussians.trajectory import Trajectory, interpolate_pose
+from ufmstar_torch.runtime.optional import optional
 
 _DEPTHS = ("16UC1", "32FC1", "64FC1")
 # Encodings by OpenCV's names of types, which state no colour order; drivers mean these.

@@ -24,7 +24,7 @@ from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence,
 from ufmstar_torch.eval.sequences.images import read_color
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.limits import MOST_PIXELS
+from ufmstar_torch.files.limits import MOST_PIXELS
 
 LOOKED_FOR = "a .sens file, or a folder that holds one (and no SensReader export)"
 _SUFFIX = ".sens"

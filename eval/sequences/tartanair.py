@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ufmstar_torch.conventions import CONVENTIONS
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_image
 from ufmstar_torch.eval.sequences.frame import FrameSequence
@@ -16,6 +15,7 @@ from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size, 
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, with_camera_files
 from ufmstar_torch.eval.sequences.poses import read_trajectory
+from ufmstar_torch.gaussians.conventions import CONVENTIONS
 
 LOOKED_FOR = "pose_left.txt and image_left/ (also in a single sub-folder P000)"
 _LENS = Lens((320.0, 320.0, 320.0, 240.0), (480, 640))

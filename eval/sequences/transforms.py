@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from ufmstar_torch.conventions import CONVENTIONS
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import UNKNOWN
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Size, Skipped
@@ -33,7 +32,8 @@ from ufmstar_torch.eval.sequences.images import (
 )
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.stream_warnings import LOGGER
+from ufmstar_torch.frames.warnings import LOGGER
+from ufmstar_torch.gaussians.conventions import CONVENTIONS
 
 FILE, TRAIN = "transforms.json", "transforms_train.json"
 LOOKED_FOR = f"{FILE} or {TRAIN}, or the path of another file *.json"

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ufmstar_torch.eval.sequences.frame import FrameError, Size
-from ufmstar_torch.limits import require_pixels
+from ufmstar_torch.files.limits import require_pixels
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 

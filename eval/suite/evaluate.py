@@ -23,8 +23,8 @@ from ufmstar_torch.eval.suite.examples import ExampleWriter
 from ufmstar_torch.eval.suite.job import EvalJob
 from ufmstar_torch.eval.suite.record import Record
 from ufmstar_torch.eval.suite.work_items import TOUR, WorkItem
-from ufmstar_torch.recalibrate import Recalibration
-from ufmstar_torch.stream_warnings import LOGGER
+from ufmstar_torch.frames.warnings import LOGGER
+from ufmstar_torch.posterior.recalibrate import Recalibration
 
 _NO_POSES = "its images have no poses: the rows of networks alone are finished, {} that compare views cannot be had"
 _FITTED = "{} recalibrated rows were fitted to this sequence and are not judged on it"

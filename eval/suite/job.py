@@ -19,7 +19,7 @@ from ufmstar_torch.eval.sequences.plugins import load_plugins
 from ufmstar_torch.eval.suite.folder import CACHE, EvalFolder
 from ufmstar_torch.eval.suite.work_items import WorkItem
 from ufmstar_torch.models.inference import Inference
-from ufmstar_torch.recalibrate import Recalibration
+from ufmstar_torch.posterior.recalibrate import Recalibration
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from ufmstar_torch.eval.tour.path import tour_path
 from ufmstar_torch.eval.tour.style import STYLES
 from ufmstar_torch.eval.tour.tour import Tour, make_tour
 from ufmstar_torch.eval.tour.view import TourView, intrinsics, render
-from ufmstar_torch.limits import MOST_PIXELS, require_bytes, require_pixels
+from ufmstar_torch.files.limits import MOST_PIXELS, require_bytes, require_pixels
 
 PREFIX = "tour:"
 _FORM = (

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ufmstar_torch.arguments import require_float, require_mask
-from ufmstar_torch.fixed_order import apply, product
-from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.frames.arguments import require_float, require_mask
+from ufmstar_torch.frames.frame import FrameInput
+from ufmstar_torch.gaussians.fixed_order import apply, product
 
 # Largest factor between an anchor and the prediction. A single anchor beyond it would dominate the mean of all others,
 # and larger values overflow in the state. More than FEW such anchors, if they outnumber the valid ones, show that the

@@ -4,7 +4,7 @@ Each input pose errs by a rotation w and a shift s, normal with the standard dev
 prior holds for every view, the refined poses do not drift and keep the scale. A corner's position in an earlier view is
 distributed about its point's projection as Student's t. Its variance grows with the number of views between, since
 errors of tracking add up. Gauss-Newton steps on poses and inverse depths, with the inverse depths eliminated
-(``kernels.bundle_cpu``), yield the most likely poses.
+(``anchors.kernels.bundle``), yield the most likely poses.
 
 sigma_w and sigma_s are learnt (EM). The error d of the newest pose has the prior variance sigma^2 and the posterior
 variance c, so the mean of d^2 should be sigma^2 - c. Images determine independent errors. They hardly determine errors
@@ -112,7 +112,13 @@ class PoseRefinement(SavedState):
         Returns:
             [W, 4, 4] refined poses; the input poses if too few corners are seen, or after a jump.
         """
-        from ufmstar_torch.kernels.bundle_cpu import FAR, NEAR, equations, inverse_depths, moved  # compiles when needed
+        from ufmstar_torch.anchors.kernels.bundle import (  # compiles when needed
+            FAR,
+            NEAR,
+            equations,
+            inverse_depths,
+            moved,
+        )
 
         self.shared, self.jumped = 0.0, False
         tracks, views = seen[:, -1] & (seen.sum(1) > 1), np.flatnonzero(seen.any(0))

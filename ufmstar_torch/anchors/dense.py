@@ -30,10 +30,10 @@ from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, OtherCameraErro
 from ufmstar_torch.anchors.motion import LANDMARK, LINE, OFF_LINE, SEARCH, MotionTests, Tested, located, moves
 from ufmstar_torch.anchors.saved_state import SavedState
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
-from ufmstar_torch.checked import Checked, number
+from ufmstar_torch.runtime.checked import Checked, number
 
 if TYPE_CHECKING:
-    from ufmstar_torch.kernels.dense_cpu import Search, Views
+    from ufmstar_torch.anchors.kernels.dense import Search, Views
 
 # Baselines of the keyframes with which a frame is compared, as shares of the median depth.
 _BASELINES = (0.04, 0.1, 0.22, 0.45)
@@ -218,7 +218,7 @@ class DenseEvidence(SavedState):
         self, small: NDArray[np.uint8], scale: NDArray, T: NDArray, K: NDArray, corners: Landmarks
     ) -> Landmarks:
         """Measure the depths in a reduced image, and add corners where there are none."""
-        from ufmstar_torch.kernels.anchor_check_cpu import check_anchors  # kernels compile when they are first needed
+        from ufmstar_torch.anchors.kernels.check import check_anchors  # kernels compile when they are first needed
 
         cell, K = _cell(small.shape[1]), self._errors.camera(K)
         trusted = not corners.contradicted
@@ -308,8 +308,8 @@ class DenseEvidence(SavedState):
             store (not an uncertain match of a single view, which the next images measure better); False if the views
             contradict each other; the number of pixels with depths that disagree.
         """
-        from ufmstar_torch.kernels.anchor_check_cpu import CERTAIN, confirmed
-        from ufmstar_torch.kernels.dense_cpu import measure
+        from ufmstar_torch.anchors.kernels.check import CERTAIN, confirmed
+        from ufmstar_torch.anchors.kernels.dense import measure
 
         self._baseline = float(np.linalg.norm(np.linalg.inv(K) @ views.b[-1]))
         matches = measure(small, pixel, views, self._search())
@@ -329,8 +329,8 @@ class DenseEvidence(SavedState):
         On a blank surface beside an edge, such a window measures the edge. The anchor is moved to the texture that was
         matched.
         """
-        from ufmstar_torch.kernels.anchor_check_cpu import confirmed
-        from ufmstar_torch.kernels.dense_cpu import MARGIN, Views, measure
+        from ufmstar_torch.anchors.kernels.check import confirmed
+        from ufmstar_torch.anchors.kernels.dense import MARGIN, Views, measure
 
         half = _halved(small)
         S = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
@@ -348,7 +348,7 @@ class DenseEvidence(SavedState):
 
     def _apart(self, corners: Landmarks, occupied: NDArray[np.float64], width: int) -> NDArray[np.int64]:
         """Indices of the corners that become anchors: precise ones, away from the ``occupied`` positions [N, 2]."""
-        from ufmstar_torch.kernels.anchor_check_cpu import farther
+        from ufmstar_torch.anchors.kernels.check import farther
 
         line_error = self._tracker.remaining_error / max(self._tracker.baseline, 1e-9) / self._tracker.focal
         stated = np.sqrt(corners.variance) / corners.depth
@@ -357,7 +357,7 @@ class DenseEvidence(SavedState):
         return precise[farther(corners.pixel[precise], occupied, self.config.corner_distance * width)]
 
     def _search(self) -> Search:
-        from ufmstar_torch.kernels.dense_cpu import Search
+        from ufmstar_torch.anchors.kernels.dense import Search
 
         config, rho = self.config, 1 / self._depth
         accepted = config.sigmas, config.least_score, config.rival, config.match_noise
@@ -366,7 +366,7 @@ class DenseEvidence(SavedState):
     def _compared(self, T: NDArray, K: NDArray, width: int) -> tuple[Views, NDArray[np.int64]] | None:
         """Choose V keyframes to compare with a camera T [4, 4]. Return them with the mapping of its pixels to theirs,
         and the indices [V] of their baselines; None if there is no suitable keyframe."""
-        from ufmstar_torch.kernels.dense_cpu import Views
+        from ufmstar_torch.anchors.kernels.dense import Views
 
         chosen = self._keyframes.choose(T, K, self._depth, _BASELINES)
         if not chosen:
@@ -419,7 +419,7 @@ def _cell(width: int) -> int:
 
 def _pixels(small: NDArray[np.uint8], cell: int, occupied: NDArray[np.float64]) -> NDArray[np.float64]:
     """[N, 2] the pixel (u, v) of largest gradient in every cell with a gradient and no ``occupied`` pixel [M, 2]."""
-    from ufmstar_torch.kernels.dense_cpu import best_pixels
+    from ufmstar_torch.anchors.kernels.dense import best_pixels
 
     shape = (-(-small.shape[0] // cell), -(-small.shape[1] // cell))
     pixel, strength = np.zeros((*shape, 2)), np.zeros(shape)

@@ -79,7 +79,7 @@ class Memory(SavedState):
 
     def reset(self) -> None:
         """Forget everything."""
-        from ufmstar_torch.kernels.dense_cpu import SIDE
+        from ufmstar_torch.anchors.kernels.dense import SIDE
 
         n = self._count
         self._point, self._pose = np.zeros((n, 3)), np.tile(np.eye(4), (n, 1, 1))
@@ -100,7 +100,7 @@ class Memory(SavedState):
             K: [3, 3] [px].
             cell: side of a cell [px].
         """
-        from ufmstar_torch.kernels.landmarks_cpu import sight
+        from ufmstar_torch.anchors.kernels.landmarks import sight
 
         self.frame += 1
         columns = self._point, self._pose, self._sigma, self._patch, self._used
@@ -186,7 +186,7 @@ class Memory(SavedState):
             T_world_cam: [4, 4] [m].
             K: [3, 3] [px].
         """
-        from ufmstar_torch.kernels.landmarks_cpu import patches
+        from ufmstar_torch.anchors.kernels.landmarks import patches
 
         if slot is None:
             age = np.where(self._used, self._seen, -1)

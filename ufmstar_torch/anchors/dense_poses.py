@@ -3,7 +3,7 @@
 An error (w, s) of a keyframe's relative pose shifts all pixels of its image consistently, and so do errors of the focal
 length, the centre or the distortion. A shift across the epipolar lines is measured directly. A shift along them is
 measured where keyframes of other baselines, or other pixels, contradict it. To first order, with the errors d and the
-Jacobians of ``kernels.poses_cpu``,
+Jacobians of ``anchors.kernels.poses``,
 
     value_k = rho + c_k d + noise,      across_k = a_k d + noise,
 
@@ -27,9 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.anchors.epipolar import MEDIAN_SQUARE, median
+from ufmstar_torch.anchors.kernels.dense import Measured, Views
+from ufmstar_torch.anchors.kernels.poses import CAMERA, POSE, Shown, Solution, linearised, solved
 from ufmstar_torch.anchors.saved_state import SavedState
-from ufmstar_torch.kernels.dense_cpu import Measured, Views
-from ufmstar_torch.kernels.poses_cpu import CAMERA, POSE, Shown, Solution, linearised, solved
 
 # Least number of matches for an update of the running estimates.
 _ENOUGH = 10

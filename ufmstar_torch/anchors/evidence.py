@@ -39,7 +39,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import AnchorInput
-from ufmstar_torch.fixed_order import total
+from ufmstar_torch.gaussians.fixed_order import total
 
 SUMS = 3  # entries of a row of sums: w, w r and w e
 # A wrong track differs from its neighbours. An anchor is used if at least SUPPORT of its NEIGHBOURS nearest anchors in

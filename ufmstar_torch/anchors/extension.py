@@ -1,4 +1,4 @@
-"""Anchors as an extension of UfM* (``ufmstar_torch.extension``): columns of step 5's regression, and the term B.
+"""Anchors as an extension of UfM* (``ufmstar_torch.frames.extension``): columns of step 5's regression, and the term B.
 
 Before the regression, a frame's anchors are added to the evidence. The regression of H also regresses the mean r and e
 of the components less the stream's. The stream's means are added at every pixel.
@@ -17,13 +17,13 @@ from torch import Tensor
 from ufmstar_torch.anchors.anchors import AnchorInput, check_anchors
 from ufmstar_torch.anchors.doubts import AnchorDoubts
 from ufmstar_torch.anchors.evidence import SUMS, Evidence, inliers, means, observe
-from ufmstar_torch.camera import unproject_at
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.extension import Columns, Distribute, Extension, FrameExtension, Tensors, Total
-from ufmstar_torch.frame import LARGEST, FrameInput
-from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.output import StepOutput
-from ufmstar_torch.state import UfMStarState
+from ufmstar_torch.frames.extension import Columns, Distribute, Extension, FrameExtension, Tensors, Total
+from ufmstar_torch.frames.frame import LARGEST, FrameInput
+from ufmstar_torch.frames.output import StepOutput
+from ufmstar_torch.gaussians.camera import unproject_at
+from ufmstar_torch.gaussians.mixture import GaussianMixture
+from ufmstar_torch.gaussians.state import UfMStarState
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def learn(
         frame: of the same B streams.
         anchors: of this frame, or None.
         config: of UfM*.
-        distribute: sums values at points by component (:func:`ufmstar_torch.regress.distribute`).
+        distribute: sums values at points by component (:func:`ufmstar_torch.steps.regress.distribute`).
         supported: masks the anchors that their neighbours support (``evidence.inliers``).
     """
     assert config.anchors is not None
@@ -97,7 +97,7 @@ class AnchorKernels:
     Attributes:
         supported: see ``evidence.inliers``.
         learn_in_view: :func:`learn` with the compiled step's components in view, to which it adds the columns
-            (``kernels.anchors_cpu.learn_in_view``); None = use :func:`learn`.
+            (``anchors.kernels.learn.learn_in_view``); None = use :func:`learn`.
     """
 
     supported: Callable[[AnchorInput], Tensor]

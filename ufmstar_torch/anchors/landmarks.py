@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
-from ufmstar_torch.optional import optional
+from ufmstar_torch.runtime.optional import optional
 
 # Imports cv2.
 opencv = partial(optional, "cv2", "landmarks of images need OpenCV", "'ufmstar-torch[eval]'")

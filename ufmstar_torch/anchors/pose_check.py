@@ -14,7 +14,7 @@ from torch import Tensor
 from ufmstar_torch.anchors.landmarks import checked
 from ufmstar_torch.anchors.pose_fit import UNCHANGED, Cameras, CornerTrack, FollowedCorners, pose_fit
 from ufmstar_torch.anchors.streams import as_bytes, camera_faults
-from ufmstar_torch.stream_warnings import LOGGER
+from ufmstar_torch.frames.warnings import LOGGER
 
 
 class PoseCheck:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.anchors.corners import find, follow
-from ufmstar_torch.conventions import CONVENTIONS, OURS
+from ufmstar_torch.gaussians.conventions import CONVENTIONS, OURS
 
 # Largest number of frames of a track, and two median motions, as shares of the image's width, at which corners are
 # compared: near, where errors of good recordings are below a pixel, and far, where a smooth trajectory that is late by

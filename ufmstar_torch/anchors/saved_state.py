@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.frame import LARGEST
+from ufmstar_torch.frames.frame import LARGEST
 
 
 def saved_image(state: Mapping[str, Tensor], name: str) -> NDArray[np.uint8]:

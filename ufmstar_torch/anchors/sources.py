@@ -17,8 +17,8 @@ from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.anchors.landmarks import Landmarks, LandmarkSource
 from ufmstar_torch.anchors.tracker import LandmarkTracker
-from ufmstar_torch.array_files import read_npz
-from ufmstar_torch.camera import invert_rigid
+from ufmstar_torch.files.arrays import read_npz
+from ufmstar_torch.gaussians.camera import invert_rigid
 
 CORNERS, DENSE = "corners", "dense"
 FILE_TYPES = (".csv", ".txt", ".npz")

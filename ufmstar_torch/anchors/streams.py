@@ -17,8 +17,8 @@ from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, LandmarkSource, OtherCameraError
 from ufmstar_torch.anchors.sources import landmark_source
 from ufmstar_torch.anchors.tracker import LandmarkTracker
-from ufmstar_torch.camera import rotation_deviation
-from ufmstar_torch.frame import FRAME_FAULTS, intrinsics_fault, pose_fault
+from ufmstar_torch.frames.frame import FRAME_FAULTS, intrinsics_fault, pose_fault
+from ufmstar_torch.gaussians.camera import rotation_deviation
 
 _LOG = logging.getLogger("ufmstar_torch")
 _CAUSES = (

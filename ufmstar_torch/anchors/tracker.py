@@ -20,10 +20,10 @@ from ufmstar_torch.anchors.corners import find, follow
 from ufmstar_torch.anchors.epipolar import NEAREST, median, off_lines, weighted_median
 from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, OtherCameraError, checked
 from ufmstar_torch.anchors.saved_state import SavedState, saved_image
-from ufmstar_torch.checked import Checked, number
+from ufmstar_torch.runtime.checked import Checked, number
 
 if TYPE_CHECKING:
-    from ufmstar_torch.kernels.triangulate_cpu import Triangulated
+    from ufmstar_torch.anchors.kernels.triangulate import Triangulated
 
 # Least number of tracks for a comparison with the poses.
 _ENOUGH = 5
@@ -364,7 +364,7 @@ class LandmarkTracker(SavedState):
         self._point = np.full((self.config.max_points, 3), np.nan)
         if not chosen.any():
             return chosen, None
-        from ufmstar_torch.kernels.triangulate_cpu import triangulate  # compiles when it is first needed
+        from ufmstar_torch.anchors.kernels.triangulate import triangulate  # compiles when it is first needed
 
         result = triangulate(self._pixel[chosen], self._seen[chosen], self._poses, self._K)
         fine = result.ahead & (result.error <= self.config.max_error)

@@ -12,11 +12,11 @@ import torch
 from ufmstar_torch.anchors.extension import REFERENCE as ANCHOR_REFERENCE
 from ufmstar_torch.anchors.extension import AnchorKernels
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.frame import CheckKernel, check_values
+from ufmstar_torch.frames.frame import CheckKernel, check_values
+from ufmstar_torch.gaussians.state import UfMStarState
 from ufmstar_torch.kernels.host import on_host
-from ufmstar_torch.state import UfMStarState
-from ufmstar_torch.step import Step, step
-from ufmstar_torch.step_parts import REFERENCE, Kernels
+from ufmstar_torch.steps.step import Step, step
+from ufmstar_torch.steps.step_parts import REFERENCE, Kernels
 
 _TRITON_DEVICES = ("cuda", "xpu")  # "cuda" is ROCm's name as well
 _LEAST_CAPABILITY = (8, 0)  # of an NVIDIA GPU that triton supports
@@ -48,11 +48,11 @@ def select_step(name: str, device_type: str) -> Step:
         ImportError: ``name`` is "triton", which cannot be imported.
     """
     if _compiled(name, device_type):
-        from ufmstar_torch.kernels import step_cpu
+        from ufmstar_torch.kernels.cpu import step as step_cpu
 
         return step_cpu.step
     if _on_gpu(name, device_type):
-        from ufmstar_torch.kernels.step_device import DeviceStep
+        from ufmstar_torch.kernels.triton.step import DeviceStep
 
         return DeviceStep(_triton())
     return functools.partial(step, kernels=select_kernels(name, device_type))
@@ -61,7 +61,7 @@ def select_step(name: str, device_type: str) -> Step:
 def select_check(name: str, device_type: str) -> CheckKernel:
     """The check of a frame's values; arguments and errors as :func:`select_step`."""
     if _compiled(name, device_type):
-        from ufmstar_torch.kernels import check_cpu
+        from ufmstar_torch.kernels.cpu import check as check_cpu
 
         return check_cpu.check_values
     if _on_gpu(name, device_type):
@@ -74,7 +74,7 @@ def select_check(name: str, device_type: str) -> CheckKernel:
 def select_anchors(name: str, device_type: str) -> AnchorKernels:
     """Kernels of the anchors' evidence; arguments as :func:`select_step`. Raises ValueError: "numba" off the CPU."""
     if _compiled(name, device_type):
-        from ufmstar_torch.kernels import anchors_cpu as fast
+        from ufmstar_torch.anchors.kernels import learn as fast
 
         return AnchorKernels(fast.inliers, fast.learn_in_view)
     return ANCHOR_REFERENCE
@@ -86,7 +86,7 @@ def select_kernels(name: str, device_type: str) -> Kernels:
         return _triton()
     if name == "torch" or device_type in ("cpu", "meta"):
         return REFERENCE
-    from ufmstar_torch.kernels import segment_cpu
+    from ufmstar_torch.kernels.cpu import segment as segment_cpu
 
     return replace(REFERENCE, spgf=on_host(segment_cpu.segment))
 

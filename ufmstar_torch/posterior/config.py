@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ufmstar_torch.checked import Checked, number
+from ufmstar_torch.runtime.checked import Checked, number
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The posterior as an extension of UfM* (``ufmstar_torch.extension``). It runs after the anchors' extension."""
+"""The posterior as an extension of UfM* (``ufmstar_torch.frames.extension``). It runs after the anchors' extension."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from torch import Tensor
 from ufmstar_torch.anchors.anchors import AnchorInput
 from ufmstar_torch.anchors.extension import AnchorFrame
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.extension import Extension, FrameExtension, Tensors, Total
-from ufmstar_torch.frame import FrameInput
-from ufmstar_torch.output import StepOutput
+from ufmstar_torch.frames.extension import Extension, FrameExtension, Tensors, Total
+from ufmstar_torch.frames.frame import FrameInput
+from ufmstar_torch.frames.output import StepOutput
+from ufmstar_torch.gaussians.state import UfMStarState
 from ufmstar_torch.posterior import conformal
 from ufmstar_torch.posterior.running import SIZE, require, restarted
-from ufmstar_torch.state import UfMStarState
 
 if TYPE_CHECKING:
     from ufmstar_torch.posterior.update import Posterior

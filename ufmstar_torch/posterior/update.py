@@ -64,9 +64,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import AnchorInput
-from ufmstar_torch.frame import FrameInput
-from ufmstar_torch.kernels.arrays_cpu import array
-from ufmstar_torch.kernels.threads_cpu import each
+from ufmstar_torch.frames.frame import FrameInput
+from ufmstar_torch.kernels.cpu.arrays import array
+from ufmstar_torch.kernels.cpu.threads import each
 from ufmstar_torch.posterior.cells import cell_means, features, read
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.field import at

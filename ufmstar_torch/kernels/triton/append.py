@@ -1,6 +1,6 @@
 """First and last part of a step on a GPU: relative camera poses, and the components that a frame adds.
 
-The host learns the number of slots one frame late (``kernels.step_device``). A mask therefore marks the frame's
+The host learns the number of slots one frame late (``kernels.triton.step``). A mask therefore marks the frame's
 Gaussians without a slot, so that a later launch can append them.
 """
 
@@ -13,11 +13,11 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.frames.frame import FrameInput
+from ufmstar_torch.gaussians.mixture import GaussianMixture
+from ufmstar_torch.gaussians.state import UfMStarState
 from ufmstar_torch.kernels.triton.launch import launch, power_of_two
 from ufmstar_torch.kernels.triton.matrices import exact, load_symmetric, moved, store_symmetric, turned
-from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.state import UfMStarState
 
 # Rows of a frame's counts [8, B] int64.
 COMPONENTS, SEGMENTS, MATCHED, PAIRS, NEW, DROPPED, VALID, UNMEASURED = range(8)

@@ -7,8 +7,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from ufmstar_torch.camera import POLAR_STEPS, rotation_deviation
-from ufmstar_torch.frame import (
+from ufmstar_torch.frames.frame import (
     DEPTH_RANGE,
     FARTHEST,
     FOCAL_RANGE,
@@ -18,6 +17,7 @@ from ufmstar_torch.frame import (
     of_streams,
     pose_fault,
 )
+from ufmstar_torch.gaussians.camera import POLAR_STEPS, rotation_deviation
 from ufmstar_torch.kernels.triton.launch import launch
 from ufmstar_torch.kernels.triton.matrices import exact
 
@@ -34,7 +34,7 @@ def check_values(
     rotation_tolerance: float,
     max_depth: float,
 ) -> FrameInput:
-    """As :func:`ufmstar_torch.frame.check_values`."""
+    """As :func:`ufmstar_torch.frames.frame.check_values`."""
     depth = depth.contiguous()
     b, height, width = depth.shape
     device = depth.device

@@ -15,11 +15,11 @@ import triton.language as tl
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.correspond import Correspondence
-from ufmstar_torch.gaussian import PIXEL_VARIANCE
+from ufmstar_torch.gaussians.gaussian import PIXEL_VARIANCE
+from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.kernels.triton.launch import launch
 from ufmstar_torch.kernels.triton.matrices import exact, load_symmetric, lowest_bit, moved, turned
-from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.steps.correspond import Correspondence
 
 WORD = 32  # candidates c in one entry of ``Pairs.bits``
 _CHUNK = 64
@@ -62,7 +62,7 @@ def correspond(
     size: tuple[int, int],
     config: UfMStarConfig,
 ) -> Correspondence:
-    """As :func:`ufmstar_torch.correspond.correspond`."""
+    """As :func:`ufmstar_torch.steps.correspond.correspond`."""
     b, device = previous_cam.streams, previous_cam.mean.device
     shape = (b, current_cam.capacity, previous_cam.capacity)
     match = torch.zeros(shape, dtype=torch.bool, device=device)

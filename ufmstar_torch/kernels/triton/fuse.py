@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.correspond import Correspondence
+from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.kernels.triton.correspond import WORD
 from ufmstar_torch.kernels.triton.launch import launch, power_of_two
 from ufmstar_torch.kernels.triton.matrices import (
@@ -26,8 +26,8 @@ from ufmstar_torch.kernels.triton.matrices import (
     store_symmetric,
     turned,
 )
-from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.views import COMPLETE, LEAST
+from ufmstar_torch.steps.correspond import Correspondence
+from ufmstar_torch.steps.views import COMPLETE, LEAST
 
 _LANES = 32
 
@@ -41,7 +41,7 @@ def fuse(
     *,
     rounds: int | None = None,
 ) -> GaussianMixture:
-    """As :func:`ufmstar_torch.fuse.fuse`; ``rounds`` is ignored."""
+    """As :func:`ufmstar_torch.steps.fuse.fuse`; ``rounds`` is ignored."""
     b, c, k = pairs.match.shape
     device = pairs.match.device
     words = triton.cdiv(c, WORD)
@@ -71,7 +71,7 @@ def fuse_bits(
         motion: R [B, 3, 3] and t [B, 3] float64 from the frame of ``current`` to the mixture's frame.
         matches: bits [B, K, words], indices of the listed c's [B, C], row of each k in the bits [B, K], number of
             listed c's [B].
-        view: [B, 4] as :func:`ufmstar_torch.fuse.fuse`.
+        view: [B, 4] as :func:`ufmstar_torch.steps.fuse.fuse`.
         config: of UfM*.
         pairs: overlaps and distances if the config needs them; None = W2^2, not weighted by overlap.
     """
@@ -98,7 +98,7 @@ def fuse_bits(
 
 
 def floor_covariance(covariance: Tensor, floor: Tensor) -> Tensor:
-    """As :func:`ufmstar_torch.gaussian.floor_covariance` for positive semidefinite float64 tensors."""
+    """As :func:`ufmstar_torch.gaussians.gaussian.floor_covariance` for positive semidefinite float64 tensors."""
     contiguous = covariance.to(torch.float64).contiguous()
     lifted = torch.empty_like(contiguous)
     limits = floor.to(torch.float64).expand(contiguous.shape[:-2]).contiguous()

@@ -13,9 +13,9 @@ import triton.language as tl
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.kernels.triton.launch import launch
 from ufmstar_torch.kernels.triton.matrices import load_symmetric, moved, turned
-from ufmstar_torch.mixture import GaussianMixture
 
 # As on the CPU: share of the denominator that culling may omit, and share of the prior in the threshold.
 EPSILON = {torch.float32: 1e-7, torch.float64: 1e-14}
@@ -66,7 +66,7 @@ def prepare(
 
 @triton.jit
 def whitened(xx, xy, xz, yy, yz, zz):
-    """Inverse Cholesky factor (rows, 6 numbers) and the factor's determinant (``regress_cull_cpu.whiten``)."""
+    """Inverse Cholesky factor (rows, 6 numbers) and the factor's determinant (``regress_cull.whiten``)."""
     least = 1e-14 * tl.maximum(xx, tl.maximum(yy, zz))
     l00 = tl.sqrt(tl.maximum(xx, least))
     l10, l20 = xy / l00, xz / l00

@@ -1,4 +1,4 @@
-"""Symmetric 3x3 matrices in registers: functions of ``ufmstar_torch.gaussian`` for Triton kernels.
+"""Symmetric 3x3 matrices in registers: functions of ``ufmstar_torch.gaussians.gaussian`` for Triton kernels.
 
 A symmetric matrix is stored as its upper triangle (xx, xy, xz, yy, yz, zz), a lower triangular one as its rows
 (00, 10, 11, 20, 21, 22), any other as its nine entries, row by row. The entries are float64 blocks of one shape.

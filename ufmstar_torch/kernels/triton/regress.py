@@ -1,6 +1,6 @@
 """Gaussian mixture regression on a GPU: the exact sum with culling in two levels.
 
-The bound is that of ``kernels.regress_cull_cpu``: a component is omitted where its density is at most
+The bound is that of ``kernels.cpu.regress_cull``: a component is omitted where its density is at most
 (eps / 3n) max(max_j l_j, pi_0 / 1000), with a lower bound l_j of each density. The first level is the image: a program
 per stream lists the components whose silhouette meets it. The second level is a tile of 16 x 16 pixels, with a program
 each. Chosen pixels are processed in groups of 256 instead of tiles.
@@ -16,15 +16,15 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from ufmstar_torch import unmeasured
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.frames.frame import FrameInput
+from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.kernels.triton.launch import launch, power_of_two
 from ufmstar_torch.kernels.triton.listing import EPSILON, PRIOR, prepare
 from ufmstar_torch.kernels.triton.matrices import lowest_bit
-from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.regress import Regression
-from ufmstar_torch.regress import regress_image as reference
+from ufmstar_torch.steps import unmeasured
+from ufmstar_torch.steps.regress import Regression
+from ufmstar_torch.steps.regress import regress_image as reference
 
 _SIDE = 16  # pixels of a tile
 _CHUNK = 32  # components bounded at a time, the bits of a mask
@@ -94,7 +94,7 @@ def regress_image(
     config: UfMStarConfig,
     pixels: Tensor | None = None,
 ) -> Regression:
-    """As :func:`ufmstar_torch.regress.regress_image`; which also runs ``config.regression == "neighbourhood"``."""
+    """As ``steps.regress.regress_image``, which also runs ``config.regression == "neighbourhood"``."""
     if config.regression != "exact":
         return reference(mixture_cam, depth, intrinsics, valid, config, pixels)
     maps = depth.new_empty(depth.shape if pixels is None else pixels.shape)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ufmstar_torch.kernels.triton.launch import interpreted, launch, power_of_two
 from ufmstar_torch.kernels.triton.matrices import exact
-from ufmstar_torch.segment_input import SegmentInput
+from ufmstar_torch.steps.segment_input import SegmentInput
 
 MOMENTS, INTEGERS = 8, 3  # of a finished segment: mean x, z; scatter xx, xz, zz; line x, z; length^2 | N, interval
 

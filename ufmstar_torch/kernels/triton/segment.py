@@ -16,13 +16,13 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from ufmstar_torch.gaussian import PIXEL_VARIANCE
+from ufmstar_torch.gaussians.gaussian import PIXEL_VARIANCE
+from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.kernels.triton.launch import launch, power_of_two
 from ufmstar_torch.kernels.triton.matrices import exact, floored, load_symmetric, store_symmetric
 from ufmstar_torch.kernels.triton.scanline import Rows, scanlines, slope_of
-from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.segment import max_gaussians
-from ufmstar_torch.segment_input import SegmentInput
+from ufmstar_torch.steps.segment import max_gaussians
+from ufmstar_torch.steps.segment_input import SegmentInput
 
 _PRUNE = {"none": 0, "both": 1, "either": 2}
 _CHUNK = 32  # Gaussians of a program of ``_lift``
@@ -45,7 +45,7 @@ class Floor:
 
 
 def segment(inputs: SegmentInput) -> tuple[GaussianMixture, Tensor]:
-    """As :func:`ufmstar_torch.segment.segment`, computed in float64, with the capacity for accelerators."""
+    """As :func:`ufmstar_torch.steps.segment.segment`, computed in float64, with the capacity for accelerators."""
     mixture, read_labels = fit(inputs)
     return mixture, read_labels()
 

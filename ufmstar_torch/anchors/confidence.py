@@ -1,0 +1,246 @@
+"""A network's confidence as a variance in metres: a monotone factor of V, learnt from anchors.
+
+A confidence c orders the pixels by quality. Its unit is unknown, and so is whether large values are good or bad. At an
+anchor (depth g, variance s^2) of a pixel with prediction d and variance V, the network's squared error is
+
+    y = min((g - d)^2 / (V + s^2), largest),      with the weight w = (V / (V + s^2))^2;
+
+y is 1 on average where V is right, and w is small for an anchor that is noisier than V. The last anchors of a stream
+are divided by c into bins of equal size. The mean of each bin includes a prior of kappa anchors with y = 1,
+
+    m = (sum w y + kappa) / (sum w + kappa).
+
+An isotonic regression of m over the bins (Barlow and Brunk 1972), rising or falling, whichever fits better, gives the
+factor h(c):
+
+    V' = h(c) V.
+
+Only the order of c counts: a logit, a probability and a standard deviation of the same content give the same V'.
+
+New anchors decide whether c helps, before the map is updated with them. The mean log likelihood of their errors under
+V h(c) is compared with that under V, and with that under V times the single factor that the anchors give without c.
+Both gains are averaged with exponential forgetting. c is used where both means exceed their standard errors; otherwise
+V' = V.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.anchors.extension import AnchorFrame
+from ufmstar_torch.config import ConfidenceConfig, UfMStarConfig
+from ufmstar_torch.frames.arguments import require_float
+from ufmstar_torch.frames.extension import Chosen, Extension, FrameExtension, Tensors, Total
+from ufmstar_torch.frames.frame import LARGEST, FrameInput
+from ufmstar_torch.frames.output import StepOutput
+from ufmstar_torch.gaussians.state import UfMStarState
+
+# Numbers per anchor: c, y, w. Statistics of the gains: the number of frames, and, for the gain over V and over one
+# factor, the sum and the sum of squares, all with exponential forgetting.
+FIELDS, GAINS = 3, 5
+# c is used after this many frames with a gain, and a frame has a gain from this many anchors per bin on. The mean gain
+# [nat] must exceed its standard error by USEFUL; a smaller gain is rounding or useless.
+FEWEST, FULL, USEFUL = 5, 4, 1e-3
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """Statistics of the confidence of B streams.
+
+    Attributes:
+        c, y, w: [B, N] of the last anchors, the newest last; w = 0 marks an empty entry.
+        gains: [B, 5] frames, sum and sum of squares of the gain over V, and of that over one factor [nat].
+    """
+
+    c: Tensor
+    y: Tensor
+    w: Tensor
+    gains: Tensor
+
+    @classmethod
+    def of(cls, packed: Tensor) -> Learnt:
+        """From one row of numbers per stream [B, 3 N + 5]; zeros before the first frame."""
+        anchors, gains = packed[:, :-GAINS], packed[:, -GAINS:]
+        c, y, w = anchors.view(len(packed), FIELDS, -1).unbind(1)
+        return cls(c, y, w, gains)
+
+    def packed(self) -> Tensor:
+        """[B, 3 N + 5], for :meth:`of`."""
+        return torch.cat([torch.stack([self.c, self.y, self.w], 1).flatten(1), self.gains], 1)
+
+    def added(self, c: Tensor, y: Tensor, w: Tensor, limit: int) -> Learnt:
+        """A copy with at most ``limit`` anchors of a frame [B, n], evenly chosen, in place of the oldest."""
+        chosen = evenly(w > 0, limit)
+        pairs = ((self.c, c), (self.y, y), (self.w, w))
+        every = [torch.cat([old, torch.where(chosen, new, 0)], 1) for old, new in pairs]
+        order = (every[2] > 0).to(torch.int8).argsort(dim=1, stable=True)[:, c.shape[1] :]
+        return replace(self, **dict(zip("cyw", (value.gather(1, order) for value in every), strict=True)))
+
+    def judged(self, gains: Sequence[Tensor], fresh: Tensor, half_life: float) -> Learnt:
+        """A copy with the frame's mean gains over V and over one factor, each [B], added for the streams ``fresh``."""
+        one = torch.stack([torch.ones_like(gains[0]), *(f(g) for g in gains for f in (torch.clone, torch.square))], 1)
+        faded = 0.5 ** (1 / half_life) * self.gains + one.to(self.gains)
+        return replace(self, gains=torch.where(fresh[:, None], faded, self.gains))
+
+    def gain(self) -> Tensor:
+        """[B] gain in log likelihood of new anchors over the better of V and one factor, less its standard error and
+        ``USEFUL`` [nat]. The confidence is used where it is positive. -inf before enough frames."""
+        frames = self.gains[:, 0]
+        n = frames.clamp_min(1)
+        least = torch.full_like(n, torch.inf)
+        for total, square in (self.gains[:, 1:3].unbind(1), self.gains[:, 3:5].unbind(1)):
+            mean = total / n
+            least = torch.minimum(least, mean - ((square / n - mean.square()).clamp_min(0) / n).sqrt())
+        return torch.where(frames >= FEWEST * (1 - 1e-3), least - USEFUL, -torch.inf)
+
+
+def evenly(valid: Tensor, limit: int) -> Tensor:
+    """[B, n] True for every k-th valid entry, with the smallest k that selects at most ``limit``."""
+    stride = (valid.sum(1, keepdim=True) + limit - 1) // limit
+    return valid & ((valid.cumsum(1) - 1) % stride.clamp_min(1) == 0)
+
+
+def factors(learnt: Learnt, config: ConfidenceConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """The map h: edges [B, K - 1] of the bins in c, factors [B, K], and the single factor without c [B, 1].
+
+    Bin k holds the values c that have k edges at or below them. The edges are quantiles of the anchors' c.
+    """
+    learnt_from, bins = learnt.w > 0, config.bins
+    ordered = torch.where(learnt_from, learnt.c, torch.inf).sort(1).values
+    step = torch.arange(1, bins, device=ordered.device) * learnt_from.sum(1, keepdim=True) // bins
+    edges = ordered.gather(1, step)
+    at = torch.searchsorted(edges.contiguous(), learnt.c.contiguous(), right=True)
+    w, wy = (torch.zeros_like(ordered[:, :bins]).scatter_add(1, at, v) for v in (learnt.w, learnt.w * learnt.y))
+    prior = config.shrinkage
+    weight, mean = w + prior, (wy + prior) / (w + prior)
+    rising, falling = isotonic(*(torch.cat([v, v.flip(1)]) for v in (mean, weight))).chunk(2)
+    falling = falling.flip(1)
+    misfit = [(weight * (mean - fitted).square()).sum(1, keepdim=True) for fitted in (rising, falling)]
+    h = torch.where(misfit[0] <= misfit[1], rising, falling)
+    one = (wy.sum(1, keepdim=True) + prior) / (w.sum(1, keepdim=True) + prior)
+    return edges, h.clamp(config.least, config.largest), one.clamp(config.least, config.largest)
+
+
+def isotonic(value: Tensor, weight: Tensor) -> Tensor:
+    """The non-decreasing sequence nearest to ``value`` [B, K] by weighted squares: max over i <= k of min over j >= k
+    of the weighted mean from i to j."""
+    k = value.shape[1]
+    upto = torch.nn.functional.pad(torch.stack([value * weight, weight]).cumsum(-1), (1, 0))
+    total, weights = upto[..., None, 1:] - upto[..., :-1, None]  # [B, i, j]
+    upper = torch.ones(k, k, dtype=torch.bool, device=value.device).triu()
+    means = torch.where(upper, total / weights.clamp_min(torch.finfo(value.dtype).tiny), torch.inf)
+    least = means.flip(-1).cummin(-1).values.flip(-1)
+    return torch.where(upper, least, -torch.inf).amax(-2)
+
+
+def read(c: Tensor, edges: Tensor, h: Tensor) -> Tensor:
+    """h(c) at c [B, n]; 1 where c is NaN."""
+    bins = torch.searchsorted(edges, c.contiguous(), right=True)
+    return torch.where(c.isnan(), 1.0, h.gather(1, bins))
+
+
+class ConfidenceFrame(FrameExtension):
+    """The confidence of one frame.
+
+    Args:
+        c: [B, H, W] float32.
+        of_anchors: the frame's anchors; None = the map is applied but not updated.
+        frame: of B streams.
+        config: of the confidence.
+    """
+
+    def __init__(self, c: Tensor, of_anchors: AnchorFrame | None, frame: FrameInput, config: ConfidenceConfig) -> None:
+        self._c, self._anchors, self._frame, self._config = c, of_anchors, frame, config
+        self._factor: Tensor | None = None
+
+    def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
+        """Test the map at the frame's anchors, update it with them, and compute h at every pixel."""
+        learnt = Learnt.of(state.by_stream["confidence"])
+        if self._anchors is not None and self._anchors.anchors is not None:
+            learnt = self._taught(learnt, total(self._anchors.disagreement(out.disagreement, self._frame.depth)))
+        edges, h, _ = factors(learnt, self._config)
+        gain = learnt.gain()
+        h = torch.where(gain[:, None] > 0, h, torch.ones_like(h))
+        self._factor = read(self._c.flatten(1).to(edges), edges, h).view_as(self._c)
+        state = state.with_tensors({"confidence": learnt.packed()})
+        return state, replace(out, statistics=replace(out.statistics, confidence=gain))
+
+    def _taught(self, learnt: Learnt, variance: Tensor) -> Learnt:
+        """The statistics after the frame's anchors; ``variance`` is V before the map [B, H, W]."""
+        assert self._anchors is not None
+        anchors, dtype = self._anchors.anchors, learnt.c.dtype
+        assert anchors is not None
+        c = self._c.flatten(1).gather(1, anchors.index).to(dtype)
+        V = variance.detach().flatten(1).gather(1, anchors.index).double()
+        usable = anchors.valid & V.isfinite() & (V > 0) & ~c.isnan()
+        V = torch.where(usable, V, torch.ones_like(V))
+        spread = V + anchors.variance
+        y = ((anchors.depth - anchors.predicted).square() / spread).clamp_max(self._config.largest).to(dtype)
+        w = torch.where(usable, (V / spread).square(), torch.zeros_like(V)).to(dtype)
+        edges, h, one = factors(learnt, self._config)
+        likelihood = [-0.5 * (y / f + f.log()) for f in (read(c, edges, h), torch.ones_like(one), one)]
+        weight = w.sum(1)
+        gains = [(w * (likelihood[0] - other)).sum(1) / weight.clamp_min(1e-6) for other in likelihood[1:]]
+        enough = (learnt.w > 0).sum(1) >= FULL * self._config.bins
+        judged = learnt.judged(gains, enough & (weight > 0), self._config.half_life)
+        return judged.added(c.nan_to_num(), y, w, self._config.each)
+
+    def map_variance(self, variance: Tensor, chosen: Chosen) -> Tensor:
+        """V' = h(c) V."""
+        return variance if self._factor is None else variance * chosen(self._factor).to(variance.dtype)
+
+
+class ConfidenceExtension(Extension):
+    """The network's confidence, calibrated at anchors. ``config``: with ``confidence`` and ``anchors``."""
+
+    argument = "confidence"
+
+    def __init__(self, config: UfMStarConfig) -> None:
+        assert config.confidence is not None
+        self._config: ConfidenceConfig = config.confidence
+
+    def by_stream(self, streams: int, dtype: torch.dtype, device: torch.device | str) -> dict[str, Tensor]:
+        """``confidence`` [B, 3 N + 5], the last N anchors and the gains (:class:`Learnt`)."""
+        return {"confidence": torch.zeros(streams, FIELDS * self._config.anchors + GAINS, dtype=dtype, device=device)}
+
+    def require_state(self, state: Tensors) -> None:
+        """See :meth:`Extension.require_state`."""
+        learnt = Learnt.of(state["confidence"])
+        bad = (learnt.w < 0) | (learnt.w > 1) | (learnt.y < 0) | (learnt.y > self._config.largest)
+        if bool(bad.any()) or bool((learnt.gains[:, ::2] < 0).any()) or bool((learnt.gains.abs() > LARGEST).any()):
+            raise ValueError("confidence holds impossible errors, weights or gains")
+
+    def of_frame(
+        self,
+        frame: FrameInput,
+        network_variances: Sequence[Tensor],
+        argument: Any,
+        before: Sequence[FrameExtension],
+        *,
+        dense: bool,
+    ) -> FrameExtension:
+        """The frame's confidence; nothing without one. Without ``dense``, the map is applied but not updated.
+
+        Raises:
+            TypeError, ValueError: ``confidence`` is no map of the depth's shape.
+        """
+        if argument is None:
+            return FrameExtension()
+        of_anchors = [one for one in before if isinstance(one, AnchorFrame)] if dense else []
+        return ConfidenceFrame(
+            as_confidence(argument, frame), of_anchors[0] if of_anchors else None, frame, self._config
+        )
+
+
+def as_confidence(values: Any, frame: FrameInput) -> Tensor:
+    """Convert a confidence to [B, H, W] float32, clamped to finite values. Raises TypeError, ValueError: not a map of
+    the depth's shape."""
+    size = tuple(frame.depth.shape)
+    c = require_float("confidence", values, [size, (size[0], 1, *size[1:])], frame.depth).detach()
+    limit = torch.finfo(torch.float32).max
+    return c.reshape(size).float().clamp(-limit, limit)

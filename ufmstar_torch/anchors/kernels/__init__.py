@@ -1,0 +1,1 @@
+"""Kernels of the anchors for CPUs, compiled by numba."""

@@ -1,0 +1,1 @@
+"""A frame on its way in and out: arguments, checks, predictions, results, counts and warnings."""

@@ -1,0 +1,174 @@
+"""Finds images that show nothing, and images that contradict a pose that never changes.
+
+A network predicts a depth for a black image, too, and predicts it again for the next one, so views agree on a guess. An
+image shows nothing if it is black, saturated, blurred beyond recognition or covered (``shows_something``), or if it is
+the same as the last one although the camera moved. The depth of such an image is neither fused nor counted as measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from ufmstar_torch.frames.warnings import LOGGER
+
+# Width of the reduced image [px], and the cells over which it is averaged [px].
+_WIDTH, _CELL = 192, 3
+# Least detail [grey levels of 255]: RMS difference of a cell from the mean of its 3 x 3 cells. Images of recordings and
+# tours have 5 to 18, at a tenth of their brightness .5 to 1.8, blurred with a radius of 1/30 of the width .2 to 1.4;
+# sensor noise of 3 grey levels has .5.
+_DETAIL = 1.0
+# Cells within this range of grey levels are not clipped; least share of such cells.
+_DARK, _BRIGHT, _SHARE = 4.0, 251.0, 0.1
+# Successive images after which a warning is logged.
+_IMAGES = 8
+# Largest correlation of an image with that at the first of ``_IMAGES`` equal poses: below, the camera must have moved.
+_SAME_SCENE = 0.5
+
+
+def reduced(image: Tensor) -> Tensor:
+    """Grey levels [B, 1, h, w] from 0 to 255 of an image [B, 3, H, W] of bytes or of floats in [0, 1]."""
+    stride = max(1, image.shape[-1] // _WIDTH)
+    grey = image[:, :, ::stride, ::stride].float().mean(1, keepdim=True)
+    grey = grey if image.dtype == torch.uint8 else 255 * grey
+    return avg_pool2d(grey, _CELL) if min(grey.shape[-2:]) >= 3 * _CELL else grey
+
+
+def shows_something(grey: Tensor) -> Tensor:
+    """[B] False where a reduced image [B, 1, h, w] lacks detail, or is almost everywhere black or saturated."""
+    around = avg_pool2d(grey, 3, 1, 1, count_include_pad=False)
+    detail = (grey - around).square().mean((1, 2, 3)).sqrt()
+    exposed = ((grey > _DARK) & (grey < _BRIGHT)).float().mean((1, 2, 3))
+    return (detail >= _DETAIL) & (exposed >= _SHARE)
+
+
+class _Seen(NamedTuple):
+    """The last image of B streams, and what they have shown.
+
+    Attributes:
+        grey: [B, 1, h, w] of the last image (``reduced``); NaN before it.
+        pose: [B, 4, 4] of the last image.
+        first: [B, 1, h, w] of the first image of the present pose.
+        still: [B] number of images since then.
+        empty: [B] number of images in a row that show nothing.
+        frozen: [B] number of images in a row that are the same as the one before under another pose.
+    """
+
+    grey: Tensor
+    pose: Tensor
+    first: Tensor
+    still: Tensor
+    empty: Tensor
+    frozen: Tensor
+
+    @classmethod
+    def before(cls, grey: Tensor, pose: Tensor) -> _Seen:
+        """The streams before their first image."""
+        zero = torch.zeros(len(grey), dtype=torch.int64, device=grey.device)
+        nothing = torch.full_like(grey, torch.nan)
+        return cls(nothing, torch.full_like(pose, torch.nan), nothing, zero, zero, zero)
+
+    def where(self, mask: Tensor, other: _Seen) -> _Seen:
+        """This for the streams of ``mask`` [B], ``other`` for the rest."""
+        pairs = zip(self, other, strict=True)
+        return _Seen(*(torch.where(mask.view(-1, *[1] * (a.dim() - 1)), a, b) for a, b in pairs))
+
+
+class ImageCheck:
+    """Compares every image with the one before, and logs each finding once per stream."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self, streams: Sequence[int] | None = None) -> None:
+        """Forget the images of all streams, because other videos begin, or of some."""
+        if streams is None:
+            self._seen: _Seen | None = None
+            self._undone: _Seen | None = None
+            self._examined = False  # whether an image waits for UfM*'s verdict
+            self._logged = set[tuple[int, str]]()
+        elif self._seen is not None:
+            self._seen = _Seen.before(self._seen.grey, self._seen.pose).where(_mask(streams, self._seen), self._seen)
+
+    def undo(self, streams: Sequence[int] | None = None) -> None:
+        """Forget the last image of all streams, or of some, because UfM* refused or skipped it; once an image."""
+        if self._examined and (streams is None or streams):
+            now, before = self._seen, self._undone
+            if streams is None or now is None or before is None or before.grey.shape != now.grey.shape:
+                self._seen = before
+            else:
+                self._seen = _Seen(*(value.to(now.still.device) for value in before)).where(_mask(streams, now), now)
+        self._examined = False
+
+    def informative(self, image: Tensor, pose: Tensor) -> Tensor | None:
+        """[B] False where the image shows nothing; None for an image of normalised floats, or on a device without
+        values, of which nothing is known.
+
+        Args:
+            image: [B, 3, H, W].
+            pose: [B, 4, 4] or [4, 4] camera-to-world [m].
+        """
+        fits = pose.dim() == 2 or len(pose) in (1, len(image))  # if not, UfM* names it
+        if image.is_meta or not fits or not (image.dtype == torch.uint8 or _in_unit_range(image)):
+            return None
+        grey = reduced(image.detach())
+        T = pose.detach().to(grey.device).double().expand(len(grey), *pose.shape[-2:]).clone()
+        self._undone = last = self._seen
+        if last is None or last.grey.shape != grey.shape or last.pose.shape != T.shape:
+            last = _Seen.before(grey, T)
+        last = _Seen(*(value.to(grey.device) for value in last))
+        changed = (last.pose != T).flatten(1).any(1)
+        same = (grey == last.grey).flatten(1).all(1)
+        shows, frozen = shows_something(grey), same & changed
+        still = torch.where(changed, 0, last.still + 1)
+        first = torch.where(changed[:, None, None, None], grey, last.first)
+        empty = torch.where(shows, 0, last.empty + 1)
+        repeated = torch.where(changed, torch.where(same, last.frozen + 1, 0), last.frozen)
+        self._seen = _Seen(grey, T, first, still, empty, repeated)
+        self._examined = True
+        if image.is_cpu:  # on an accelerator, reading the counts would synchronise
+            self._warn(self._seen)
+        return shows & ~frozen
+
+    def _warn(self, seen: _Seen) -> None:
+        for b, kind, text in (*_findings(seen), *_moving(seen)):
+            if (b, kind) not in self._logged:
+                self._logged.add((b, kind))
+                LOGGER.warning("stream %d: %s (logged once)", b, text)
+
+
+def _mask(streams: Sequence[int], seen: _Seen) -> Tensor:
+    """[B] True for the streams; an index that the images do not have is ignored."""
+    mask = torch.zeros(len(seen.still), dtype=torch.bool)
+    mask[[b for b in streams if b < len(mask)]] = True
+    return mask.to(seen.still.device)
+
+
+def _findings(seen: _Seen) -> Iterator[tuple[int, str, str]]:
+    for b in (seen.empty == _IMAGES).nonzero().flatten().tolist():
+        text = f"{_IMAGES} images in a row show nothing (black, saturated, blurred, or a covered lens): their "
+        yield b, "empty", text + "depth is a guess, so it counts as unmeasured"
+    for b in (seen.frozen == _IMAGES).nonzero().flatten().tolist():
+        text = f"the image was the same in {_IMAGES + 1} frames of a moving camera: is it updated? Its depth counts "
+        yield b, "frozen", text + "as unmeasured"
+
+
+def _moving(seen: _Seen) -> Iterator[tuple[int, str, str]]:
+    due = (seen.still > 0) & (seen.still % _IMAGES == 0)
+    for b in due.nonzero().flatten().tolist():
+        both = torch.stack([seen.grey[b].flatten(), seen.first[b].flatten()])
+        if float(torch.corrcoef(both)[0, 1]) < _SAME_SCENE:
+            text = f"the pose was the same in {int(seen.still[b]) + 1} images, which show different scenes: is the "
+            yield b, "pose", text + "pose updated, and has SLAM started?"
+
+
+def _in_unit_range(image: Tensor) -> bool:
+    """True for floats in [0, 1]; on an accelerator, where looking would synchronise, False."""
+    if not image.is_floating_point() or not image.is_cpu or not image.numel():
+        return False
+    low, high = image.aminmax()
+    return float(low) >= 0 and float(high) <= 1

@@ -1,0 +1,323 @@
+"""The outputs of a step and of UfM* for one image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.gaussians.mixture import GaussianMixture
+from ufmstar_torch.posterior.conformal import NORMAL
+from ufmstar_torch.posterior.distribution import LEAST_VARIANCE, DepthDistribution
+
+_WITHOUT_EVIDENCE = (
+    "an interval needs evidence: UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig()) and images or "
+    "anchors, or a Recalibration; without one, nothing shows how large the errors are"
+)
+_NO_ANCHORS_YET = (
+    "an interval needs evidence, and too few anchors were held out so far: quantiles is NaN. Move the camera, or use a "
+    "Recalibration until then"
+)
+
+
+@dataclass(frozen=True, repr=False)
+class FrameStatistics:
+    """Counts of one frame, per stream [B].
+
+    Attributes:
+        components: K, occupied components after the frame.
+        segments: C, Gaussians segmented from the frame.
+        matched: segments that match at least one earlier component.
+        pairs: matched pairs (c, k); fused where the view changed (``views``).
+        new: segments appended to the mixture.
+        dropped: components that were dropped because ``max_components`` was reached, the farthest first; and segments
+            nearer than the near plane, which are not appended.
+        valid_pixels: pixels used.
+        beyond: pixels not used because their depth is beyond ``config.segment.max_depth``.
+        out_of_range: other pixels with a finite positive depth that are not used, because depth, A, E or features lie
+            outside the ranges of ``UfMStar.forward``.
+        unmeasured: pixels used (with a subset, pixels regressed) where less than half of M rests on surfaces seen from
+            different places; ``config.unmeasured`` decides their M.
+        single_view: components seen by only one frame. If it stays close to ``components``, hardly anything is compared
+            between views; the logger ``ufmstar_torch`` then lists likely causes.
+        fault: index into ``ufmstar_torch.frames.frame.FRAME_FAULTS``; not 0 = the frame was skipped.
+        rotation_deviation: max |R^T R - I| of the pose, removed by projection onto SO(3).
+        anchors: usable anchors (0, for example, while the camera stands still). None without ``config.anchors``.
+        anchors_used: usable anchors without gross outliers. If 0, the frame adds no evidence: B follows from earlier
+            frames, and is 0 at the start.
+        anchors_rejected: anchors that differ from the prediction by more than a factor of 100. If they are the
+            majority, they count as an error of the prediction and widen the variance.
+        anchors_moving: depths from images that were not used because the surface moves, or because views disagree.
+        pose_error: disagreement of poses and images: standard deviation of tracked corners from their epipolar lines
+            [px] of the searched image; NaN = not measured, None = no source of anchors measures it. Without anchors
+            it is not measured, because the search costs as much as the step; a run measures some pairs of frames
+            instead (``image_fit`` of its summary).
+        calibration: running mean of z^2 of held-out anchors: 1 = the posterior variance matches the errors, more = it
+            is too small. NaN before any anchor; None without ``config.posterior``.
+        unseen: likewise, variance of log g/d at held-out anchors on surfaces far from all other anchors; large where
+            the evidence covers little of the image.
+        confidence: gain of the network's confidence in log likelihood of held-out anchors, less its standard error
+            [nat]. The confidence is ignored where it is at most 0; -inf = too few frames. None without
+            ``config.confidence``.
+    """
+
+    components: Tensor
+    segments: Tensor
+    matched: Tensor
+    pairs: Tensor
+    new: Tensor
+    dropped: Tensor
+    valid_pixels: Tensor
+    beyond: Tensor
+    out_of_range: Tensor
+    unmeasured: Tensor
+    fault: Tensor
+    rotation_deviation: Tensor
+    single_view: Tensor
+    anchors: Tensor | None = None
+    anchors_used: Tensor | None = None
+    anchors_rejected: Tensor | None = None
+    anchors_moving: Tensor | None = None
+    pose_error: Tensor | None = None
+    calibration: Tensor | None = None
+    unseen: Tensor | None = None
+    confidence: Tensor | None = None
+
+    def __repr__(self) -> str:
+        """The counts that are not 0, in one line."""
+        names = (f.name for f in fields(self) if f.name != "rotation_deviation")
+        counts = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        shown = [f"{name}={_short(value)}" for name, value in counts.items() if _any(value)]
+        return f"FrameStatistics({', '.join(shown)})"
+
+
+@dataclass(frozen=True)
+class StepOutput:
+    """The regressed maps, segments and counts of a step.
+
+    Attributes:
+        disagreement: M [B, H, W] [m^2] after the moving average, NaN where not valid; [B, n] on a subset.
+        features: regressed features [B, H, W, F] or [B, n, F].
+        measured: [B, H, W] or [B, n] share in [0, 1] of M that rests on surfaces seen from different places.
+        current_cam: C_i in the camera frame.
+        statistics: of this frame.
+    """
+
+    disagreement: Tensor
+    features: Tensor
+    measured: Tensor
+    current_cam: GaussianMixture
+    statistics: FrameStatistics
+
+
+@dataclass(frozen=True, repr=False)
+class UfMStarOutput:
+    """The prediction of one frame with its variance. Maps have the shape of the argument ``depth``.
+
+    Attributes:
+        depth: the argument ``depth`` [m].
+        variance: V, the total variance of the depth [m^2]: M, plus A and E if passed (and not switched off in the
+            config), plus B with ``config.anchors``; at least ``config.variance_floor``. NaN where not valid.
+        disagreement: M, the multiview disagreement [m^2]. NaN where not valid.
+        aleatoric, epistemic: the arguments A and E [m^2], or None; with ``config.aleatoric_in_h`` A of the mixture.
+        anchored: B, the mean square error at anchors in excess of M + A + E [m^2] (``evidence``); None unless
+            ``config.anchors``.
+        bias: the relative error r = g/d - 1 that anchors predict; None unless ``config.anchors``.
+        posterior_depth, posterior_variance: the results of :meth:`posterior`; None unless ``config.posterior``.
+        posterior_outlier: probability p that the pixel lies on another surface than the anchors that corrected it. NaN
+            before any anchor; None unless ``config.posterior``.
+        posterior_inlier_variance: V_1 [m^2], the variance if it lies on their surface. ``posterior_variance`` V is that
+            of the mixture: on another surface, the variance is (V - (1 - p) V_1)/p.
+        quantiles: [B, 3] half-widths of the central intervals of 50, 90 and 99 %, in standard deviations of a normal
+            distribution (``posterior.conformal``). NaN in a stream without evidence; None unless ``config.posterior``.
+        recalibrated: [B, 1] True if a ``Recalibration`` has mapped ``variance``, or None.
+        features: regressed further entries of H, [B, H, W, F], in the caller's units.
+        measured: share in [0, 1] of M that rests on surfaces seen from different places; below one half the pixel
+            counts as not measured (``config.unmeasured``). NaN where not valid.
+        valid: True where the pixel was used.
+        current_cam: C_i, the segments of this frame in the camera frame, float64.
+        statistics: per-stream counts of this frame.
+    """
+
+    depth: Tensor
+    variance: Tensor
+    disagreement: Tensor
+    aleatoric: Tensor | None
+    epistemic: Tensor | None
+    features: Tensor
+    measured: Tensor
+    valid: Tensor
+    current_cam: GaussianMixture
+    statistics: FrameStatistics
+    anchored: Tensor | None = None
+    bias: Tensor | None = None
+    posterior_depth: Tensor | None = None
+    posterior_variance: Tensor | None = None
+    posterior_outlier: Tensor | None = None
+    posterior_inlier_variance: Tensor | None = None
+    quantiles: Tensor | None = None
+    recalibrated: Tensor | None = None
+
+    def __repr__(self) -> str:
+        """Shape, median standard deviation and counts in one line."""
+        std = "" if self.variance.device.type == "meta" else f", median std {float(self.std.nanmedian()):.3g} m"
+        return f"UfMStarOutput({' x '.join(map(str, self.variance.shape))}{std}, {self.statistics!r})"
+
+    @property
+    def std(self) -> Tensor:
+        """sqrt(variance) [m]."""
+        return self.variance.sqrt()
+
+    def posterior(self) -> tuple[Tensor, Tensor]:
+        """p(depth | network, UfM*, anchors): depth [m] and its variance [m^2], NaN where not valid
+        (``ufmstar_torch.posterior``).
+
+        Before the first anchor they equal ``depth`` and ``variance`` to the last bit.
+
+        Raises:
+            ValueError: without ``config.posterior``.
+        """
+        if self.posterior_depth is None or self.posterior_variance is None:
+            raise ValueError("posterior needs UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())")
+        return self.posterior_depth, self.posterior_variance
+
+    def interval(self, level: float) -> tuple[Tensor, Tensor]:
+        """Central interval that holds the true depth with probability ``level``: lower and upper end [m], in the shape
+        of ``depth``; NaN where not valid, and in a stream without evidence.
+
+        The interval is that of the posterior's mixture, widened or narrowed so that it holds the held-out anchors
+        (``posterior.conformal``). With a ``Recalibration`` and without a posterior, it is that of N(depth, variance).
+
+        Raises:
+            ValueError: ``level`` is not within (0, 1); or no stream has evidence: neither a posterior with held-out
+                anchors, nor a ``Recalibration``.
+        """
+        if not 0 < level < 1:
+            raise ValueError(f"level must lie within (0, 1), got {level!r}")
+        lower, upper = self.distribution().interval(level)
+        return lower.to(self.depth.dtype), upper.to(self.depth.dtype)
+
+    def probability_nearer(self, than: float | Tensor) -> Tensor:
+        """Probability that the depth is below ``than`` [m], in the shape of ``depth``; from the distribution of
+        :meth:`interval`.
+
+        Args:
+            than: a depth, or a map that broadcasts with ``depth``.
+
+        Raises:
+            ValueError: as :meth:`interval`, without its ``level``.
+        """
+        bound = torch.as_tensor(than, dtype=torch.float64, device=self.depth.device).expand(self.depth.shape)
+        return self.distribution().below(bound).to(self.depth.dtype)
+
+    def probability_between(self, near: float | Tensor, far: float | Tensor) -> Tensor:
+        """Probability that the depth lies between ``near`` and ``far`` [m]; otherwise as :meth:`probability_nearer`.
+
+        Raises:
+            ValueError: as :meth:`probability_nearer`; or ``near`` is beyond ``far``.
+        """
+        near, far = (torch.as_tensor(x, dtype=torch.float64, device=self.depth.device) for x in (near, far))
+        if bool((near > far).any()):
+            raise ValueError("near must be at most far, got a larger one")
+        return self.probability_nearer(far) - self.probability_nearer(near)
+
+    @property
+    def has_intervals(self) -> bool:
+        """True if :meth:`interval` and the probabilities have evidence in at least one stream."""
+        return self.recalibrated is not None or (self.quantiles is not None and bool(self.quantiles.isfinite().any()))
+
+    def distribution(self) -> DepthDistribution:
+        """The distribution of the depth at every pixel, of which the intervals and probabilities are.
+
+        Raises:
+            ValueError: no stream has evidence, as :meth:`interval`.
+        """
+        if not self.has_intervals:
+            raise ValueError(_WITHOUT_EVIDENCE if self.quantiles is None else _NO_ANCHORS_YET)
+        V1, p = self.posterior_inlier_variance, self.posterior_outlier
+        streams = 1 if self.depth.dim() < 3 else len(self.depth)
+        quantiles = self.variance.new_full((streams, 3), torch.nan) if self.quantiles is None else self.quantiles
+        if V1 is None or p is None:
+            mean, variance, weight = self.depth[None], self.variance[None], torch.ones_like(self.depth)[None]
+        else:
+            d, V = self.posterior()
+            p = torch.where(p.isnan() & V.isfinite(), 0.0, p)  # before any anchor
+            elsewhere = torch.maximum((V - (1 - p) * V1) / p.clamp_min(1e-12), V1)
+            weight, mean, variance = torch.stack([1 - p, p]), torch.stack([d, d]), torch.stack([V1, elsewhere])
+        if self.recalibrated is not None:
+            quantiles = torch.where(quantiles.isnan() & self.recalibrated, quantiles.new_tensor(NORMAL), quantiles)
+        weight = torch.where(variance.isfinite(), weight, torch.nan)
+        return DepthDistribution(weight, mean, variance.clamp_min(LEAST_VARIANCE), quantiles)
+
+
+@dataclass(frozen=True)
+class SampleStatistics:
+    """Statistics of a map over the pixels of an image with a value, per stream [B]; NaN if there are none.
+
+    Attributes:
+        mean, median, maximum: in the unit of the map; for an even number of pixels, the lower of the two middle values.
+        variance: between the pixels, in the unit squared; NaN with fewer than two.
+        pixels: number of pixels with a value.
+    """
+
+    mean: Tensor
+    variance: Tensor
+    median: Tensor
+    maximum: Tensor
+    pixels: Tensor
+
+
+@dataclass(frozen=True, repr=False)
+class MeanUncertainty:
+    """Averages of V and of its parts over a sample of an image's pixels, per stream [B].
+
+    Attributes:
+        total: V [m^2]; with ``config.unmeasured="nan"`` only over measured pixels.
+        disagreement: M [m^2], likewise.
+        aleatoric, epistemic: A and E [m^2], or None if V does not include them.
+        anchored: B [m^2]; None unless ``config.anchors``.
+        depth: the predicted depth [m].
+        standard_error: of the mean of V as an estimate of the mean over all valid pixels [m^2]; NaN with fewer than two
+            pixels.
+        measured: share in [0, 1] of the sampled pixels whose M rests on surfaces seen from different places; about 0
+            in a first view, where ``config.unmeasured`` decides the mean. NaN without a valid pixel.
+        statistics: per-stream counts of this frame; ``unmeasured`` counts the other sampled pixels.
+    """
+
+    total: SampleStatistics
+    disagreement: SampleStatistics
+    aleatoric: SampleStatistics | None
+    epistemic: SampleStatistics | None
+    anchored: SampleStatistics | None
+    depth: SampleStatistics
+    standard_error: Tensor
+    measured: Tensor
+    statistics: FrameStatistics
+
+    @property
+    def mean(self) -> Tensor:
+        """[B] mean of V [m^2]."""
+        return self.total.mean
+
+    @property
+    def pixels(self) -> Tensor:
+        """[B] number of pixels over which V is averaged."""
+        return self.total.pixels
+
+    def __repr__(self) -> str:
+        """Means and counts in one line."""
+        counts = f"pixels={_short(self.pixels)}, measured={_short(self.measured)}"
+        return f"MeanUncertainty(mean={_short(self.mean)} m^2, {counts}, {self.statistics!r})"
+
+
+def _any(value: Tensor) -> bool:
+    return value.device.type == "meta" or bool(value.any())
+
+
+def _short(value: Tensor) -> str:
+    """The values of at most four streams."""
+    if value.device.type == "meta":
+        return "?"
+    texts = [f"{x:.4g}" if value.is_floating_point() else str(x) for x in value[:4].tolist()]
+    return texts[0] if len(value) == 1 else f"[{', '.join(texts)}{', ...' if len(value) > 4 else ''}]"

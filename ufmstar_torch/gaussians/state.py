@@ -1,0 +1,147 @@
+"""The state of UfM* between images: defines all of its tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.gaussians.camera import rotation_deviation
+from ufmstar_torch.gaussians.mixture import GaussianMixture
+
+
+@dataclass(frozen=True)
+class UfMStarState:
+    """The state of B streams. The tensors' names are the keys of a saved state (``UfMStar.state_dict``).
+
+    Attributes:
+        mean, covariance, weight, disagreement, compared, views, reference, features: M_i (:class:`GaussianMixture`) in
+            the frame of each stream's first camera.
+        T_world_first: [B, 4, 4] float64 pose of that camera; identity before the first frame.
+        started: [B] bool, True after the first frame of a stream.
+        frames: [B] int64 number of frames used.
+        skipped: [B] int64 number of frames skipped because of a fault.
+        smoothed: [B, H, W] moving average of the dense disagreement [m^2] in the mixture's dtype, NaN without a
+            value; of size 0 x 0 before the first average.
+        by_component: tensors of extensions [B, K, C] by name, sums over the observations of each component.
+        by_stream: tensors of extensions [B, C] by name, which describe a stream as a whole.
+    """
+
+    mean: Tensor
+    covariance: Tensor
+    weight: Tensor
+    disagreement: Tensor
+    compared: Tensor
+    views: Tensor
+    reference: Tensor
+    features: Tensor
+    T_world_first: Tensor
+    started: Tensor
+    frames: Tensor
+    skipped: Tensor
+    smoothed: Tensor
+    by_component: Mapping[str, Tensor] = field(default_factory=dict)
+    by_stream: Mapping[str, Tensor] = field(default_factory=dict)
+
+    @classmethod
+    def initial(
+        cls, streams: int, config: UfMStarConfig, dtype: torch.dtype, device: torch.device | str
+    ) -> UfMStarState:
+        """The empty state of ``streams`` independent streams, without extensions."""
+        capacity = min(config.initial_capacity, config.max_components or config.initial_capacity)
+        mixture = GaussianMixture.empty(streams, capacity, features=config.entries, dtype=dtype, device=device)
+        counter = torch.zeros(streams, dtype=torch.int64, device=device)
+        components: dict[str, Any] = mixture.tensors()
+        return cls(
+            **components,
+            T_world_first=torch.eye(4, dtype=torch.float64, device=device).repeat(streams, 1, 1),
+            started=counter.bool(),
+            frames=counter,
+            skipped=counter.clone(),
+            smoothed=torch.zeros(streams, 0, 0, dtype=dtype, device=device),
+        )
+
+    @property
+    def mixture(self) -> GaussianMixture:
+        """M_i, [B, K]."""
+        return GaussianMixture(**{f.name: getattr(self, f.name) for f in fields(GaussianMixture)})
+
+    def require(self, config: UfMStarConfig, like: UfMStarState) -> None:
+        """Check tensors from outside, for example a checkpoint, before they are used.
+
+        Args:
+            config: of UfM*.
+            like: a state with the tensors of the extensions, with any number of streams and components.
+
+        Raises:
+            ValueError: shapes that do not fit each other or the config; values that are not finite or out of range;
+                covariances that are not positive definite; more slots than ``config.max_components``.
+        """
+        if self.weight.dim() != 2:
+            raise ValueError(f"weight must be [B, K], got {tuple(self.weight.shape)}")
+        b, k = self.weight.shape
+        image = tuple(self.smoothed.shape[1:]) if self.smoothed.dim() == 3 else ("H", "W")
+        shapes = {
+            "mean": (b, k, 3), "covariance": (b, k, 3, 3), "disagreement": (b, k), "compared": (b, k),
+            "views": (b, k), "reference": (b, k, 5),
+            "features": (b, k, config.entries), "T_world_first": (b, 4, 4), "started": (b,), "frames": (b,),
+            "skipped": (b,), "smoothed": (b, *image),
+            **{name: (b, k, *value.shape[2:]) for name, value in like.by_component.items()},
+            **{name: (b, *value.shape[1:]) for name, value in like.by_stream.items()},
+        }  # fmt: skip
+        tensors = self.tensors()
+        for name, shape in shapes.items():
+            if (actual := tuple(tensors[name].shape)) != shape:
+                raise ValueError(f"{name} must have shape {shape} to match weight {(b, k)}, got {actual}")
+        if config.max_components is not None and k > max(config.max_components, 1):
+            raise ValueError(f"{k} slots exceed max_components = {config.max_components}")
+        if self.weight.device.type == "meta":
+            return
+        for name, value in self.tensors().items():
+            if not bool((value.isfinite() | value.isnan() if name == "smoothed" else value.isfinite()).all()):
+                raise ValueError(f"{name} holds NaN or infinity")
+        for name in ("weight", "disagreement", "compared", "views", "frames", "skipped", "smoothed"):
+            if bool((getattr(self, name) < 0).any()):
+                raise ValueError(f"{name} holds negative values")
+        occupied = self.weight > 0
+        if bool((occupied[:, 1:] & ~occupied[:, :-1]).any()):
+            raise ValueError("weight has an empty slot before an occupied one")
+        covariance = self.covariance[occupied].double()
+        # A rotation rounds an entry and its transpose differently.
+        lopsided = (covariance - covariance.mT).abs() > 1e-4 * covariance.abs().amax((-2, -1), keepdim=True)
+        if bool(lopsided.any()) or bool(torch.linalg.cholesky_ex(covariance).info.any()):
+            raise ValueError("covariance holds matrices that are not symmetric and positive definite")
+        R = self.T_world_first[:, :3, :3]
+        if b and float(rotation_deviation(R).max()) > 1e-6:
+            raise ValueError("T_world_first holds matrices that are not rigid")
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The tensors by name, without copying."""
+        return {**{name: getattr(self, name) for name in NAMES}, **self.by_component, **self.by_stream}
+
+    def with_tensors(self, changed: Mapping[str, Tensor]) -> UfMStarState:
+        """A copy with some tensors replaced, by name."""
+        tensors = {**self.tensors(), **changed}
+        return UfMStarState(
+            **{name: tensors[name] for name in NAMES},
+            by_component={name: tensors[name] for name in self.by_component},
+            by_stream={name: tensors[name] for name in self.by_stream},
+        )
+
+    def restarted(self, again: Tensor) -> UfMStarState:
+        """A copy with the streams of the mask ``again`` [B] set to the state before their first frame."""
+        start = {"T_world_first": torch.eye(4, dtype=torch.float64, device=again.device), "smoothed": torch.nan}
+
+        def value(name: str, old: Tensor) -> Tensor:
+            mask = again.view(-1, *[1] * (old.dim() - 1))
+            return torch.where(mask, torch.as_tensor(start.get(name, 0), dtype=old.dtype, device=old.device), old)
+
+        return self.with_tensors({name: value(name, old) for name, old in self.tensors().items()})
+
+
+# Names of the tensors without extensions, in order.
+NAMES = tuple(f.name for f in fields(UfMStarState) if f.name not in ("by_component", "by_stream"))

@@ -1,0 +1,1 @@
+"""The algorithm's steps for CPUs, compiled by numba, with the signatures of ``steps``."""

@@ -1,0 +1,167 @@
+"""Selects the components that matter in a box of points, on the CPU (numba): culling in two levels, and its error.
+
+A component k adds w_k(x) = pi_k N(x; mu_k, Sigma_k) to the denominator D(x) = pi_0 + sum_k w_k(x) of a point x.
+
+1. Block of 32 x 32 pixels: interval arithmetic over the bounding box of the block's points gives l_k <= w_k(x) <= h_k.
+   Components that the box around all points of the image excludes are left out first. Every block would exclude them,
+   so that no bit changes.
+2. Tile of 8 x 8 pixels: the same, for the components that the block keeps.
+
+Each level leaves out the components with h_k <= (eps / 2n) max(max_j l_j, pi_0 / 1000), with n components at that
+level. max_j l_j and pi_0 are parts of the denominator, so that the components left out add up to
+d(x) <= eps max(max_j w_j(x), pi_0 / 1000) <= eps D(x). The error is d/D times the difference of two averages of m_k
+and mu_0:
+
+    |m_hat - m_hat_culled| <= eps max(m_k, mu_0),
+
+and eps / 1000 max(m_k, mu_0) at a point that no component explains (every w_j <= pi_0 / 1000). The factor 1000 keeps
+the *relative* error small there, where m_hat itself is small. Rounding of the sums adds to it; the bounds contain their
+own rounding. tests/test_regress.py checks the bound.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
+from ufmstar_torch.kernels.cpu.regress_vectors import TERMS, bounds
+from ufmstar_torch.kernels.cpu.rigid import COVARIANCE, WEIGHT, padded
+
+HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
+_PRIOR = 1e-3  # share of the prior in a threshold
+FIELDS = 10  # of a component: mean (3), whitening (6), log2 of the peak
+_LOG2_E = math.log2(math.e)
+_SCALE = math.sqrt(0.5 * _LOG2_E)
+# Rows of :func:`whiten`, the last of which is the peak.
+WHITENED, PEAK = 7, 6
+
+
+@kernel
+def in_view(components, m, features, K, depth, farthest, prior_weight, prior_mean, epsilon):
+    """The components that can matter in an image, as :func:`exact` takes them.
+
+    Args:
+        components: in the camera's frame by field [13, n and more] (``rigid``).
+        m, features: of the n components [n], [n, F].
+        depth: [H, W], not positive where invalid.
+        farthest: the largest depth.
+
+    Returns:
+        Indices [n], fields [n, 10], the same in the dtype of ``depth`` and by field [10, n and more], the terms of the
+        sum [n, TERMS], and the settings: prior weight and mean, epsilon, log2 of the least threshold, and the number of
+        all components.
+    """
+    height, width = depth.shape
+    n = m.size
+    whitened = empty((WHITENED, components.shape[1]), np.float64)
+    index, every = empty(n, np.int64), empty(n, np.int64)
+    whiten(components, n, whitened)
+    for k in range(n):
+        every[k] = k
+        for i in range(6):
+            whitened[i, k] *= _SCALE
+        whitened[PEAK, k] = (math.log(whitened[PEAK, k]) - HALF_LOG_TWO_PI_CUBED) * _LOG2_E
+    packed = empty((FIELDS, padded(n)), depth.dtype)
+    _pack(components, whitened, every, n, packed)
+    z = farthest
+    left, top = (0 - K[0, 2]) / K[0, 0] * z, (0 - K[1, 2]) / K[1, 1] * z
+    right, bottom = (width - 1 - K[0, 2]) / K[0, 0] * z, (height - 1 - K[1, 2]) / K[1, 1] * z
+    box = min(left, 0.0), min(top, 0.0), 0.0, max(right, 0.0), max(bottom, 0.0), z
+    settings = prior_weight, prior_mean, epsilon, math.log2(_PRIOR * prior_weight), n
+    work = empty(8 + packed.shape[1], depth.dtype)
+    # Blocks divide their threshold by n. A larger divisor makes this one lower in spite of rounding of the boxes.
+    chosen = cull(packed, n, n + n // 64 + 1, box, settings, work, index)
+    fields, constants = empty((chosen, FIELDS), np.float64), empty((chosen, TERMS), depth.dtype)
+    _terms(components, whitened, index, m, features, fields, constants)
+    packed = empty((FIELDS, padded(chosen)), depth.dtype)
+    _pack(components, whitened, index, chosen, packed)
+    return index[:chosen], fields, packed, constants, settings
+
+
+@leaf
+def _pack(components, whitened, index, n, packed):
+    """The fields of the first n chosen components by field, padded with components of density 0.
+
+    The fields are mean, whitening and log2 of the peak: 2^(peak - |whitening (x - mean)|^2) is the density.
+    """
+    for i in range(3):
+        for k in range(n):
+            packed[i, k] = components[i, index[k]]
+    for i in range(3, FIELDS):
+        for k in range(n):
+            packed[i, k] = whitened[i - 3, index[k]]
+    pad(packed, n)
+
+
+@leaf
+def _terms(components, whitened, index, m, features, fields, constants):
+    """Write the fields [n, 10] of the chosen components, and the terms of the sum."""
+    for i in range(fields.shape[0]):
+        k = index[i]
+        for j in range(3):
+            fields[i, j] = components[j, k]
+        for j in range(7):
+            fields[i, 3 + j] = constants[i, j] = whitened[j, k]
+        constants[i, 7] = m[k]
+        for g in range(min(3, features.shape[1])):
+            constants[i, 8 + g] = features[k, features.shape[1] - 1 - g]
+
+
+@leaf
+def _limit(epsilon, count):
+    """log2 of the share of a lower bound that one component may add at one level, with a margin for rounding."""
+    return math.log2(epsilon / (2 * max(count, 1))) - 0.01
+
+
+@leaf
+def pad(packed, n):
+    """Fill the fields after n components up to the padded number with components of density 0."""
+    for j in range(n, padded(n)):
+        for i in range(FIELDS - 1):
+            packed[i, j] = 0
+        packed[FIELDS - 1, j] = -1e30
+
+
+@leaf
+def whiten(components, n, whitened):
+    """Write the inverse Cholesky factor (row by row, 6 numbers) of the first n components by field, and weight over its
+    determinant."""
+    for k in range(n):
+        xx, yy, zz = components[COVARIANCE, k], components[COVARIANCE + 4, k], components[COVARIANCE + 8, k]
+        least = max(xx, yy, zz) * 1e-14  # the pivots of fused covariances are far above it
+        l00 = math.sqrt(max(xx, least))
+        l10, l20 = components[COVARIANCE + 3, k] / l00, components[COVARIANCE + 6, k] / l00
+        l11 = math.sqrt(max(yy - l10 * l10, least))
+        l21 = (components[COVARIANCE + 7, k] - l20 * l10) / l11
+        l22 = math.sqrt(max(zz - l20 * l20 - l21 * l21, least))
+        a, c, f = 1 / l00, 1 / l11, 1 / l22
+        b, e = -l10 / (l00 * l11), -l21 / (l11 * l22)
+        whitened[0, k], whitened[1, k], whitened[2, k] = a, b, c
+        whitened[3, k], whitened[4, k], whitened[5, k] = -(l20 * a + l21 * b) / l22, e, f
+        whitened[PEAK, k] = components[WEIGHT, k] / (l00 * l11 * l22)
+
+
+@leaf
+def cull(packed, n, level, box, settings, work, retained):
+    """Write those of the n packed components that matter in the box (low, high) to ``retained``; return their number.
+
+    ``level`` is the number of components of the level, which divides the threshold. ``work`` is scratch for 8 numbers
+    and one for each component.
+    """
+    real = packed.dtype.type
+    epsilon, least = settings[2], settings[3]
+    slack = 16 * (2.0**-23 if packed.itemsize == 4 else 2.0**-52)
+    for i in range(3):
+        centre, half = 0.5 * (box[i] + box[3 + i]), 0.5 * (box[3 + i] - box[i])
+        work[i], work[3 + i] = centre, half + slack * (half + abs(centre))
+    work[6], work[7] = slack, least
+    upper = work[8:]
+    bounds(packed, packed.shape[1], padded(n), work, upper)
+    threshold = work[7] + real(_limit(epsilon, level))
+    count = 0
+    for j in range(n):
+        retained[count] = j
+        count += upper[j] > threshold
+    return count

@@ -1,0 +1,120 @@
+"""Compile all kernels by running two synthetic frames."""
+
+from __future__ import annotations
+
+import gc
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ufmstar_torch.anchors.anchors import Anchors
+from ufmstar_torch.anchors.dense import DenseEvidence
+from ufmstar_torch.anchors.tracker import LandmarkTracker
+from ufmstar_torch.frames import arguments
+from ufmstar_torch.frames.arguments import require_whole
+
+_DISTANCE = 2.0  # [m]
+_WALL, _SQUARE = (96, 128), 4  # [px] images of a wall, and its squares, by one of which the camera moves
+_FRAMES = 8  # of the wall
+_TOTAL = 3 * 7  # stages of a step, for two frames and an image average
+
+
+class _Stages:
+    """Reports the stages of a step (``ufmstar_torch.steps.step_parts.StepObserver``) to ``progress``, as in
+    :func:`warm_up`, with their ``total`` number."""
+
+    def __init__(self, progress: Callable[[int, int], object] | None, total: int) -> None:
+        self._progress, self._total, self._done = progress, total, -1
+        self.stage("")
+
+    def stage(self, name: str) -> None:
+        """Report another completed stage, at most ``total``."""
+        self._done += 1
+        if self._progress is not None:
+            self._progress(min(self._done, self._total), self._total)
+
+
+def warm_up(
+    module: Any,
+    size: tuple[int, int],
+    streams: int,
+    progress: Callable[[int, int], object] | None = None,
+    also: Sequence[Callable[[], object]] = (),
+) -> None:
+    """Run a module on two frames of ``size`` (H, W) and an image average; see ``UfMStar.warm_up``.
+
+    Args:
+        module: a ``UfMStar`` before its first frame; its state changes.
+        size, streams, progress: see ``UfMStar.warm_up``.
+        also: functions that call further kernels to compile.
+
+    Raises:
+        ValueError: a size or number of streams that is not positive.
+    """
+    require_size(size, streams)
+    if progress is not None and not callable(progress):
+        raise TypeError(f"progress must be a function of two numbers or None, got {type(progress).__name__}")
+    height, width = size
+    config, device = module.config, module.mean.device
+    distance = min(_DISTANCE, config.segment.depth_limit)
+    depth = torch.full((streams, height, width), distance, device=device)
+    pose = torch.eye(4)
+    K = camera_of(size)
+    features = depth.new_zeros(streams, config.features, height, width) if config.features else None
+    aleatoric = depth if config.aleatoric_in_h else None
+    corner = depth[:, 0, :1]
+    anchors = None
+    if config.anchors is not None:
+        anchors = Anchors(torch.zeros(streams, 1, 2, device=device), corner, 1e-4 * corner)
+    with warnings.catch_warnings(), _no_collection():
+        warnings.simplefilter("ignore", UserWarning)  # a small image has no segment
+        stages = _Stages(progress, _TOTAL + len(also))
+        module.observer = stages
+        for _ in range(2):  # the fusion needs a mixture, from the second frame on
+            module(depth, pose, K, aleatoric, features=features, **({} if anchors is None else {"anchors": anchors}))
+        module.mean_uncertainty(depth, pose, K, aleatoric, features=features, pixels=1)
+        for function in also:
+            function()
+            stages.stage("")
+
+
+def require_size(size: tuple[int, int], streams: int) -> None:
+    """Raise a TypeError or ValueError unless ``size`` is (H, W) and all three numbers are positive."""
+    arguments.require_size("size", size)
+    require_whole("streams", streams, 1)
+
+
+def camera_of(size: tuple[int, int]) -> Tensor:
+    """[3, 3] intrinsics [px] of a camera with images of ``size`` (H, W), 53 degrees wide."""
+    height, width = size
+    return torch.tensor([[float(width), 0, width / 2], [0, float(width), height / 2], [0, 0, 1]])
+
+
+def along_wall(evidence: LandmarkTracker | DenseEvidence) -> None:
+    """Compile the kernels of a new source of landmarks: run it on a camera's way along a textured wall."""
+    height, width = _WALL
+    squares = np.random.default_rng(0).integers(0, 256, (height // _SQUARE, width // _SQUARE + _FRAMES, 3), np.uint8)
+    wall, K = squares.repeat(_SQUARE, 0).repeat(_SQUARE, 1), camera_of(_WALL).double().numpy()
+    for frame in range(_FRAMES):
+        T_world_cam = np.eye(4)
+        T_world_cam[0, 3] = frame * _SQUARE / width * evidence.config.start_depth
+        evidence.update(wall[:, frame * _SQUARE :][:, :width].copy(), T_world_cam, K)
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Disable garbage collection, which takes a tenth of a compilation's time; collect afterwards, because a collection
+    during a later frame would take half a second."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+            gc.collect()

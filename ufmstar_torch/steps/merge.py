@@ -1,0 +1,312 @@
+"""Reduction of the mixture with little change to the regressed map: an extension, not in the paper (``config.merge``).
+
+The paper's method only adds components, and a surface that each view segments differently collects dozens of them.
+Every ``merge.every`` frames, two rules reduce the mixture; both are pure functions of it.
+
+**Join.** Two components become one with their joint moments,
+
+    pi = pi_i + pi_j,   a = pi_i / pi,   mu = a mu_i + (1-a) mu_j,   features likewise,
+    W = W_i + W_j,      m = (W_i m_i + W_j m_j) / W,                 n = n_i + n_j,
+    Sigma = a Sigma_i + (1-a) Sigma_j + a (1-a) (mu_i - mu_j)(mu_i - mu_j)^T,
+
+which preserve the sums of pi, pi mu, pi (Sigma + mu mu^T) and W m over the mixture (in the paper W = pi); the reference
+view is that of the heavier component. Runnalls (IEEE TAES 43, 2007) bounds the Kullback-Leibler divergence of the
+reduced mixture from the original; per pixel of the lighter component, the bound is
+
+    l(i, j) = [log|Sigma| - a log|Sigma_i| - (1-a) log|Sigma_j|] / (2 min(a, 1-a))   [nat],
+
+0 for equal components and KL(lighter || heavier) in the limit of a weightless lighter one. A pair within ``merge.loss``
+overlaps so much that the regression mixes the two anyway. In each round, pairs join that are mutually best.
+
+A component of which views were compared does not join a heavier one without, because the unmeasured surface would then
+count as measured.
+
+**Dissolve.** A component's weight share at its own points, s_k = mean of w_k(x) over the cubature points
+mu_k +- sqrt(3) L_k e_i (L_k L_k^T = Sigma_k), falls as others are observed repeatedly. Removing it changes a regressed
+quantity at these points by s_k times its difference to the others. Where s_k < ``merge.share`` and the remaining
+components have the rest of the weight, they receive its weight, m, features and anchors' sums, in proportion to their
+shares at these points. Their means and covariances do not change.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.frames.extension import Extension, FrameExtension, Total
+from ufmstar_torch.frames.frame import FrameInput
+from ufmstar_torch.frames.output import StepOutput
+from ufmstar_torch.gaussians.fixed_order import total
+from ufmstar_torch.gaussians.gaussian import cholesky3, floor_covariance, inverse_lower3, storage_floor
+from ufmstar_torch.gaussians.mixture import GaussianMixture
+from ufmstar_torch.gaussians.state import UfMStarState
+from ufmstar_torch.steps.regress import shares
+
+# Most pairs, or points x components, evaluated at a time: bounds the temporary memory to some 100 MB.
+_CHUNK = 2**19
+# Cubature points mu +- sqrt(3) L e_i, which have the component's mean and covariance.
+_POINTS = 6
+_REACH = 3**0.5
+# A component is omitted at another's point if its density is below this share of the other's density there. K omitted
+# components change a share by less than K times this.
+_LEAST_SHARE = 1e-9
+# The components of one stream: the fields of its mixture and "sums" [n, C], in float64.
+Components = dict[str, Tensor]
+
+
+class MergeExtension(Extension):
+    """Merging every ``merge.every`` frames. ``config``: with ``merge``."""
+
+    def __init__(self, config: UfMStarConfig) -> None:
+        self._config = config
+
+    def of_frame(
+        self,
+        frame: FrameInput,
+        network_variances: Sequence[Tensor],
+        argument: object,
+        before: Sequence[FrameExtension],
+        *,
+        dense: bool,
+    ) -> FrameExtension:
+        """Merging after this frame."""
+        return _MergeFrame(frame, self._config)
+
+
+class _MergeFrame(FrameExtension):
+    """Merging after one frame."""
+
+    changes_mixture = True
+
+    def __init__(self, frame: FrameInput, config: UfMStarConfig) -> None:
+        self._frame, self._config = frame, config
+
+    def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
+        """Merge the due streams, and count the components."""
+        state = merged(state, self._frame.fault == 0, self._config)
+        alone = state.mixture.valid & (state.views == 0)
+        counts = {"components": state.mixture.components, "single_view": alone.sum(1)}
+        return state, replace(out, statistics=replace(out.statistics, **counts))
+
+
+def merged(state: UfMStarState, fine: Tensor, config: UfMStarConfig) -> UfMStarState:
+    """The state after a frame, with the streams merged whose frame count is a multiple of ``merge.every``.
+
+    Args:
+        state: of B streams, after the step.
+        fine: [B] True where the frame was used.
+        config: with ``merge``.
+
+    Checking which streams are due synchronises with an accelerator.
+    """
+    assert config.merge is not None
+    if state.mean.device.type == "meta":
+        return state
+    due = fine & (state.frames % config.merge.every == 0)
+    if not bool(due.any()):
+        return state
+    sums = torch.cat([state.mean.new_zeros(*state.weight.shape, 0), *state.by_component.values()], -1)
+    mixture, sums = merge(state.mixture, sums, due, config)
+    parts = sums.split([value.shape[-1] for value in state.by_component.values()], -1) if state.by_component else ()
+    return state.with_tensors(mixture.tensors() | dict(zip(state.by_component, parts, strict=True)))
+
+
+def merge(mixture: GaussianMixture, sums: Tensor, due: Tensor, config: UfMStarConfig) -> tuple[GaussianMixture, Tensor]:
+    """Join, then dissolve; the remaining components move up and keep their order.
+
+    Args:
+        mixture: [B, K] in any frame: both rules are rigid invariants up to the choice of the cubature points.
+        sums: [B, K, C] sums over the observations of each component.
+        due: [B] True for the streams to merge; the others are unchanged.
+        config: ``merge``, which is not None, and ``prior_weight``.
+
+    Returns:
+        The mixture [B, K] and the sums. Components that neither joined nor received anything are unchanged to the last
+        bit.
+    """
+    assert config.merge is not None
+    every = mixture.tensors() | {"sums": sums}
+    after = {name: value.clone() for name, value in every.items()}
+    for b in due.nonzero().flatten().tolist():
+        n = int(mixture.components[b])
+        before = {name: v[b, :n].double() if v.is_floating_point() else v[b, :n] for name, v in every.items()}
+        reduced = dissolve(join(before, config.merge.loss, mixture.covariance.dtype), config)
+        for name, value in reduced.items():
+            after[name][b] = 0
+            after[name][b, : len(value)] = value.to(after[name].dtype)
+    sums = after.pop("sums")
+    return GaussianMixture(**after), sums
+
+
+def join(g: Components, limit: float, stored: torch.dtype) -> Components:
+    """Join mutually best pairs, in rounds, until no pair is within the limit; the first of a pair holds the result.
+
+    Args:
+        g: n components.
+        limit: largest loss l of a pair [nat].
+        stored: dtype to which the joint covariances will be rounded.
+    """
+    n = len(g["weight"])
+    fresh = torch.ones(n, dtype=torch.bool, device=g["weight"].device)
+    joined, pairs, loss = ~fresh, torch.zeros(2, 0, dtype=torch.int64, device=fresh.device), g["weight"][:0]
+    while True:
+        found = _close_pairs(g, fresh, limit)
+        pairs, loss = torch.cat([pairs, found[0]], 1), torch.cat([loss, found[1]])
+        mutual = _mutual(pairs, loss, len(fresh))
+        if not bool(mutual.any()):
+            break
+        stays, goes = pairs[:, mutual]
+        first, second = ({name: value[which] for name, value in g.items()} for which in (stays, goes))
+        common = _joint(first, second)
+        fresh = torch.zeros_like(fresh).index_fill(0, stays, True)
+        remains = torch.ones_like(fresh).index_fill(0, goes, False)
+        g = {name: value.index_copy(0, stays, common[name])[remains] for name, value in g.items()}
+        same = (remains & ~fresh)[pairs].all(0)
+        pairs, loss = (remains.cumsum(0) - 1)[pairs[:, same]], loss[same]
+        joined, fresh = (joined | fresh)[remains], fresh[remains]
+    covariance = g["covariance"][joined]
+    floored = floor_covariance(covariance, storage_floor(covariance, stored))
+    return g | {"covariance": g["covariance"].index_copy(0, joined.nonzero().flatten(), floored)}
+
+
+def _close_pairs(g: Components, fresh: Tensor, limit: float) -> tuple[Tensor, Tensor]:
+    """Pairs i < j [2, P] within the limit with at least one ``fresh`` [n] component, and their losses [P].
+
+    A bound excludes most pairs without their determinant: log|Sigma| >= a log|Sigma_i| + b log|Sigma_j| +
+    log(1 + a b q) with q >= d_x^2 / (a Sigma_i + b Sigma_j)_xx for every axis, so l > limit where
+    q > (exp(2 min(a, b) limit) - 1) / (a b), which is at most 4 (exp(limit) - 1).
+    """
+    slot = torch.arange(len(fresh), device=fresh.device)
+    reach, weight, mean = 4 * math.expm1(limit) * (1 + 1e-9), g["weight"], g["mean"]
+    spread, log_det = torch.diagonal(g["covariance"], dim1=-2, dim2=-1), _log_det(g["covariance"])
+    found = [(slot[:0].expand(2, 0), weight[:0])]
+    for i in slot[fresh].split(max(1, _CHUNK // max(1, len(fresh)))):
+        close = ~fresh | (slot > i[:, None])  # a pair of two fresh components once
+        share = weight[i, None] / (weight[i, None] + weight)
+        for axis in range(3):
+            variance = share * spread[i, None, axis] + (1 - share) * spread[:, axis]
+            close &= (mean[i, None, axis] - mean[:, axis]).square() <= reach * variance
+        row, j = close.nonzero().unbind(1)
+        pair = torch.stack([torch.minimum(i[row], j), torch.maximum(i[row], j)])
+        first, second = ({name: value[which] for name, value in g.items()} for which in pair)
+        a, b = _parts(first, second)
+        volume = _log_det(_joint(first, second)["covariance"]) - a * log_det[pair[0]] - b * log_det[pair[1]]
+        loss = 0.5 * volume / torch.minimum(a, b)
+        lighter_first = first["weight"] < second["weight"]
+        lighter = torch.where(lighter_first, first["views"], second["views"])
+        heavier = torch.where(lighter_first, second["views"], first["views"])
+        within = (loss <= limit) & ~((lighter > 0) & (heavier == 0))
+        found.append((pair[:, within], loss[within]))
+    return torch.cat([pair for pair, _ in found], 1), torch.cat([loss for _, loss in found])
+
+
+def _mutual(pairs: Tensor, loss: Tensor, n: int) -> Tensor:
+    """[P] True for mutually best pairs; a component's best partner has the least loss, on a tie the lowest index."""
+    ends, others, twice = pairs.flatten(), pairs.flip(0).flatten(), loss.repeat(2)
+    best = loss.new_full((n,), torch.inf).scatter_reduce(0, ends, twice, "amin")
+    others = torch.where(twice == best[ends], others, n)
+    partner = torch.full((n,), n, device=ends.device).scatter_reduce(0, ends, others, "amin")
+    return (partner[pairs[0]] == pairs[1]) & (partner[pairs[1]] == pairs[0])
+
+
+def _parts(g: Components, h: Components) -> tuple[Tensor, Tensor]:
+    """a and 1 - a."""
+    both = g["weight"] + h["weight"]
+    return g["weight"] / both, h["weight"] / both
+
+
+def _joint(g: Components, h: Components) -> Components:
+    """The components with the joint moments of pairs."""
+    a, b = _parts(g, h)
+
+    def average(name: str) -> Tensor:
+        shape = (-1, *[1] * (g[name].dim() - 1))
+        return a.view(shape) * g[name] + b.view(shape) * h[name]
+
+    d = g["mean"] - h["mean"]
+    between = (a * b)[:, None, None] * d[:, :, None] * d[:, None, :]
+    compared = g["compared"] + h["compared"]
+    weighted = g["compared"] * g["disagreement"] + h["compared"] * h["disagreement"]
+    return {name: average(name) for name in ("mean", "features")} | {
+        "covariance": average("covariance") + between,
+        "disagreement": torch.where(compared > 0, weighted / compared, torch.zeros_like(weighted)),
+        "reference": torch.where((a >= b)[:, None], g["reference"], h["reference"]),
+        **{name: g[name] + h[name] for name in ("weight", "compared", "views", "sums")},
+    }
+
+
+def _log_det(S: Tensor) -> Tensor:
+    """log|S| of positive definite S [..., 3, 3], by the pivots of its Cholesky factor."""
+    p0 = S[..., 0, 0]
+    u, v = S[..., 1, 0] / p0, S[..., 2, 0] / p0
+    p1 = S[..., 1, 1] - u * S[..., 1, 0]
+    w = S[..., 2, 1] - v * S[..., 1, 0]
+    p2 = S[..., 2, 2] - v * S[..., 2, 0] - w * w / p1
+    return torch.log(p0 * p1 * p2)
+
+
+def self_shares(g: Components, prior_weight: float) -> Tensor:
+    """[n] s_k, each component's mean weight share at its own cubature points, by the exact sum over the components."""
+    mean, points, whitening = g["mean"], _cubature(g), inverse_lower3(cholesky3(g["covariance"]))
+    sigma = torch.diagonal(g["covariance"], dim1=-2, dim2=-1).sqrt()
+    log_peak = torch.diagonal(whitening, dim1=-2, dim2=-1).log().sum(-1) - 1.5 * math.log(2 * math.pi)
+    log_peak = log_peak + g["weight"].log()
+    evidence = mean.new_full((len(mean), _POINTS), prior_weight)
+    for i in torch.arange(len(mean), device=mean.device).split(max(1, _CHUNK // max(1, len(mean)))):
+        # Component i has the density peak exp(-3/2) at its six points. Beyond ``radius`` standard deviations, the
+        # density of another component falls below _LEAST_SHARE of that.
+        radius = (2 * (log_peak - log_peak[i, None] + 1.5 - math.log(_LEAST_SHARE))).clamp_min(0).sqrt()
+        near = torch.ones_like(radius, dtype=torch.bool)
+        for axis in range(3):
+            gap = (mean[i, None, axis] - mean[:, axis]).abs()
+            near &= gap <= _REACH * sigma[i, None, axis] + radius * sigma[:, axis]
+        row, k = near.nonzero().unbind(1)
+        squared = ((points[i[row]] - mean[k, None]) @ whitening[k].mT).square().sum(-1)
+        evidence.index_add_(0, i[row], torch.exp(log_peak[k, None] - 0.5 * squared))
+    return (torch.exp(log_peak - 1.5)[:, None] / evidence).mean(1)
+
+
+def _cubature(g: Components) -> Tensor:
+    """[n, 6, 3] mu + sqrt(3) L e_i for i = 0, 1, 2, then mu - sqrt(3) L e_i [m]."""
+    steps = _REACH * cholesky3(g["covariance"]).mT
+    return g["mean"][:, None] + torch.cat([steps, -steps], dim=1)
+
+
+def _mean_shares(g: Components, points: Tensor, config: UfMStarConfig) -> Tensor:
+    """[P, n] shares of all components at points [P, 6, 3], their mean over the six."""
+    mixture = GaussianMixture(**{name: value[None] for name, value in g.items() if name != "sums"})
+    exact, parts = config.replace(regression="exact"), points.split(max(1, _CHUNK // (_POINTS * mixture.capacity)))
+    share = torch.cat([shares(mixture, part.flatten(0, 1)[None], exact)[0] for part in parts])
+    return total(share.unflatten(0, (-1, _POINTS)), 1) / _POINTS
+
+
+def dissolve(g: Components, config: UfMStarConfig) -> Components:
+    """Remove the components whose share at their own points is small, and distribute their sums to the others."""
+    assert config.merge is not None
+    weak = self_shares(g, config.prior_weight) < config.merge.share
+    if not bool(weak.any()):
+        return g
+    share = _mean_shares(g, _cubature(g)[weak], config) * ~weak
+    rest = total(share, 1)
+    enough = rest >= 1 - config.merge.share
+    split = share[enough] / rest[enough, None]
+    goes = weak.nonzero().flatten()[enough]
+
+    # Averages, each with its weight; the others are sums.
+    means = (("weight", "features"), ("compared", "disagreement"))
+    products = [g[w][:, None] * g[name].view(len(weak), -1) for w, name in means]
+    gifts = torch.cat([g["weight"][:, None], g["compared"][:, None], *products, g["sums"]], -1)[goes]
+    gain = torch.stack([total(split * gift[:, None], 0) for gift in gifts.unbind(-1)], -1)
+    weight, compared, *more, learnt = gain.split([1, 1, *(p.shape[1] for p in products), g["sums"].shape[1]], -1)
+    after = g | {"sums": g["sums"] + learnt}
+    for (w, name), gained, product, added in zip(means, (weight, compared), products, more, strict=True):
+        after[w] = g[w] + gained[:, 0]
+        mean = (product + added) / after[w].clamp_min(torch.finfo(gain.dtype).tiny)[:, None]
+        after[name] = torch.where(gained > 0, mean, g[name].view(mean.shape)).view(g[name].shape)
+    remains = torch.ones_like(weak).index_fill(0, goes, False)
+    return {name: value[remains] for name, value in after.items()}

@@ -1,0 +1,120 @@
+"""Means over a sample of an image's pixels, for active learning (section "Compute- and memory efficiency")."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ufmstar_torch.frames.arguments import require_number, require_whole
+from ufmstar_torch.frames.output import MeanUncertainty, SampleStatistics, StepOutput
+from ufmstar_torch.gaussians.fixed_order import total
+from ufmstar_torch.steps import unmeasured
+
+_MAPS = ("variance", "disagreement", "aleatoric", "epistemic", "anchored", "depth")
+
+
+def mean_uncertainty(out: StepOutput, maps: Mapping[str, Tensor | None], used: Tensor) -> MeanUncertainty:
+    """Averages of V, M, A, E and B over the sampled pixels.
+
+    Args:
+        out: of the step on the sample [B, n].
+        maps: [B, n] the variance, its parts and the depth, by name; None = no statistics.
+        used: [B, n] True for the pixels to average.
+    """
+    sampled = {name: torch.where(used, value, torch.nan) for name in _MAPS if (value := maps.get(name)) is not None}
+    each = sample_statistics(torch.stack(list(sampled.values())))
+    by_map = {name: SampleStatistics(*(value[i] for value in vars(each).values())) for i, name in enumerate(sampled)}
+    count, variance = used.sum(1), by_map["variance"]
+    # finite population correction: a sample of all pixels has no error
+    unsampled = 1 - count / out.statistics.valid_pixels.clamp_min(1)
+    return MeanUncertainty(
+        total=variance,
+        disagreement=by_map["disagreement"],
+        aleatoric=by_map.get("aleatoric"),
+        epistemic=by_map.get("epistemic"),
+        anchored=by_map.get("anchored"),
+        depth=by_map["depth"],
+        standard_error=(variance.variance / variance.pixels * unsampled).sqrt(),
+        measured=((out.measured >= unmeasured.HALF) & used).sum(1) / count,
+        statistics=out.statistics,
+    )
+
+
+def sample_size(size: tuple[int, int], pixels: int | None, fraction: float | None) -> int:
+    """Number of pixels to sample in an image of ``size`` (H, W): ``pixels``, or a ``fraction`` of all; default 1000.
+
+    Raises:
+        ValueError: both arguments, or one out of range.
+    """
+    every = size[0] * size[1]
+    if pixels is not None and fraction is not None:
+        raise ValueError("pass pixels or fraction, not both")
+    if fraction is not None:
+        if not 0 < require_number("fraction", fraction) <= 1:
+            raise ValueError(f"fraction must lie in (0, 1], got {fraction}")
+        return max(1, round(fraction * every))
+    if pixels is None:
+        return min(1000, every)
+    if isinstance(pixels, bool) or not isinstance(pixels, int | np.integer) or not 1 <= pixels <= every:
+        raise ValueError(f"pixels must be a whole number from 1 to H*W = {every}, got {pixels!r}")
+    return int(pixels)
+
+
+def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:
+    """A uniform sample of the valid pixels of each image, without replacement.
+
+    The first ``count`` valid pixels in a random order, which depends only on the seed and the number of pixels: equal
+    streams of a batch draw the same pixels.
+
+    Args:
+        valid: [B, H, W] bool.
+        count: pixels per image, 1 <= count <= H W.
+        seed: of the random order, drawn on the CPU so that all devices sample the same pixels.
+
+    Returns:
+        index [B, count] into the flattened image and used [B, count]; with fewer than ``count`` valid pixels the rest
+        of ``used`` is False.
+    """
+    seed, flat = require_whole("seed", seed), valid.flatten(1)
+    pixels, on_cpu = flat.shape[1], valid.device.type == "cpu"
+    requested = 2 * count if on_cpu else pixels  # elsewhere, counting the valid ones would synchronise
+    while True:
+        order = random_order(pixels, seed)[:requested].to(valid.device, non_blocking=not on_cpu)
+        usable = flat[:, order]
+        if requested >= pixels or bool((usable.sum(1) >= count).all()):
+            break
+        requested *= 2
+    rank_invalid = usable.sum(1, keepdim=True) + (~usable).cumsum(1) - 1
+    position = torch.where(usable, usable.cumsum(1) - 1, rank_invalid)  # valid pixels first, both in random order
+    index = torch.empty_like(position).scatter_(1, position, order.expand_as(position))[:, :count]
+    return index, torch.gather(flat, 1, index)
+
+
+def sample_statistics(values: Tensor) -> SampleStatistics:
+    """Statistics of maps over a sample of pixels.
+
+    Args:
+        values: [..., B, n], NaN = no value.
+
+    Returns:
+        Each statistic [..., B].
+    """
+    present = ~values.isnan()
+    count = present.sum(-1)
+    mean = total(torch.where(present, values, 0), -1) / count  # 0/0 = NaN without a pixel
+    squares = total(torch.where(present, (values - mean[..., None]) ** 2, 0), -1)
+    variance = torch.where(count > 1, squares / (count - 1).clamp_min(1), torch.nan)
+    largest = torch.where(present, values, -torch.inf).amax(-1)
+    return SampleStatistics(
+        mean, variance, values.nanmedian(-1).values, torch.where(count > 0, largest, torch.nan), count
+    )
+
+
+@functools.lru_cache(maxsize=4)  # the draw costs more than a sample
+def random_order(pixels: int, seed: int) -> Tensor:
+    """A permutation of the numbers below ``pixels``; the caller must not modify it."""
+    return torch.randperm(pixels, generator=torch.Generator().manual_seed(seed))

@@ -1,0 +1,192 @@
+"""Steps 2 to 5 for one image: a pure function from state and frame to state and output.
+
+The mixture is stored in the frame of each stream's first camera. Poses are converted to that frame in float64, so large
+world coordinates never reach the float32 state, and components that a frame does not update never change.
+
+``UfMStar`` calls a :class:`Step`; :func:`step` is the reference. Its kernels can be replaced individually
+(``step_parts``); another implementation of the whole step has the same signature.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.frames.extension import NONE, FrameExtensions
+from ufmstar_torch.frames.frame import FrameInput
+from ufmstar_torch.frames.output import FrameStatistics, StepOutput
+from ufmstar_torch.gaussians.camera import focal_and_centre, relative_pose
+from ufmstar_torch.gaussians.gaussian import pixel_footprint, storage_floor
+from ufmstar_torch.gaussians.mixture import GaussianMixture
+from ufmstar_torch.gaussians.state import UfMStarState
+from ufmstar_torch.steps import fuse, regress, unmeasured
+from ufmstar_torch.steps.correspond import Correspondence
+from ufmstar_torch.steps.disagree import with_overlap_disagreement
+from ufmstar_torch.steps.segment_input import SegmentInput
+from ufmstar_torch.steps.step_parts import REFERENCE, Kernels, StepObserver
+
+
+class Step(Protocol):
+    """Steps 2 to 5 for one image; see :func:`step`."""
+
+    def __call__(
+        self,
+        state: UfMStarState,
+        frame: FrameInput,
+        config: UfMStarConfig,
+        *,
+        pixels: Tensor | None = None,
+        smooth: bool = True,
+        extensions: FrameExtensions = NONE,
+        observer: StepObserver | None = None,
+    ) -> tuple[UfMStarState, StepOutput]: ...
+
+
+def step(
+    state: UfMStarState,
+    frame: FrameInput,
+    config: UfMStarConfig,
+    *,
+    pixels: Tensor | None = None,
+    smooth: bool = True,
+    extensions: FrameExtensions = NONE,
+    observer: StepObserver | None = None,
+    kernels: Kernels = REFERENCE,
+    grow: bool = True,
+) -> tuple[UfMStarState, StepOutput]:
+    """Segment, correspond, fuse, regress (section "Uncertainty from Motion*", steps 2 to 5).
+
+    Args:
+        state: of the previous image; not modified.
+        frame: checked input of B streams.
+        config: of UfM*.
+        pixels: [B, n] indices into the flattened image to regress only there; None = every pixel.
+        smooth: apply the exponential moving average.
+        extensions: extensions during this frame.
+        observer: called after every stage.
+        kernels: implementation of each part.
+        grow: whether the mixture may get more slots; False: the caller has provided enough.
+
+    Returns:
+        The new state and the output. For a stream with a faulty frame, the state is unchanged and the output is NaN.
+    """
+    stage = unobserved if observer is None else observer.stage
+    fine = frame.fault == 0
+    first = torch.where((fine & ~state.started)[:, None, None], frame.T_world_cam, state.T_world_first)
+
+    current_cam = _segment(frame, config, kernels, state.covariance.dtype)
+    stage("segment")
+
+    mixture = state.mixture
+    R_cam, t_cam = relative_pose(first, frame.T_world_cam)
+    previous_cam = mixture.to(torch.float64).rigid(R_cam, t_cam)
+    pairs = kernels.correspond(previous_cam, current_cam, frame.intrinsics, frame.size, config)
+    stage("correspond")
+
+    if config.disagreement == "overlap":
+        pairs = with_overlap_disagreement(pairs, previous_cam, current_cam)
+    matched = pairs.match.any(dim=2)
+    # A Gaussian nearer than the near plane is not appended: it could never be matched.
+    far_enough = current_cam.mean[..., 2] > config.near_plane
+    new = current_cam.valid & far_enough & ~matched
+    current_first = current_cam.rigid(*relative_pose(frame.T_world_cam, first))
+    needed, rounds = _room(mixture, pairs, new, config, grow)
+    mixture = mixture.grown(needed, config.max_components)
+    centre = relative_pose(frame.T_world_cam, first)[1]
+    member = torch.zeros_like(centre[:, 0]) if frame.member is None else frame.member
+    view = torch.cat([centre, member[:, None]], 1)
+    mixture = kernels.fuse(mixture, current_first, pairs.padded(mixture.capacity), view, config, rounds=rounds)
+    stage("fuse")
+
+    sums, limit, gone = dict(state.by_component), config.max_components, torch.zeros_like(state.frames)
+    if limit is not None and needed >= limit:
+        mixture, sums, _, gone = fuse.make_room(mixture, sums, mixture.components, new.sum(1), centre, limit)
+    mixture, dropped = fuse.append(mixture, current_first, new, view, config)
+    mixture_cam = mixture.to(torch.float64).rigid(R_cam, t_cam)
+    changed, mixture_cam = extensions.before_regression({**state.by_stream, **sums}, mixture_cam, regress.distribute)
+    mixture_cam = unmeasured.before_regression(mixture_cam)
+    stage("append")
+
+    result = kernels.regress_image(mixture_cam, frame.depth, frame.intrinsics, frame.valid, config, pixels)
+    at_pixels = regress.at_pixels(frame.depth, pixels)
+    result, measured = unmeasured.after_regression(result, at_pixels, config, frame.informative)
+    result = extensions.after_regression(result)
+    stage("regress")
+
+    counts = {
+        "components": mixture.components,
+        "segments": current_cam.components,
+        "matched": matched.sum(1),
+        "pairs": pairs.match.sum((1, 2)),
+        "new": new.sum(1) - dropped,
+        "dropped": gone + dropped + (current_cam.valid & ~far_enough).sum(1),
+        "valid_pixels": frame.valid.sum((1, 2)),
+        "unmeasured": (measured < unmeasured.HALF).flatten(1).sum(1),
+        "single_view": (mixture.valid & (mixture.views == 0)).sum(1),
+    }
+    disagreement, smoothed = result.disagreement, state.smoothed
+    if smooth and config.ema_alpha < 1.0:
+        smoothed, disagreement = regress.moving_average(smoothed, disagreement, frame.size, config.ema_alpha, pixels)
+    updated = state.with_tensors({
+        **mixture.tensors(), **sums, **changed, "T_world_first": first, "started": state.started | fine,
+        "frames": state.frames + fine, "skipped": state.skipped + ~fine, "smoothed": smoothed,
+    })  # fmt: skip
+    statistics = frame_statistics(frame, counts)
+    out = StepOutput(disagreement, result.features, measured, current_cam, statistics)
+    stage("average")
+    return updated, out
+
+
+def frame_statistics(frame: FrameInput, counts: Mapping[str, Tensor]) -> FrameStatistics:
+    """The statistics of a frame: ``counts`` from the step, the others from the check of the frame."""
+    return FrameStatistics(
+        **counts,
+        beyond=frame.beyond,
+        out_of_range=frame.out_of_range,
+        fault=frame.fault,
+        rotation_deviation=frame.rotation_deviation,
+    )
+
+
+def unobserved(name: str) -> None:
+    """The stage callback without an observer: does nothing."""
+
+
+def _segment(frame: FrameInput, config: UfMStarConfig, kernels: Kernels, stored: torch.dtype) -> GaussianMixture:
+    """Step 2: C_i in the camera frame, float64.
+
+    SPGF's raw moments have no floor. Eigenvalues are raised to the variance across one pixel at that depth, (z/f)^2/12,
+    and to the least value that survives rounding to the mixture's dtype ``stored``, as in the fusion.
+    """
+    mixture = kernels.spgf(SegmentInput.of_frame(frame, config))[0].to(torch.float64)
+    fx, fy, _, _ = focal_and_centre(frame.intrinsics)
+    # Gaussians nearer than the near plane are never matched; clamping z keeps their floor above zero.
+    z = mixture.mean[..., 2].clamp_min(config.near_plane)
+    floor = pixel_footprint(z, torch.minimum(fx, fy)[:, None])
+    floor = torch.maximum(floor, storage_floor(mixture.covariance, stored))
+    floor = torch.where(mixture.valid, floor, torch.zeros_like(floor))  # an empty slot holds zeros
+    return mixture.replace(covariance=kernels.floor_covariance(mixture.covariance, floor))
+
+
+def _room(
+    mixture: GaussianMixture, pairs: Correspondence, new: Tensor, config: UfMStarConfig, grow: bool
+) -> tuple[int, int | None]:
+    """The number of slots that the frame needs, and a bound on the matches of a component (None: the kernel reads it).
+
+    Growth needs the step's only synchronisation with an accelerator, a read of two numbers. If the capacity cannot
+    grow, the static bounds are returned without a read. Raises ValueError: growth on the meta device.
+    """
+    device, limit = mixture.mean.device.type, config.max_components
+    if not grow or (device != "cpu" and limit is not None and mixture.capacity >= limit):
+        return mixture.capacity, pairs.match.shape[1]
+    if device == "meta":
+        raise ValueError("device 'meta' needs max_components <= initial_capacity")
+    needed = mixture.components + new.sum(1)
+    if device == "cpu":
+        return int(needed.max()), None
+    slots, most = torch.stack([needed, pairs.match.sum(1).amax(1)]).amax(1).tolist()
+    return slots, most

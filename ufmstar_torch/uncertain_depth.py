@@ -1,0 +1,668 @@
+"""The whole pipeline: networks and their alternation (step 1), anchors, UfM* and the posterior."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
+from typing import TYPE_CHECKING, Any, Literal, Self
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ufmstar_torch.anchors import landmarks
+from ufmstar_torch.anchors.anchors import Anchors, require_anchors
+from ufmstar_torch.anchors.pose_check import PoseCheck
+from ufmstar_torch.anchors.streams import SourceLike, StreamLandmarks, as_bytes
+from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
+from ufmstar_torch.frames.arguments import (
+    Array,
+    CameraLike,
+    ImageLike,
+    as_device,
+    as_image,
+    as_intrinsics,
+    as_pose,
+    as_tensor,
+    require_flag,
+    require_kind,
+    require_whole,
+)
+from ufmstar_torch.frames.image_check import ImageCheck
+from ufmstar_torch.frames.networks import (
+    SAMPLES,
+    NetworksInTurn,
+    Preprocess,
+    in_unit_range,
+    modules_of,
+    shared_preprocess,
+    weights_mark,
+)
+from ufmstar_torch.frames.output import FrameStatistics, MeanUncertainty, UfMStarOutput
+from ufmstar_torch.frames.prediction import DepthPrediction
+from ufmstar_torch.frames.warnings import LOGGER
+from ufmstar_torch.posterior.recalibrate import Recalibration
+from ufmstar_torch.runtime.one_caller import OneCaller, one_caller
+from ufmstar_torch.runtime.stateful import outliving
+from ufmstar_torch.runtime.warm_up import along_wall, camera_of, require_size, warm_up
+from ufmstar_torch.ufmstar import UfMStar
+
+_BLACK = {torch.uint8: 1, torch.float32: 1 / 255, torch.float64: 1 / 255}  # largest value of a black image
+_MARK = "weights_mark"  # key of the checksum of the networks' weights in a state
+_BRIGHT = 8.0  # largest value of a normalised image, by a wide margin
+_MISSED = "UfM* alone, without anchors and the depth that the posterior corrects with them: %s"
+
+
+@dataclass(frozen=True)
+class UncertainPrediction:
+    """The depth of an image and its variance: the posterior's, or, without a posterior, the network's depth with the
+    variance of UfM*. Before a stream's first anchor, the posterior's depth is the network's, with a large variance.
+
+    Attributes:
+        prediction: the network's output (for "full": the predictive mean, mean A and E over the members).
+        ufm: the output of UfM* for the network's depth: V, M, A, E and B, ``measured`` and the counts.
+        member: index of the network that was run; None if all were, or none.
+    """
+
+    prediction: DepthPrediction
+    ufm: UfMStarOutput
+    member: int | None
+
+    @property
+    def depth(self) -> Tensor:
+        """[B, H, W] [m]; the posterior's is NaN where not valid."""
+        corrected = self.ufm.posterior_depth
+        return self.prediction.depth if corrected is None else corrected
+
+    @property
+    def intrinsics(self) -> Tensor:
+        """[B, 3, 3] of the depth map [px]."""
+        return self.prediction.K
+
+    @property
+    def variance(self) -> Tensor:
+        """[B, H, W] of ``depth`` [m^2], NaN where not valid."""
+        corrected = self.ufm.posterior_variance
+        return self.ufm.variance if corrected is None else corrected
+
+    @property
+    def std(self) -> Tensor:
+        """[B, H, W] square root of ``variance`` [m]."""
+        return self.variance.sqrt()
+
+    @property
+    def disagreement(self) -> Tensor:
+        """[B, H, W] M [m^2]."""
+        return self.ufm.disagreement
+
+    def interval(self, level: float) -> tuple[Tensor, Tensor]:
+        """As :meth:`UfMStarOutput.interval`, [B, H, W] [m]."""
+        return self.ufm.interval(level)
+
+    def probability_nearer(self, than: float | Tensor) -> Tensor:
+        """As :meth:`UfMStarOutput.probability_nearer`, [B, H, W]."""
+        return self.ufm.probability_nearer(than)
+
+    def probability_between(self, near: float | Tensor, far: float | Tensor) -> Tensor:
+        """As :meth:`UfMStarOutput.probability_between`, [B, H, W]."""
+        return self.ufm.probability_between(near, far)
+
+
+@dataclass(frozen=True)
+class _Predicted:
+    """A prediction that is being copied to UfM*'s device.
+
+    Attributes:
+        image, pose, intrinsics: the image and its camera, as tensors.
+        prediction, member: as in :class:`UncertainPrediction`.
+        features: [B, F, H, W] for UfM*, or None.
+        ready: recorded after the copies; None = no copy to wait for.
+    """
+
+    image: Tensor
+    pose: Tensor
+    intrinsics: Tensor
+    prediction: DepthPrediction
+    member: int | None
+    features: Tensor | None
+    ready: torch.cuda.Event | None
+
+
+@one_caller(
+    "forward",
+    "update",
+    "mean_uncertainty",
+    "_predicted",
+    "_fused",
+    "reset",
+    "load_state_dict",
+    "_save_to_state_dict",
+    "_apply",
+)
+class UncertainDepth(NetworksInTurn):
+    """Depth and variance from any pretrained network(s), for images with pose and intrinsics.
+
+    Args:
+        networks: one network or a sequence of them (an ensemble's members; BatchEnsemble members as separate
+            callables); None: pass predictions to :meth:`update`. A network whose attribute ``stochastic`` is True
+            predicts another random sample for every image. Each network maps an image [B, 3, H, W] to a
+            :class:`DepthPrediction`; one with an attribute ``takes_intrinsics = True`` is called as ``network(x, K)``
+            with K [B, 3, 3] [px] of ``x``. ``ufmstar_torch.UncertainDepth`` also accepts everything that
+            ``ufmstar_torch.models.wrap_network`` accepts without further declarations: metric depth is assumed.
+        config: of UfM*; if ``segment.max_depth`` is None, it is set to the networks' (:attr:`max_depth`).
+        mode: "alternate" runs member n = i mod N (counted from 0) on image i; with one network this is the
+            single-model mode, and with a stochastic network the sampling-based mode. "full" runs every member (or
+            ``samples`` passes of a stochastic network) per image and takes the predictive mean, the mean aleatoric
+            variance, and the variance between the members as epistemic variance.
+        posterior: correct the depth and its variance with anchors. Sets the sections ``anchors`` and ``posterior`` of
+            ``config`` and, unless a source is passed, ``anchors="dense"``. Without OpenCV, and without networks, whose
+            images are searched, a warning states what is missed, and UfM* runs alone. False: UfM* alone; with
+            ``anchors``, B is added to its variance.
+        samples: number of stochastic passes per image in mode "full" with one network (MC-Dropout; the network must
+            sample in eval mode). None: the network is deterministic.
+        preprocess: maps image and intrinsics to the networks' input. "own": the networks' attribute ``preprocess``;
+            for networks without one, bytes become floats in [0, 1]. None = no preprocessing.
+        anchors: source of the anchors of every image: "corners" (tracked in the image), "dense" (searched in earlier
+            images), a file of landmarks, each for every stream; or a
+            :class:`~ufmstar_torch.anchors.landmarks.LandmarkSource`; or a list with one source for each stream. Saved
+            and reset with the state. An image of another size or camera restarts it. None: "dense" for the posterior,
+            on images of bytes, or floats in [0, 1]; anchors that are passed with an image replace its search.
+        recalibration: a map of V, applied last (``Recalibration.from_json(FILE)``); None = no map.
+        check_poses: number of first images, of the first stream, that are compared with their poses and intrinsics by
+            tracked corners, 2 ms each. A warning states if another convention or delay of the poses, or K of another
+            image size, fits much better. 0 = none.
+        multiview_device: device of UfM* and of the results; None = the networks' device. "cpu", the paper's split, is
+            faster for one camera with the networks on a GPU. :meth:`stream` runs both devices at the same time.
+
+    The constructor puts the networks into eval mode; they run without gradients. A stochastic network must sample in
+    eval mode, as decoder dropout at test time does. A second thread that calls the module while another one is inside
+    gets a RuntimeError.
+
+    Raises:
+        TypeError: an argument is no network.
+        ValueError: no network, networks with different ``preprocess`` attributes, an unknown mode, or ``samples`` that
+            fit neither mode nor networks.
+
+    Example::
+
+        model = UncertainDepth(network)
+        for image, pose, intrinsics in video:  # [H, W, 3] uint8, [4, 4], [3, 3]
+            out = model(image, pose, intrinsics)
+            out.depth, out.std  # corrected [m]; the network's are in out.prediction, M, A, E and B in out.ufm
+    """
+
+    image_index: Tensor
+
+    def __init__(
+        self,
+        networks: Callable[..., Any] | Sequence[Callable[..., Any]] | None,
+        config: UfMStarConfig | None = None,
+        *,
+        mode: Literal["alternate", "full"] = "alternate",
+        posterior: bool = True,
+        samples: int | None = None,
+        preprocess: Preprocess | Literal["own"] | None = "own",
+        anchors: SourceLike | list[SourceLike] | tuple[SourceLike, ...] | None = None,
+        recalibration: Recalibration | None = None,
+        check_poses: int = 40,
+        multiview_device: torch.device | str | None = None,
+    ) -> None:
+        members, preprocess = ([], None) if networks is None else self.accepted(networks, preprocess)
+        single, posterior = len(members) == 1, require_flag("posterior", posterior)
+        if not isinstance(mode, str) or mode not in ("alternate", "full"):
+            raise ValueError(f"mode must be 'alternate' or 'full', got {mode!r}")
+        if samples is not None and (require_whole("samples", samples) < 2 or not single or mode != "full"):
+            raise ValueError("samples must be at least 2 and goes with one network in mode 'full'")
+        if mode == "full" and single and samples is None:
+            raise ValueError("mode 'full' needs several networks, or samples for a stochastic one")
+        if len({id(member) for member in members}) < len(members):
+            raise ValueError("networks must differ, got one of them twice: for passes of a stochastic one set samples")
+        super().__init__(members or None, samples=samples, preprocess=preprocess)
+        self._caller = OneCaller()
+        config = UfMStarConfig() if config is None else config
+        for name, value, kind in (("config", config, UfMStarConfig), ("recalibration", recalibration, Recalibration)):
+            if value is not None and not isinstance(value, kind):
+                raise TypeError(f"{name} must be a {kind.__name__} or None, got {type(value).__name__}")
+        self._by_default = posterior and anchors is None
+        if self._by_default and (missed := _missed(networks)):
+            self._by_default, posterior = False, config.anchors is not None
+            if networks is not None or not posterior:
+                LOGGER.warning(_MISSED, missed)
+        anchors = "dense" if self._by_default else anchors
+        if posterior or anchors is not None:
+            config = config.replace(anchors=config.anchors or AnchorConfig())
+        if posterior:
+            config = config.replace(posterior=config.posterior or PosteriorConfig())
+        mapped = () if recalibration is None else (recalibration,)
+        self.ufm = UfMStar(config.within(self.max_depth, self.states_confidence), extensions=mapped)
+        self.landmarks = None if anchors is None else StreamLandmarks(anchors)
+        self._unsearchable = False  # whether an image could not be searched for anchors
+        self._searched = False  # whether the source of anchors has processed the current image
+        # A source that searches the images compares their poses itself, but does not name the mistake.
+        searching = self.landmarks is not None and self.landmarks.searching and not self._by_default
+        if isinstance(check_poses, bool) or not isinstance(check_poses, int) or check_poses < 0:
+            raise ValueError(f"check_poses must be a number of images of at least 0, got {check_poses!r}")
+        self._pose_check = PoseCheck(0 if searching else check_poses, self.ufm.config.rotation_tolerance)
+        self._image_check = ImageCheck()
+        self.mode = mode
+        self.multiview_device = None if multiview_device is None else as_device("multiview_device", multiview_device)
+        self.register_buffer("image_index", torch.zeros((), dtype=torch.int64))
+        self._next = 0
+        self.register_state_dict_post_hook(_without_weights)
+
+    def accepted(
+        self, networks: object, preprocess: Preprocess | Literal["own"] | None
+    ) -> tuple[list[nn.Module], Preprocess | None]:
+        """Convert the networks to modules, and resolve their preprocessing; a subclass may accept more types.
+
+        Raises:
+            TypeError, ValueError: see the class.
+        """
+        members = modules_of(networks)
+        if isinstance(preprocess, str) and preprocess != "own":
+            raise TypeError(f"preprocess must be a Preprocess, a function or None, got {preprocess!r}")
+        return members, shared_preprocess(members) if isinstance(preprocess, str) else preprocess
+
+    def forward(
+        self,
+        image: ImageLike,
+        pose: CameraLike,
+        intrinsics: CameraLike,
+        valid: Array | None = None,
+        *,
+        features: Array | None = None,
+        anchors: Anchors | None = None,
+    ) -> UncertainPrediction:
+        """Predict depth and its variance for the next image of every stream.
+
+        Args:
+            image: [B, 3, H, W] or [3, H, W] as the preprocessing (or the network) expects it, a NumPy array
+                [B, H, W, 3] or [H, W, 3], or a Pillow image.
+            pose: [B, 4, 4] or [4, 4] camera-to-world [m], or without the last row; a tensor or a NumPy array.
+            intrinsics: [B, 3, 3] or [3, 3] of ``image`` [px], or fx, fy, cx, cy; likewise.
+            valid: [B, h, w] bool at the depth map's size, True = use.
+            features: [B, F, h, w] likewise, F = ``config.features``.
+            anchors: sparse depths of this frame, [B, N] padded and masked, at pixels of ``image`` before the
+                preprocessing. None = of the constructor's source.
+
+        Raises:
+            ValueError, TypeError: as :meth:`UfMStar.forward`; alternation and landmarks then do not advance.
+        """
+        return self._fused(self._predicted(image, pose, intrinsics, features), valid, anchors)
+
+    if TYPE_CHECKING:
+        __call__ = forward
+
+    def stream(self, frames: Iterable[tuple[ImageLike, CameraLike, CameraLike]]) -> Iterator[UncertainPrediction]:
+        """The predictions of a video, in order, with the networks one image ahead of UfM*.
+
+        With networks on a GPU and ``multiview_device="cpu"``, both run at the same time. Each result is yielded after
+        the next frame has been read.
+
+        Args:
+            frames: image, pose and intrinsics of each frame, as in :meth:`forward`.
+
+        Raises:
+            ValueError, TypeError: as :meth:`forward`.
+        """
+        waiting: _Predicted | None = None
+        if isinstance(frames, Tensor | np.ndarray):
+            raise TypeError(f"frames must be an iterable of (image, pose, intrinsics), got {type(frames).__name__}")
+        for frame in require_kind("frames", frames, Iterable, "an iterable of (image, pose, intrinsics)"):
+            if not isinstance(frame, tuple | list) or len(frame) != 3:
+                raise TypeError(f"frames must yield (image, pose, intrinsics), got {type(frame).__name__}")
+            ahead = self._predicted(*frame, ahead=waiting is not None)
+            if waiting is not None:
+                yield self._fused(waiting)
+            waiting = ahead
+        if waiting is not None:
+            yield self._fused(waiting)
+
+    def update(
+        self,
+        prediction: DepthPrediction,
+        pose: CameraLike,
+        intrinsics: CameraLike,
+        valid: Array | None = None,
+        *,
+        features: Array | None = None,
+        anchors: Anchors | None = None,
+    ) -> UncertainPrediction:
+        """Process an existing prediction, for example a cached one, as :meth:`forward` does after its networks.
+
+        Args:
+            prediction: [B, h, w].
+            pose: as in :meth:`forward`.
+            intrinsics: as in :meth:`forward`, of the depth map [px].
+            valid, features: as in :meth:`forward`.
+            anchors: [B, N] at pixels of the depth map, with ``config.anchors``; None = no anchors, even with a source.
+
+        Raises:
+            ValueError, TypeError: as :meth:`UfMStar.forward`; the image is then not counted.
+        """
+        require_kind("prediction", prediction, DepthPrediction, "a DepthPrediction")
+        maps = maps_of(prediction, self.ufm)
+        ufm = self.ufm(pose=pose, intrinsics=intrinsics, valid=valid, features=features, anchors=anchors, **maps)
+        self._count(self._next + 1)
+        if prediction.intrinsics is None:
+            K = as_intrinsics(intrinsics)
+            prediction = replace(prediction, intrinsics=K.expand(len(prediction.depth), 3, 3))
+        return UncertainPrediction(prediction, ufm, None)
+
+    def mean_uncertainty(
+        self,
+        image: ImageLike,
+        pose: CameraLike,
+        intrinsics: CameraLike,
+        valid: Array | None = None,
+        *,
+        features: Array | None = None,
+        anchors: Anchors | None = None,
+        pixels: int | None = None,
+        fraction: float | None = None,
+        seed: int = 0,
+        average: bool = False,
+    ) -> MeanUncertainty:
+        """Like :meth:`forward`, but computes the average of V per image, for active learning. The default source of
+        anchors is not asked: V has B only from a source that the constructor was passed, or from earlier calls of
+        :meth:`forward`.
+
+        Args:
+            image, pose, intrinsics, valid, features, anchors: as in :meth:`forward`.
+            pixels, fraction, seed, average: as in :meth:`UfMStar.mean_uncertainty`.
+
+        Raises:
+            ValueError, TypeError: as :meth:`UfMStar.mean_uncertainty`; alternation and landmarks then do not advance.
+        """
+        predicted = self._predicted(image, pose, intrinsics, features)
+        sample: dict[str, Any] = {"pixels": pixels, "fraction": fraction, "seed": seed, "average": average}
+        with self._anchored(predicted, anchors, search=not self._by_default) as (found, p):
+            mean = self.ufm.mean_uncertainty(
+                pose=predicted.pose, intrinsics=p.K, valid=valid, features=predicted.features, anchors=found,
+                **maps_of(p, self.ufm), **sample,
+            )  # fmt: skip
+        self._undo(mean.statistics)
+        self._count(self._next + 1)
+        return mean
+
+    def warm_up(
+        self,
+        size: tuple[int, int] = (480, 640),
+        *,
+        streams: int = 1,
+        progress: Callable[[int, int], object] | None = None,
+    ) -> None:
+        """Run every network twice on noise, and compile all kernels or load them from disk. State, evidence and the
+        number of images do not change; a network with a state of its own sees the noise. Without this, the first images
+        wait for the compiler and for the libraries of a GPU.
+
+        Args:
+            size: (H, W) of the images [px]; without networks, of the depth maps.
+            streams: B.
+            progress: as in :meth:`UfMStar.warm_up`.
+
+        Raises:
+            ValueError: as :meth:`UfMStar.warm_up`.
+        """
+        require_size(size, streams)
+        searching = () if self.landmarks is None else self.landmarks.searching
+        if self.networks:
+            size = self._tried(size, streams)
+        ufm = UfMStar(self.ufm.config, dtype=self.ufm.mean.dtype, device=self.ufm.mean.device)
+        warm_up(ufm, size, streams, progress, [partial(along_wall, kind()) for kind in searching])
+
+    def _tried(self, size: tuple[int, int], streams: int) -> tuple[int, int]:
+        """Run every network twice on noise in images of ``size``; the size of their depth maps."""
+        device = self._device() or torch.device("cpu")
+        floats = (t.dtype for t in self._tensors() if t.is_floating_point() and t.element_size() > 1)
+        with torch.no_grad(), torch.random.fork_rng([device] if device.type == "cuda" else []):
+            noise = torch.randint(0, 256, (streams, 3, *size), dtype=torch.uint8, device=device)
+            image = (noise / 255).to(next(floats, torch.float32)) if self.preprocess is None else noise
+            x, K = self.prepare(image, camera_of(size).to(torch.float64).expand(streams, 3, 3))
+            for _ in range(2):
+                maps = [self.member(x, K, n) for n in range(len(self.networks))]
+        height, width = maps[0].depth.shape[1:]
+        return height, width
+
+    def _fused(
+        self, predicted: _Predicted, valid: Array | None = None, anchors: Anchors | None = None
+    ) -> UncertainPrediction:
+        with self._anchored(predicted, anchors) as (found, p):
+            out = self.update(p, predicted.pose, p.K, valid, features=predicted.features, anchors=found)
+        self._undo(out.ufm.statistics)
+        return replace(out, member=predicted.member)
+
+    @contextmanager
+    def _anchored(
+        self, predicted: _Predicted, anchors: Anchors | None, *, search: bool = True
+    ) -> Iterator[tuple[Anchors | None, DepthPrediction]]:
+        """The image's anchors, from the caller or the source, at pixels of the depth map, and the prediction with
+        whether the image shows something. Waits for the prediction's copies. An error in the context undoes the updates
+        by the image.
+
+        Raises:
+            ValueError: anchors from both the caller and a source, or as :meth:`StreamLandmarks.update`.
+        """
+        if predicted.ready is not None:
+            predicted.ready.synchronize()
+        K = predicted.intrinsics
+        self._pose_check.compare(predicted.image, predicted.pose, K)
+        if anchors is not None and self.landmarks is not None and not self._by_default:
+            raise ValueError("anchors come from the source that UncertainDepth was made with: pass none")
+        self._searched = search and anchors is None and self._searchable(predicted.image)
+        if self._searched and self.landmarks is not None:
+            config = self.ufm.config
+            skip = config.on_bad_frame == "skip"
+            anchors = self.landmarks.update(predicted.image, predicted.pose, K, config.rotation_tolerance, skip=skip)
+            anchors = anchors.to(predicted.prediction.depth.device)  # UfM*'s may be another than the image's
+        try:
+            moved = anchors is not None and self.preprocess not in (None, in_unit_range)
+            found = require_anchors(anchors).moved(K, predicted.prediction.K) if moved else anchors
+            informative = self._image_check.informative(predicted.image, predicted.pose)
+            yield found, replace(predicted.prediction, informative=informative)
+        except BaseException:
+            self._image_check.undo()
+            if self.landmarks is not None and self._searched:
+                self.landmarks.undo()
+            raise
+
+    def _searchable(self, image: Tensor) -> bool:
+        """False where the default source cannot search the image: it is neither of bytes nor of floats in [0, 1]."""
+        if not self._by_default or image.is_meta:
+            return not image.is_meta
+        try:
+            as_bytes(image)
+        except ValueError:
+            if not self._unsearchable:
+                LOGGER.warning(_MISSED, "the images must be bytes, or floats in [0, 1] (logged once)")
+            self._unsearchable = True
+            return False
+        return True
+
+    def _undo(self, statistics: FrameStatistics) -> None:
+        """Undo the updates by the image for streams that skipped it."""
+        # Reading the faults synchronises with an accelerator.
+        can_skip = self.ufm.config.on_bad_frame == "skip" and not statistics.fault.is_meta
+        skipped = statistics.fault.nonzero().flatten().tolist() if can_skip else []
+        self._image_check.undo(skipped)
+        if self.landmarks is not None and self._searched:
+            self.landmarks.undo(skipped)
+
+    def _predicted(
+        self,
+        image: ImageLike,
+        pose: CameraLike,
+        intrinsics: CameraLike,
+        features: Array | None = None,
+        *,
+        ahead: bool = False,
+    ) -> _Predicted:
+        """The prediction for the next image, or, with ``ahead``, for the one after that."""
+        if not self.networks:
+            raise ValueError("UncertainDepth(None) has no networks: pass predictions to update")
+        picture, T, K_image = as_image(image), as_pose(pose), as_intrinsics(intrinsics)
+        first = self._next == 0 and not ahead and picture.is_cpu and picture.dtype in _BLACK
+        if first and float(picture.max()) <= _BLACK[picture.dtype]:
+            LOGGER.warning("the first image is black: was it divided by 255 twice, or cast to whole numbers?")
+        if first and picture.is_floating_point() and float(picture.max()) > _BRIGHT and float(picture.min()) >= 0:
+            brightest = f"the first image has floats up to {float(picture.max()):g}"
+            LOGGER.warning("%s: pass bytes, or floats in [0, 1], unless the network expects this", brightest)
+        if not isinstance(image, Tensor):  # a tensor's device is the caller's choice
+            picture = picture.to(self._device() or picture.device)
+        member = None if self.mode == "full" else self.turn(self._next + ahead)
+        with torch.no_grad():
+            x, K = self.prepare(picture, K_image.expand(len(picture), 3, 3))
+            prediction = self.every(x, K) if member is None else self.member(x, K, member)
+        index = 0 if member is None else (self._next + ahead) % SAMPLES if self.stochastic else member
+        prediction = replace(prediction, member=index)
+        tensors = {name: value for name, value in vars(prediction).items() if isinstance(value, Tensor)}
+        if features is not None:
+            tensors["features"] = as_tensor("features", features)
+        there, ready = _copied(tensors, self.multiview_device)
+        H = there.pop("features", None)
+        return _Predicted(picture, T, K_image, replace(prediction, **there), member, H, ready)
+
+    def _tensors(self) -> Iterator[Tensor]:
+        """The networks' parameters and buffers. A ``LazyMember`` has a buffer alone, on its device."""
+        return chain(self.networks.parameters(), self.networks.buffers())
+
+    def _device(self) -> torch.device | None:
+        """The networks' device; None if they have no tensors."""
+        return next((tensor.device for tensor in self._tensors()), None)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Move the networks; UfM* stays on ``multiview_device`` unless that is None."""
+        super()._apply(fn, recurse)
+        if self.multiview_device is not None:
+            self.ufm.to(self.multiview_device)
+        return self
+
+    def reset(self, streams: Sequence[int] | Tensor | None = None, *, keep_evidence: bool = False) -> None:
+        """Reset UfM* (:meth:`UfMStar.reset`) and the landmarks; resetting all streams also restarts the alternation."""
+        self.ufm.reset(streams, keep_evidence=keep_evidence)
+        b = self.ufm.mean.shape[0]
+        chosen = None if streams is None else self.ufm._chosen(streams, b).nonzero().flatten().tolist()
+        if self.landmarks is not None:
+            self.landmarks.reset(chosen)
+        if chosen is None:
+            self._count(0)
+        self._image_check.reset(chosen)
+        if chosen is None or 0 in chosen:
+            self._pose_check.reset()
+
+    def _count(self, images: int) -> None:
+        """Set the number of processed images, as a number for the alternation and as a buffer for ``state_dict``."""
+        self._next = images
+        with outliving():  # the buffer must outlive the caller's inference mode
+            self.image_index = torch.full_like(self.image_index, images)
+
+    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        if self.landmarks is not None:
+            destination.update({f"{prefix}landmarks.{n}": value for n, value in self.landmarks.state().items()})
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
+        landmark_prefix = f"{prefix}landmarks."
+        mark = self._with_own_weights(state_dict, prefix)
+        try:
+            if mark is not None:
+                _require_count(mark, _MARK)
+            if f"{prefix}image_index" in state_dict:
+                _require_count(state_dict[f"{prefix}image_index"], "image_index")
+            self.ufm.accepted(state_dict, f"{prefix}ufm.")
+            if self.landmarks is not None:
+                self.landmarks.load_state(
+                    {
+                        key[len(landmark_prefix) :]: state_dict.pop(key)
+                        for key in list(state_dict)
+                        if key.startswith(landmark_prefix)
+                    }
+                )
+        except ValueError as error:
+            args[-1].append(str(error))
+            return
+        if mark is not None and int(mark) != weights_mark(self.networks):
+            LOGGER.warning("the state was saved with other networks: it holds their disagreement; reset() begins anew")
+        super()._load_from_state_dict(state_dict, prefix, *args)
+        self._next = int(self.image_index)
+
+    def _with_own_weights(self, state_dict: dict[str, Tensor], prefix: str) -> Tensor | None:
+        """Replace the checksum in a state, or weights, by the module's own weights; the checksum, or None."""
+        for key in [key for key in state_dict if key.startswith(f"{prefix}networks.")]:
+            del state_dict[key]
+        state_dict.update({f"{prefix}networks.{name}": value for name, value in self.networks.state_dict().items()})
+        return state_dict.pop(f"{prefix}{_MARK}", None)
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
+        """Restore the state of a video, of :meth:`state_dict`. The networks' weights are no part of it; if they differ
+        from those at saving, a warning is logged. Nor is the last image: the next one cannot be recognised as the same.
+        Atomic: if it raises, state and landmarks are unchanged.
+
+        Raises:
+            RuntimeError: the state is incomplete, of other sources of anchors, or invalid.
+        """
+        before = {name: value.clone() for name, value in self.state_dict().items()}
+        try:
+            result = super().load_state_dict(state_dict, strict, assign)
+            self._image_check.reset()
+            return result
+        except BaseException:
+            super().load_state_dict(before)
+            raise
+
+
+def _without_weights(module: nn.Module, state_dict: dict[str, Any], prefix: str, _: object) -> None:
+    """Replace the networks' weights in a state, which is saved often, by their checksum."""
+    assert isinstance(module, UncertainDepth)
+    for key in [key for key in state_dict if key.startswith(f"{prefix}networks.")]:
+        del state_dict[key]
+    state_dict[f"{prefix}{_MARK}"] = torch.tensor(weights_mark(module.networks))
+
+
+def maps_of(prediction: DepthPrediction, ufm: UfMStar) -> dict[str, Any]:
+    """The arguments of :meth:`UfMStar.forward` from a prediction: depth, A, E, the network's index, whether the image
+    shows something, and the confidence if used."""
+    maps = {
+        "depth": prediction.depth,
+        "aleatoric": prediction.aleatoric_variance,
+        "epistemic": prediction.epistemic_variance,
+        "member": prediction.member,
+        "informative": prediction.informative,
+    }
+    return maps | ({"confidence": prediction.confidence} if ufm.takes("confidence") else {})
+
+
+def _missed(networks: object) -> str:
+    """Why no image can be searched for anchors; "" if images can be."""
+    if networks is None:
+        return "UncertainDepth(None) sees no images"
+    try:
+        landmarks.opencv()
+    except ImportError as error:
+        return str(error)
+    return ""
+
+
+def _require_count(value: object, name: str) -> None:
+    """Raise a ValueError unless ``value`` is a whole number of at least 0."""
+    if not isinstance(value, Tensor) or value.dtype != torch.int64 or value.dim() or bool(value < 0):
+        raise ValueError(f"{name} must be a whole number of at least 0, got {value}")
+
+
+def _copied(values: dict[str, Tensor], device: torch.device | None) -> tuple[dict[str, Any], torch.cuda.Event | None]:
+    """Copy the values to ``device`` (None: no copy). Copies from CUDA to the CPU are asynchronous, into pinned memory,
+    and return an event to wait for."""
+    if device is None:
+        return values, None
+    source = values["depth"].device
+    if source.type != "cuda" or device.type != "cpu":
+        return {name: value.to(device, non_blocking=True) for name, value in values.items()}, None
+    copies = {name: torch.empty(value.shape, dtype=value.dtype, pin_memory=True) for name, value in values.items()}
+    for name, value in values.items():
+        copies[name].copy_(value.detach(), non_blocking=True)
+    ready = torch.cuda.Event()
+    ready.record(torch.cuda.current_stream(source))
+    return copies, ready
