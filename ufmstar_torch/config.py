@@ -18,7 +18,7 @@ UNSTATED_RANGE = 20.0
 # The paper's settings where the defaults differ from them (``UfMStarConfig.paper`` has the reasons), by dotted name.
 PAPER: Mapping[str, Any] = MappingProxyType({
     "segment.min_pixels": 2000, "segment.min_rows": 32, "segment.prune": "either", "segment.slope_focal": "camera",
-    "view_baseline": None, "regression": "neighbourhood", "unmeasured": "paper",
+    "segment.max_depth": 1000.0, "view_baseline": None, "regression": "neighbourhood", "unmeasured": "paper",
 })  # fmt: skip
 
 
@@ -321,6 +321,8 @@ class UfMStarConfig(Checked):
           rows; the default one that is below 200 pixels and below 16 rows. On four sequences that is 4 to 6 Gaussians
           over 55 to 85 % of the usable pixels here, 12 to 24 over 92 to 99 % by default, and ECE_delta of FastDepth's
           depth alone is .562 here and .382 by default (docs/results/accuracy.md).
+        - ``segment.max_depth``: 1 km here, farther than any depth in the paper's data sets; by default the largest
+          depth that the network states, or SPGF's 20 m.
         - ``segment.slope_focal``: SPGF's thresholds have the camera's own focal length here, by default the
           reference's, which made no difference on tours.
         - ``view_baseline``: every comparison counts here, and the first view counts as agreement; by default a
