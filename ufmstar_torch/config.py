@@ -234,8 +234,8 @@ class UfMStarConfig(Checked):
         variance_floor: smallest variance of a pixel
         add_aleatoric: add the network's aleatoric variance to the result
         add_epistemic: add the network's epistemic variance to the result
-        aleatoric_in_h: average the network's aleatoric variance over views in the Gaussians (the paper's H), and add
-            that average instead of the pixel's own
+        variances_in_h: average the network's variances, aleatoric and epistemic, over views in the Gaussians (the
+            paper's H), and add these averages instead of the pixel's own
         features: additional regressed quantities per Gaussian
         initial_capacity: slots for Gaussians at the start; the number grows as needed
         max_components: largest number of Gaussians, beyond which the farthest are dropped, then the oldest; null = no
@@ -279,7 +279,7 @@ class UfMStarConfig(Checked):
     add_epistemic: bool = True
 
     # State
-    aleatoric_in_h: bool = False
+    variances_in_h: bool = False
     features: int = number(0, "dim H - 1", "1", 0)
     initial_capacity: int = number(256, "K_0", "components", 1)
     max_components: int | None = number(None, "K_max", "components", 1)
@@ -300,10 +300,10 @@ class UfMStarConfig(Checked):
         for name in ("posterior", "confidence"):
             if getattr(self, name) is not None and self.anchors is None:
                 raise ValueError(f"UfMStarConfig.{name} needs anchors: set anchors=AnchorConfig() as well")
-        if self.aleatoric_in_h and (self.anchors is not None or not self.add_aleatoric):
+        if self.variances_in_h and (self.anchors is not None or not (self.add_aleatoric or self.add_epistemic)):
             raise ValueError(
-                "UfMStarConfig.aleatoric_in_h goes with add_aleatoric=True and without anchors (posterior=False; "
-                "--plain), got another setting"
+                "UfMStarConfig.variances_in_h goes with add_aleatoric=True or add_epistemic=True and without anchors "
+                "(posterior=False; --plain), got another setting"
             )
         require_bytes("UfMStarConfig.initial_capacity", self.initial_capacity * (_SLOT + 4 * self.entries))
         if self.far_radius < self.near_radius:
@@ -335,8 +335,8 @@ class UfMStarConfig(Checked):
 
     @property
     def entries(self) -> int:
-        """Regressed quantities per Gaussian beside m: ``features``, and with ``aleatoric_in_h`` A and 1."""
-        return self.features + 2 * self.aleatoric_in_h
+        """Regressed quantities per Gaussian beside m: ``features``, and with ``variances_in_h`` A, E and 1."""
+        return self.features + 3 * self.variances_in_h
 
     def within(self, max_depth: float | None, states_confidence: bool = False) -> UfMStarConfig:
         """The settings for a network that states its largest depth [m], for ``segment.max_depth``, or a confidence, for

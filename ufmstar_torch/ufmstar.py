@@ -125,7 +125,7 @@ class UfMStar(StatefulModule):
         a, e = (None if v is None else as_tensor(n, v) for n, v in (("aleatoric", aleatoric), ("epistemic", epistemic)))
         frame = self._checked(depth, pose, intrinsics, a, e, valid, features, member=member, informative=informative)
         out, maps = self._observe(frame, inputs)
-        originals: dict[str, Any] = {"epistemic": e} if self.config.aleatoric_in_h else {"aleatoric": a, "epistemic": e}
+        originals: dict[str, Any] = {} if self.config.variances_in_h else {"aleatoric": a, "epistemic": e}
 
         def shaped(value: Tensor) -> Tensor:  # no map: [B, n]
             return value if value.shape == depth.shape or value.dim() == 2 else value.reshape(depth.shape)
@@ -271,7 +271,7 @@ class UfMStar(StatefulModule):
 
     def _checked(self, depth: Tensor, T: CameraLike, K: CameraLike, *maps: Array | None, **view: Any) -> FrameInput:
         return check_frame(
-            depth, T, K, *maps, **view, feature_count=self.config.features, aleatoric_in_h=self.config.aleatoric_in_h,
+            depth, T, K, *maps, **view, feature_count=self.config.features, variances_in_h=self.config.variances_in_h,
             rotation_tolerance=self.config.rotation_tolerance, max_depth=self.config.segment.depth_limit,
             kernel=self._kernels(depth.device.type)[1],
         )  # fmt: skip

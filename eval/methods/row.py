@@ -24,8 +24,8 @@ class Row:
         method, setting = self.method, self.setting
         if setting.of_ufm_star and method.fusion != UFM_STAR:
             raise ValueError(f"row {method.name}: only UfM* has {', '.join(setting.of_ufm_star)}")
-        if setting.overrides.get("aleatoric_in_h") and not method.uses_aleatoric:
-            raise ValueError(f"row {method.name}: aleatoric_in_h needs a network that predicts an aleatoric variance")
+        if setting.overrides.get("variances_in_h") and not method.uses_aleatoric:
+            raise ValueError(f"row {method.name}: variances_in_h needs a network that predicts a variance")
         try:
             configured(setting)
         except ValueError as error:

@@ -122,7 +122,7 @@ _WORDS = {
     ("ufm_preset", "paper"): "paper's settings",
     ("preprocess", "resize"): "whole frame",
     ("preprocess", "crop"): "NYU's crop",
-    ("aleatoric_in_h", True): "A in H",
+    ("variances_in_h", True): "A and E in H",
     ("posterior", True): "posterior",
 }
 # Displayed values.

@@ -14,7 +14,7 @@ from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.efficiency import efficiency_tables
 from ufmstar_torch.eval.report.means import (
-    MIN_SEQUENCES,
+    FEW_SEQUENCES,
     difference,
     mean_of,
     mean_over,
@@ -101,8 +101,8 @@ def difference_table(results: Results, dataset: str | None = None) -> Table:
                 lines.append((block, f"{labels[row]} – {labels[ours]}", (Cell(str(pairs)), *cells)))
     columns = [("", "sequences"), *(("", f"Δ {q.heading}") for q in DIFFERENCES)]
     note = (
-        "Mean over sequences of row – UfM* on the same sequence, with its 95 % confidence interval (from "
-        f"{MIN_SEQUENCES} sequences on); better and worse: beyond the interval."
+        "Mean over sequences of row – UfM* on the same sequence, with its 95 % confidence interval (w: wide, of fewer "
+        f"than {FEW_SEQUENCES} sequences); better and worse: beyond the interval, from {FEW_SEQUENCES} sequences on."
     )
     title = f"{results.title}, paired differences, {_where(results, dataset)}"
     return Table("differences", title, "Row – UfM*", frame_of(lines, columns), (note,))
@@ -170,11 +170,11 @@ def _notes(results: Results, records: Records) -> list[str]:
     if words := shared_words(records):
         notes.append(f"Images of all rows: {words}, resized to the networks' input.")
     most = max(map(len, records.values()))
-    if most < MIN_SEQUENCES:
-        few = "One sequence" if most == 1 else f"{most} sequences, fewer than {MIN_SEQUENCES}"
-        return [*notes, f"{few}: no confidence intervals."]
-    intervals = "with 95 % confidence intervals (those below 0.01 are left out)"
-    return [*notes, f"Means over sequences, each counting the same, {intervals}."]
+    if most == 1:
+        return [*notes, "One sequence: no confidence intervals."]
+    intervals = "with 95 % confidence intervals (those below 0.01 are left out"
+    few = "" if most >= FEW_SEQUENCES else f"; w: wide, since Student's interval of {most} sequences rests on normality"
+    return [*notes, f"Means over sequences, each counting the same, {intervals}{few})."]
 
 
 def _cost_note(efficiency: Mapping[str, Any]) -> str:

@@ -28,13 +28,15 @@ class NetworkVariance:
         return [value for value in (self.aleatoric, self.epistemic) if value is not None]
 
     def at(self, chosen: Chosen, features: Tensor, config: UfMStarConfig) -> NetworkVariance:
-        """A and E at the regressed pixels, whose features are [..., F]. With ``config.aleatoric_in_h`` the last two
-        features are the mixture's A and its weight share s; A is then that plus (1 - s) times the pixel's A."""
-        a, e = (None if value is None else chosen(value) for value in (self.aleatoric, self.epistemic))
-        if a is not None and config.aleatoric_in_h:
-            mixed, explained = features[..., -2:].unbind(-1)
-            a = mixed + (1 - explained) * a
-        return replace(self, aleatoric=a, epistemic=e)
+        """A and E at the regressed pixels, whose features are [..., F]. With ``config.variances_in_h`` the last three
+        features are the mixture's A, E and weight share s; each of A and E is then its mean over the mixture plus
+        (1 - s) times the pixel's own."""
+        of_pixel = [None if value is None else chosen(value) for value in (self.aleatoric, self.epistemic)]
+        if config.variances_in_h:
+            *means, explained = features[..., -3:].unbind(-1)
+            pairs = zip(of_pixel, means, strict=True)
+            of_pixel = [None if value is None else mean + (1 - explained) * value for value, mean in pairs]
+        return replace(self, aleatoric=of_pixel[0], epistemic=of_pixel[1])
 
     def total(self, disagreement: Tensor, floor: float) -> Tensor:
         """V of M [m^2], at least ``floor``; NaN stays NaN."""

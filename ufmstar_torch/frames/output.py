@@ -120,7 +120,7 @@ class UfMStarOutput:
         variance: V, the total variance of the depth [m^2]: M, plus A and E if passed (and not switched off in the
             config), plus B with ``config.anchors``; at least ``config.variance_floor``. NaN where not valid.
         disagreement: M, the multiview disagreement [m^2]. NaN where not valid.
-        aleatoric, epistemic: the arguments A and E [m^2], or None; with ``config.aleatoric_in_h`` A of the mixture.
+        aleatoric, epistemic: the arguments A and E [m^2], or None; with ``config.variances_in_h`` of the mixture.
         anchored: B, the mean square error at anchors in excess of M + A + E [m^2] (``evidence``); None unless
             ``config.anchors``.
         bias: the relative error r = g/d - 1 that anchors predict; None unless ``config.anchors``.
