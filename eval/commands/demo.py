@@ -20,6 +20,7 @@ from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
 from ufmstar_torch.eval.run.machine import hardware, share_threads, versions
 
 _WEIGHTS = ("weights", "demo.safetensors")
+_COSTS = "onboard_costs.png"
 _WALK = 150  # frames of a whole walk; the first --frames of them are used, so that consecutive frames overlap
 _ROOMS = {"familiar": "home", "unfamiliar": "hall"}  # style by data set
 
@@ -40,6 +41,8 @@ class DemoOptions(MachineOptions):
             (.onnx, .tflite)
         onboard: live instead, as on a small robot: one network, quantised, at 30 images/s among things of many sizes
         seconds: of --onboard
+        power: log of an external power meter during --onboard: CSV with the columns time (seconds since 1970) and power
+            (W); default: the computer's own counters, if there are any
         device: cpu, cuda or cuda:N
         threads: number of CPU threads; default: all cores, with --onboard but one
     """
@@ -51,12 +54,15 @@ class DemoOptions(MachineOptions):
     weights: Path | None = None
     onboard: bool = False
     seconds: float = 120.0
+    power: Path | None = None
 
     def __post_init__(self) -> None:
         if not 2 <= self.frames <= _WALK:
             raise ValueError(f"--frames must be 2 to {_WALK}, got {self.frames}")
         if not 1 <= self.seconds < float("inf"):
             raise ValueError(f"--seconds must be at least 1, got {self.seconds}")
+        if self.power is not None and not self.onboard:
+            raise ValueError("--power goes with --onboard")
         if self.onboard and self.device != "cpu":
             raise ValueError(f"--onboard runs on the CPU, got --device {self.device}")
 
@@ -88,13 +94,17 @@ def _words(options: DemoOptions, weights: Path) -> list[str]:
 
 def _onboard(options: DemoOptions, weights: Path) -> int:
     """Run ``--onboard``, write its folder, and print its table. Returns the exit code."""
+    from ufmstar_torch.eval.report.figures_cost import draw_cumulative
+    from ufmstar_torch.eval.report.style import save_figure
     from ufmstar_torch.eval.report.text import onboard_table
 
     if options.threads is None:
         share_threads()
-    kind = FolderKind("ufmstar demo --onboard", "demo", "summary.json", (GRAPH, PICTURE))
+    kind = FolderKind("ufmstar demo --onboard", "demo", "summary.json", (GRAPH, PICTURE, _COSTS))
     with output_folder(options.out, kind, {}, overwrite=options.overwrite), Bars() as bars:
-        measured = run_onboard(options.out, weights, options.seconds, options.seed, bars.show)
+        measured = run_onboard(options.out, weights, options.seconds, options.seed, bars.show, options.power)
+        if measured["costs"]:
+            save_figure(draw_cumulative(measured["costs"]), options.out / _COSTS)
     settings = {name: value for name, value in as_dict(options).items() if name not in ("frames", "device")}
     about = {"program": kind.program, "out": str(options.out), "settings": settings}
     summary: dict[str, Any] = to_json(about | measured | {"hardware": hardware(), "versions": versions()})
