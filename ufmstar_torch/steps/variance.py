@@ -61,13 +61,14 @@ def network_variances_at(
 ) -> NetworkVariances:
     """A and E [B, H, W], or [B, n] at ``pixels``, whose regressed features are [..., F].
 
-    With ``config.aleatoric_in_h`` the last two features are the mixture's A and its weight share s; A is then that plus
-    (1 - s) times the pixel's A.
+    With ``config.variances_in_h`` the last three features are the mixture's A, E and weight share s; each of A and E is
+    then its mean over the mixture plus (1 - s) times the pixel's own.
     """
     a, e = (None if value is None else at_pixels(value, pixels) for value in network_variances(frame, config))
-    if a is not None and config.aleatoric_in_h:
-        mixed, explained = features[..., -2:].unbind(-1)
-        a = mixed + (1 - explained) * a
+    if config.variances_in_h:
+        mean_a, mean_e, explained = features[..., -3:].unbind(-1)
+        a = None if a is None else mean_a + (1 - explained) * a
+        e = None if e is None else mean_e + (1 - explained) * e
     return NetworkVariances(a, e)
 
 
