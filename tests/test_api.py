@@ -16,7 +16,7 @@ from ufmstar_torch import (
     UfMStarConfig,
     UncertainDepth,
 )
-from ufmstar_torch.runtime.stateful import flat
+from ufmstar_torch.runtime.checked import flat
 
 PUBLIC = {
     "DepthPrediction",

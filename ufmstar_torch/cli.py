@@ -72,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(name: str, words: Sequence[str]) -> int:
     """Import the command, parse its options, and run it; convert errors to one line and an exit code."""
-    from ufmstar_torch.eval.commands.options import UsageError
+    from ufmstar_torch.eval.commands.errors import UsageError
 
     debug = "--debug" in words
     try:

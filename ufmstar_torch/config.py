@@ -19,6 +19,7 @@ UNSTATED_RANGE = 20.0
 PAPER: Mapping[str, Any] = MappingProxyType({
     "segment.min_pixels": 2000, "segment.min_rows": 32, "segment.prune": "either", "segment.slope_focal": "camera",
     "segment.max_depth": 1000.0, "view_baseline": None, "regression": "neighbourhood", "unmeasured": "paper",
+    "merge": None,
 })  # fmt: skip
 
 
@@ -203,8 +204,8 @@ class MergeConfig(Checked):
         every: frames of a stream from one merging to the next
     """
 
-    loss: float = number(1.0, "l_max", "nat", 0.0, 10.0, open_low=True)
-    share: float = number(0.05, "s_min", "1", 0.0, 0.5)
+    loss: float = number(2.0, "l_max", "nat", 0.0, 10.0, open_low=True)
+    share: float = number(0.1, "s_min", "1", 0.0, 0.5)
     every: int = number(50, "n", "frames", 1)
 
 
@@ -284,9 +285,9 @@ class UfMStarConfig(Checked):
     backend: str = choice("auto", "torch", "numba", "triton")
 
     # Not in the paper
-    anchors: AnchorConfig | None = section(AnchorConfig, optional=True)
-    confidence: ConfidenceConfig | None = section(ConfidenceConfig, optional=True)
-    posterior: PosteriorConfig | None = section(PosteriorConfig, optional=True)
+    anchors: AnchorConfig | None = section(AnchorConfig, optional=True, on=False)
+    confidence: ConfidenceConfig | None = section(ConfidenceConfig, optional=True, on=False)
+    posterior: PosteriorConfig | None = section(PosteriorConfig, optional=True, on=False)
     merge: MergeConfig | None = section(MergeConfig, optional=True)
 
     # Constants: the paper's neighbourhood, and a bound far above the rounding of poses in text files.
@@ -330,6 +331,8 @@ class UfMStarConfig(Checked):
         - ``regression``: over the Gaussians within .1 m here, or .5 m where there are none; by default over all, the
           sum that this approximates to save time, which was calibrated better.
         - ``unmeasured``: a surface that no two views compared reads as 0 here, as a share of its depth by default.
+        - ``merge``: Gaussians are only added here; by default those that overlap are joined every 50 frames, which
+          changes ECE_delta by at most .004 (docs/results/speed.md).
         """
         return cls().with_values(PAPER)
 

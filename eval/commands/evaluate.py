@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import OpeningOptions
 from ufmstar_torch.eval.commands.options import (
     Count,
@@ -18,7 +19,6 @@ from ufmstar_torch.eval.commands.options import (
     joined,
     reader,
     require_least,
-    usage_errors,
 )
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.methods.method import NETWORKS, UFM_STAR
@@ -214,10 +214,9 @@ def job_from(options: EvalOptions) -> EvalJob:
 
 def _evaluate(options: EvalOptions) -> int:
     from ufmstar_torch.eval.engine.warm_up import warm_up_command
-    from ufmstar_torch.eval.suite.tasks import evaluate_suite
+    from ufmstar_torch.eval.suite.tasks import evaluate_suite, executor_of
 
     how: dict[str, Any] = {"resume": options.output.resume, "overwrite": options.output.overwrite}
-    how |= {"processes": options.processes, "scheduler": options.scheduler, "threads": options.threads}
     with Bars() as bars, stop_signals(bars.say) as stop:
         job = job_from(options)
         for base in job.unused:
@@ -229,7 +228,8 @@ def _evaluate(options: EvalOptions) -> int:
             warm_up_command(config, bars.show, anchors)
         if sys.stderr.isatty():
             how["progress"] = bars.show
-        outcome = evaluate_suite(job, **how, stop=stop, report=bars.say)
+        with executor_of(options.processes, options.scheduler, job.device) as executor:
+            outcome = evaluate_suite(job, executor, threads=options.threads, **how, stop=stop, report=bars.say)
     return _report(job, outcome, options)
 
 

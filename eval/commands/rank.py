@@ -9,7 +9,8 @@ from typing import ClassVar, Literal
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.depth import OWN_DEPTH
-from ufmstar_torch.eval.commands.options import Count, Flag, Positional, Texts, reader, require_least, usage_errors
+from ufmstar_torch.eval.commands.errors import usage_errors
+from ufmstar_torch.eval.commands.options import Count, Flag, Positional, Texts, reader, require_least
 from ufmstar_torch.eval.commands.run import StreamOptions, job_from
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.engine.progress import frame_progress
