@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
+from typing import Any
 
+import lightning.pytorch as pl
 import pytest
 import torch
 from metric_maps import ALL, maps
+from pages import blocks
 from torch import Tensor
+from torch.utils.data import DataLoader
 
-from ufmstar_torch.eval.metrics import Coverage, IntervalWidth, SequenceMetrics, base
+from ufmstar_torch.eval.metrics import NLL, Coverage, ECEDelta, ECEQuantile, IntervalWidth, SequenceMetrics, base
 from ufmstar_torch.eval.metrics.intervals import GatedPixels, IntervalCoverage
 from ufmstar_torch.eval.metrics.mixture import Mixture
 
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "evaluation.md"
 KINDS = [*ALL, Coverage, IntervalWidth, GatedPixels, IntervalCoverage, Mixture]
 
 
@@ -113,3 +119,26 @@ def test_on_a_gpu_an_update_does_not_wait(kind):
         torch.cuda.set_sync_debug_mode("default")
     for name, value in expected.items():
         torch.testing.assert_close(metric.compute()[name].cpu(), value, rtol=1e-9, atol=1e-9, equal_nan=True)
+
+
+class TestThePage:
+    """docs/evaluation.md: the metrics in anybody's Lightning module."""
+
+    @pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning", "ignore:.*num_workers", "ignore:.*litlogger")
+    def test_the_module_logs_the_figures_of_all_batches(self):
+        (code,) = [block for block in blocks(PAGE.read_text()) if "LightningModule" in block]
+        scope: dict[str, Any] = {}
+        exec(compile(code, "evaluation.md", "exec"), scope)
+        depth, variance, truth = maps(4, 20, 30)
+        batches = [
+            {"image": torch.stack([depth[n : n + 2], variance[n : n + 2]], 1), "depth": truth[n : n + 2]}
+            for n in (0, 2)
+        ]
+        module = scope["MyDepth"](lambda image: image.unbind(1))
+        quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+        trainer = pl.Trainer(accelerator="cpu", devices=1, enable_model_summary=False, **quiet)
+        (logged,) = trainer.validate(module, DataLoader(batches, batch_size=None), verbose=False)
+        for kind in (NLL, ECEDelta, ECEQuantile):
+            for name, value in kind()(depth, variance, truth).items():
+                if value.dim() == 0:
+                    assert logged[name] == pytest.approx(float(value), rel=1e-6), name
