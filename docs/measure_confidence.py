@@ -88,9 +88,9 @@ def figures(prepared: list[Prepared], source: str, unit: str) -> list[float]:
         c = None if to_unit is None else to_unit(one.depth, one.sigma)
         prediction = DepthPrediction(one.depth, a, confidence=c)
         out = model.update(prediction, one.pose, one.K, anchors=one.anchors[source])
-        metrics.update(one.depth[0], out.ufm.variance[0], one.truth)
+        metrics.update(one.depth[0], out.ufm_variance[0], one.truth)
         corrected.update(out.depth[0], out.variance[0], one.truth)
-        confidence = out.ufm.statistics.confidence
+        confidence = out.statistics.confidence
         used += confidence is not None and float(confidence) > 0
     found = metrics.compute()
     return [*(found[name] for name in FIGURES), used / len(prepared), corrected.compute()["nll"]]

@@ -169,7 +169,7 @@ def judged(frames: Frames, predictions: list[tuple[Tensor, Tensor, NDArray[np.fl
         out = ufm(depth, torch.from_numpy(frame.T_world_cam)[None], K, anchors=marks)
         if i < FIRST:
             continue
-        parts = (depth, out.posterior_depth, out.posterior_variance)
+        parts = (depth, out.depth, out.variance)
         d, g, V, t = (x[::STRIDE, ::STRIDE].ravel() for x in (*(part[0].numpy() for part in parts), truth))
         measured = (t > 0) & np.isfinite(g)
         network.append(np.square(d - t)[measured])

@@ -66,7 +66,7 @@ def posterior(frames: list[Frame], network: DepthNetwork) -> Iterator[tuple[Arra
         K = K.double()
         marks = source.update(frame.image, frame.T_world_cam, frame.intrinsics).anchors(frame.intrinsics, K)
         out = ufm(depth, torch.from_numpy(frame.T_world_cam)[None], K, anchors=marks)
-        maps = out.posterior_depth, out.posterior_variance, out.posterior_inlier_variance, out.posterior_outlier
+        maps = out.depth, out.variance, out.posterior_inlier_variance, out.posterior_outlier
         truth = truth_at(frame, K[0].numpy(), (depth.shape[1], depth.shape[2]))
         yield np.stack([*(x[0].double().numpy() for x in maps if x is not None), truth], -1), K[0].numpy()
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from importlib.resources import as_file, files
 from itertools import islice
 from pathlib import Path
@@ -28,18 +28,18 @@ from torch.nn.functional import adaptive_avg_pool2d, interpolate
 
 from ufmstar_torch import PosteriorConfig, UfMStar
 from ufmstar_torch.anchors import landmark_source
-from ufmstar_torch.anchors.anchors import AnchorInput, check_anchors
+from ufmstar_torch.anchors.anchors import check_anchors
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.eval.sequences.open import open_sequence
-from ufmstar_torch.frames.frame import FrameInput, check_frame
+from ufmstar_torch.frames.frame import AnchorInput, FrameInput, check_frame
 from ufmstar_torch.gaussians.camera import resize_intrinsics
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import load_trained
-from ufmstar_torch.posterior.extension import common_error
+from ufmstar_torch.posterior.correct import common_error
 from ufmstar_torch.posterior.running import SIZE
 from ufmstar_torch.posterior.update import update
 
@@ -137,6 +137,11 @@ def figures(prepared: list[Prepared], kind: str, config: PosteriorConfig) -> lis
     return [row[name] for name in FIGURES]
 
 
+def changed(config: PosteriorConfig, **values: float) -> PosteriorConfig:
+    """The model with other settings or constants: a class of its own, whose constants differ."""
+    return type("Changed", (PosteriorConfig,), values)(config.half_life, config.discs)
+
+
 def by_tour(tours: list[list[list[Prepared]]], config: PosteriorConfig) -> NDArray[np.float64]:
     """[tours, figures] means over networks and evidence."""
     return np.array([np.mean([figures(p, kind, config) for p in tour for kind in KINDS], 0) for tour in tours])
@@ -170,11 +175,15 @@ def main() -> None:
     start = by_tour(tours, config)
     means = zip(start.mean(0), interval(start), strict=True)
     print("| as it is | " + " | ".join(f"{m:.3f} ± {h:.3f}" for m, h in means) + " |", flush=True)
-    values = {f.name: getattr(config, f.name) for f in fields(config)}
+    values = {
+        name: value
+        for name in PosteriorConfig.__annotations__
+        if isinstance(value := getattr(config, name), int | float)
+    }
     halved_and_doubled = [f"{name}={value * by:g}" for name, value in values.items() for by in (0.5, 2)]
     for change in arguments.change or [text for text in halved_and_doubled if not text.startswith("discs=1.5")]:
         name, _, value = change.partition("=")
-        difference = by_tour(tours, replace(config, **{name: type(values[name])(value)})) - start
+        difference = by_tour(tours, changed(config, **{name: type(values[name])(value)})) - start
         means = zip(difference.mean(0), interval(difference), strict=True)
         print(f"| {change} | " + " | ".join(f"{m:+.3f}{'*' * bool(abs(m) > h)}" for m, h in means) + " |", flush=True)
 

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStarConfig
 from ufmstar_torch.eval.engine.judge import UFM
 from ufmstar_torch.eval.engine.load import NetworkChoice
-from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
+from ufmstar_torch.eval.engine.stream import FrameResult, frame_results
 from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.eval.run.job import Checkpoint, RunJob
+from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.open import open_sequence
@@ -65,19 +65,19 @@ def rest(entry: Entry, seed: int) -> NDArray[np.float32]:
     return np.where(np.any([*removed(depth, seed).values()], axis=0), np.float32(0), depth)
 
 
-class RemovedHalf(FrameSink):
+class RemovedHalf:
     """Figures of the network and of the posterior on the removed half of a sequence's depth."""
 
     def __init__(self, whole: FrameSequence) -> None:
         self._whole, self.anchors = whole, list[int]()
         self.network, self.posterior = ({cause: SequenceMetrics() for cause in ("all", *CAUSES)} for _ in range(2))
 
-    def take(self, result: FrameResult) -> None:
+    def add(self, result: FrameResult) -> None:
         """Add a frame."""
         if UFM not in result.rows:
             return
         row, frame = result.rows[UFM], self._whole[result.index]
-        if frame.depth is None or row.posterior_depth is None or row.landmarks is None:
+        if frame.depth is None or not row.corrected or row.landmarks is None:
             return
         causes = removed(frame.depth, result.index)
         for cause, gone in {"all": np.any([*causes.values()], axis=0), **causes}.items():
@@ -85,8 +85,8 @@ class RemovedHalf(FrameSink):
             truth = truth_at(replace(frame, depth=hidden), row.intrinsics, row.size)
             assert truth is not None
             target = torch.from_numpy(truth)
-            self.network[cause].update(row.depth, row.variance, target, row.valid)
-            self.posterior[cause].update(row.posterior_depth, row.posterior_variance, target, row.valid, row.mixture)
+            self.network[cause].update(row.prediction.depth[0], row.map("ufm_variance"), target, row.valid)
+            self.posterior[cause].update(row.depth, row.variance, target, row.valid, row.mixture)
         self.anchors.append(len(row.landmarks.depth))
 
 
@@ -105,11 +105,12 @@ def measure(path: str, weights: str, sensor: str | None, images: bool, frames: i
         replace(whole, entries=entries), range(len(entries)), source, config.within(source.max_depth, False),
         torch.device("cpu"), {}, landmarks="dense", sensor=sensor,
     )  # fmt: skip
-    row, judged = job.row(Checkpoint()), RemovedHalf(whole)
+    (row, _), judged = job.row(), RemovedHalf(whole)
     assert row.anchors is not None
     without_images = patch.object(row.anchors.tracks, "of", return_value=None)
     with nullcontext() if images else without_images:
-        FrameStream(job.sequence, job.indices, [row]).drive([judged])
+        for result in frame_results(job.sequence, job.indices, [row]):
+            judged.add(result)
     return judged
 
 

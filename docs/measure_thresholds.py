@@ -36,7 +36,7 @@ from ufmstar_torch.eval.report.figures_gates import gates_figure, intervals_figu
 from ufmstar_torch.eval.report.style import new_figure
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.open import open_sequence
-from ufmstar_torch.frames.output import UfMStarOutput
+from ufmstar_torch.frames.output import UncertaintyOutput
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.trained import load_trained
 from ufmstar_torch.posterior.conformal import LEVELS, TRANSFER
@@ -63,7 +63,7 @@ class Frame:
     """One frame: its image [H, W, 3], UfM*'s output, and the ground truth [h, w] [m], 0 = none."""
 
     image: NDArray[np.uint8]
-    out: UfMStarOutput
+    out: UncertaintyOutput
     truth: Tensor
 
     @property
@@ -97,7 +97,7 @@ def frames_of(source: str, weights: Path | None, noise: float) -> Iterator[Frame
         out = model(frame.image, T, frame.intrinsics)
         truth = truth_at(frame, out.intrinsics[0].numpy(), (out.depth.shape[1], out.depth.shape[2]))
         if truth is not None:
-            yield Frame(frame.image, out.ufm, torch.from_numpy(truth))
+            yield Frame(frame.image, out, torch.from_numpy(truth))
 
 
 def standard_errors(frame: Frame) -> Tensor:
@@ -129,13 +129,13 @@ def gates(depth: Tensor, variance: Tensor, frame: Frame) -> list[tuple[Tensor, T
     return [(error[(ratio > low) & (ratio <= high)]) for low, high in pairwise(GATES)]
 
 
-def rules(out: UfMStarOutput, nearer: float) -> dict[str, Tensor]:
+def rules(out: UncertaintyOutput, nearer: float) -> dict[str, Tensor]:
     """By name, [h, w] True where a rule takes a pixel for nearer than ``nearer`` [m]."""
     found = {
-        "network: d < x": out.depth[0] < nearer,
-        "plain: d - 2 sigma < x": out.depth[0] - 2 * out.std[0] < nearer,
+        "network: d < x": out.network_depth[0] < nearer,
+        "plain: d - 2 sigma < x": out.network_depth[0] - 2 * out.ufm_variance[0].sqrt() < nearer,
     }
-    depth, variance = (x[0] for x in out.posterior())
+    depth, variance = out.depth[0], out.variance[0]
     found |= {"posterior: d < x": depth < nearer, "posterior: d - 2 sigma < x": depth - 2 * variance.sqrt() < nearer}
     if out.has_intervals:
         p = out.probability_nearer(nearer)[0]
@@ -170,7 +170,7 @@ def main() -> None:
         late = with_intervals[FIRST - len(frames) :] if len(frames) > FIRST + LAST / 2 else with_intervals[-LAST:]
         metrics = SequenceMetrics()
         for frame in late:
-            depth, variance = frame.out.posterior()
+            depth, variance = frame.out.depth, frame.out.variance
             level = frame.out.distribution().central_level(frame.truth[None].double())
             metrics.update(depth, variance, frame.truth[None], frame.out.valid, level=level)
         figures, curves[name] = metrics.compute(), metrics.curves()
@@ -180,7 +180,9 @@ def main() -> None:
         for kind in ("plain", "posterior"):
             parts = [[] for _ in GATES[1:]]
             for frame in late:
-                depth, variance = (frame.out.depth, frame.out.variance) if kind == "plain" else frame.out.posterior()
+                out = frame.out
+                plain, best = (out.network_depth, out.ufm_variance), (out.depth, out.variance)
+                depth, variance = plain if kind == "plain" else best
                 for part, error in zip(parts, gates(depth[0], variance[0], frame), strict=True):
                     part.append(error)
             tables[name, kind] = [torch.cat(part) for part in parts]
@@ -219,7 +221,7 @@ def print_gates(tables: dict[tuple[str, str], list[Tensor]]) -> None:
 def draw_maps(file: Path, frame: Frame, nearer: float) -> None:
     """The image, what supports its depth, and a row of the interval with the truth."""
     out, figure = frame.out, new_figure(11, 6.6, "")
-    (lower, upper), (depth, _) = (x[0].numpy() for x in out.interval(0.9)), (x[0].numpy() for x in out.posterior())
+    (lower, upper), depth = (x[0].numpy() for x in out.interval(0.9)), out.depth[0].numpy()
     assert out.posterior_outlier is not None
     maps = {
         "measured: share seen from two views": (out.measured[0].numpy(), "viridis", 1.0),

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jsonargparse import auto_cli
+import tyro
 
 from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.metrics import RMSE, mean_and_ci
@@ -73,4 +73,4 @@ def main(seeds: int = 4, frames: int = 160, labels: int = 12, steps: int = 60) -
 
 
 if __name__ == "__main__":
-    auto_cli(main)
+    tyro.cli(main)

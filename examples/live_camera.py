@@ -22,7 +22,7 @@ from ufmstar_torch.models import load_network
 def main(words: Sequence[str] | None = None) -> Any:
     """Show the camera until q is pressed; the counts of images, drops and skips."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--weights", required=True, help="FastDepth's: .onnx or .tflite")
+    parser.add_argument("--weights", required=True, help="FastDepth's: .onnx")
     parser.add_argument("--trajectory", required=True, help="lines are added by a SLAM")
     parser.add_argument("--intrinsics", required=True, nargs=4, type=float, metavar=("FX", "FY", "CX", "CY"))
     parser.add_argument("--camera", type=int, default=0)

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from jsonargparse import auto_cli
+import tyro
+from train_decision import TrainDecision, image_statistics
 
 from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.metrics import mean_and_ci
 from ufmstar_torch.eval.tour import tour_sequence
-from ufmstar_torch.frames.online import TrainDecision, image_statistics
 from ufmstar_torch.models import load_trained
 from ufmstar_torch.train import loss_of
 
@@ -65,4 +65,4 @@ def main(walks: int = 4, frames: int = 64, cost: float = 0.06) -> dict[str, list
 
 
 if __name__ == "__main__":
-    auto_cli(main)
+    tyro.cli(main)

@@ -11,19 +11,18 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from ufmstar_torch.eval.engine.estimators import Alone
+from ufmstar_torch.eval.engine.estimators import Estimator, output_of
 from ufmstar_torch.eval.metrics.base import COUNT, SumMetric, share
 from ufmstar_torch.eval.sequences.frame import Entry, make_sequence
 
 
-class ShareOfDepth(Alone):
+class ShareOfDepth(Estimator):
     """The standard deviation is a tenth of the depth. The method has no state."""
 
-    def update(self, predicted, T_world_cam, anchors=None):
-        answer = super().update(predicted, T_world_cam)
-        return {**answer, "variance": (0.1 * answer["depth"]).square().where(answer["valid"], torch.nan)}
+    def update(self, prediction, T_world_cam, anchors=None):
+        depth = prediction.depth
+        return output_of(depth, (0.1 * depth).square(), valid=(depth > 0) & depth.isfinite())
 
 
 class Coverage(SumMetric):

@@ -206,7 +206,7 @@ class CameraNode:
         out, settings = result.out, self._settings
         depth, variance = out.depth, out.variance
         sigma = variance.sqrt()
-        valid = out.ufm.valid & (depth > 0) & sigma.isfinite()
+        valid = out.valid & (depth > 0) & sigma.isfinite()
         if settings.max_relative_sigma > 0:
             valid &= sigma <= settings.max_relative_sigma * depth
         z, s = (torch.where(valid, values, torch.nan)[0].cpu().float().numpy() for values in (depth, sigma))
@@ -223,7 +223,7 @@ class CameraNode:
         self._topics["points"].publish(self._cloud(header, z, s, K))
         if settings.obstacle_range > 0:
             near = self._near(result)
-            whole, spread = (torch.where(out.ufm.valid, x, torch.nan)[0].cpu().float().numpy() for x in (depth, sigma))
+            whole, spread = (torch.where(out.valid, x, torch.nan)[0].cpu().float().numpy() for x in (depth, sigma))
             mark = near & np.isfinite(whole)
             self._topics["obstacles"].publish(self._cloud(header, np.where(mark, whole, np.nan), spread, K))
 

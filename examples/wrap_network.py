@@ -7,7 +7,7 @@ from importlib.resources import files
 from typing import Any
 
 import torch
-from jsonargparse import auto_cli
+import tyro
 from torch import Tensor
 
 from ufmstar_torch import UncertainDepth
@@ -30,7 +30,7 @@ def main(tour: int = 5, frames: int = 40) -> dict[str, SequenceMetrics]:
     for frame in (walk[i] for i in range(frames)):
         out = model(frame.image, frame.T_world_cam, frame.intrinsics)  # NumPy arrays, PIL images or tensors
         truth = wrapped.preprocess.apply_depth(torch.from_numpy(frame.depth))
-        rows["UfM*"].update(out.prediction.depth[0], out.ufm.variance[0], truth)
+        rows["UfM*"].update(out.network_depth[0], out.ufm_variance[0], truth)
         rows["posterior"].update(out.depth[0], out.variance[0], truth)
     for name, metrics in rows.items():
         figures = metrics.compute()
@@ -39,4 +39,4 @@ def main(tour: int = 5, frames: int = 40) -> dict[str, SequenceMetrics]:
 
 
 if __name__ == "__main__":
-    auto_cli(main)
+    tyro.cli(main)

@@ -30,7 +30,7 @@ from ufmstar_torch.models.dropout import DecoderDropout
 from ufmstar_torch.models.network import INITIAL_DEPTH, MULTIPLE, Backbone, DepthNetwork, require_image
 from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec, providers_for
 from ufmstar_torch.models.onnx_weights import read_convolutions
-from ufmstar_torch.models.outputs import METRIC, OutputSpec, PlainSpec, ProgramSpec
+from ufmstar_torch.models.outputs import METRIC, OutputSpec, PlainSpec
 from ufmstar_torch.models.preprocess import Preprocess
 
 # Strides of the encoder's stem and 13 blocks.
@@ -283,7 +283,7 @@ def load_fastdepth(
     threads: int | None = None,
     device: torch.device | str = "cpu",
 ) -> DepthNetwork:
-    """Load the network from an ONNX export, a .tflite file or a state_dict file, which determines its widths.
+    """Load the network from an ONNX export or a state_dict file, which determines its widths.
 
     Args:
         weights: the file.
@@ -291,7 +291,7 @@ def load_fastdepth(
         runtime: "auto": an ONNX export without dropout runs in ONNX Runtime if that is installed and has a provider for
             the device; "onnx": it runs there if possible, also without such a provider; "torch": a :class:`FastDepth`,
             which can be trained.
-        threads: of ONNX Runtime or LiteRT; None: torch's number.
+        threads: of ONNX Runtime; None: torch's number.
         device: device of the inference.
 
     Raises:
@@ -302,10 +302,6 @@ def load_fastdepth(
     if runtime not in ("auto", "onnx", "torch"):
         raise ValueError(f"runtime must be 'auto', 'onnx' or 'torch', got {runtime!r}")
     threads = threads or torch.get_num_threads()
-    if weights.suffix == ".tflite":
-        from ufmstar_torch.models.litert_network import LiteRTNetwork
-
-        return LiteRTNetwork(weights, ProgramSpec(OutputSpec(METRIC), Preprocess.nyu(size)), threads=threads)
     if weights.suffix == ".onnx":
         if positive != "relu":
             raise ValueError(f"an ONNX export of FastDepth ends in a ReLU, got positive={positive!r}")

@@ -1,8 +1,8 @@
 """The fastest form of loaded networks for inference.
 
-ONNX weights run in ONNX Runtime, on the CPU or on a GPU with its provider, and a .tflite file in LiteRT. All others run
-in torch: ``Backbone`` networks in channels-last format, FastDepth with folded batch norms (docs/results/speed.md has
-the times). The results equal those of the loaded network up to rounding.
+ONNX weights run in ONNX Runtime, on the CPU or on a GPU with its provider. All others run in torch: ``Backbone``
+networks in channels-last format, FastDepth with folded batch norms (docs/results/speed.md has the times). The results
+equal those of the loaded network up to rounding.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from torch import nn
 from ufmstar_torch.models.batch_ensemble import BatchEnsembleMember
 from ufmstar_torch.models.fastdepth import FastDepth
 from ufmstar_torch.models.heads import UncertaintyNetwork
-from ufmstar_torch.models.litert_network import LiteRTNetwork
 from ufmstar_torch.models.network import Backbone, DepthNetwork
 from ufmstar_torch.models.onnx_network import OnnxNetwork, providers_for
 from ufmstar_torch.runtime.checked import Checked, choice, number
@@ -58,7 +57,7 @@ class Inference(Checked):
             return {**threads, "providers": providers_for(device)}
         if model == "fastdepth":
             return {**threads, "runtime": TORCH if self._torch_only else self.runtime, "device": device}
-        return threads if model == "litert" else {}
+        return {}
 
     def ready(self, network: DepthNetwork, weights: Path, device: torch.device) -> DepthNetwork:
         """The fastest form of the network on ``device``; the argument is not changed.
@@ -71,11 +70,10 @@ class Inference(Checked):
         Raises:
             ValueError: the runtime or the precision does not support these weights.
         """
-        if isinstance(network, OnnxNetwork | LiteRTNetwork):
-            name = "ONNX Runtime" if isinstance(network, OnnxNetwork) else "LiteRT"
-            if self._torch_only or (self.runtime == ONNX and name == "LiteRT"):
+        if isinstance(network, OnnxNetwork):
+            if self._torch_only:
                 requested = f"runtime {self.runtime} in {self.precision}"
-                raise ValueError(f"{weights} is a graph that only {name} runs, not {requested}")
+                raise ValueError(f"{weights} is a graph that only ONNX Runtime runs, not {requested}")
             return network
         if self.runtime == ONNX:
             raise ValueError(
@@ -94,9 +92,6 @@ def runtime_of(network: nn.Module, precision: str) -> dict[str, Any]:
     if isinstance(network, OnnxNetwork):
         details = {"provider": network.session.get_providers()[0], "threads": network.threads or None}
         return {"name": "onnxruntime", "version": version("onnxruntime"), **details, "precision": "as in the file"}
-    if isinstance(network, LiteRTNetwork):
-        details = {"version": version("ai-edge-litert"), "threads": network.threads or None}
-        return {"name": "litert", **details, "precision": "as in the file"}
     return {"name": "torch", "version": torch.__version__, "threads": torch.get_num_threads(), "precision": precision}
 
 

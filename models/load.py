@@ -15,7 +15,6 @@ _LOADERS = {
     "exported": ("any_network", "load_exported"),
     "fastdepth": ("fastdepth", "load_fastdepth"),
     "huggingface": ("hugging_face", "load_hugging_face"),
-    "litert": ("litert_network", "LiteRTNetwork"),
     "monodepth2": ("monodepth2_import", "load_monodepth_resnet"),
     "onnx": ("fastdepth", "load_graph"),
     "torchscript": ("any_network", "load_torchscript"),
@@ -38,15 +37,14 @@ def load_network(name: str, weights: str | Path | None = None, **options: Any) -
         weights: its file.
         options: depend on the name:
             fastdepth: ``size``, ``dropout``, ``positive`` with a state_dict, ``runtime``, ``threads`` and ``device``.
-                ``weights``: an ONNX export, which runs in ONNX Runtime (``runtime="torch"``: in torch), a .tflite file,
-                or a state_dict (.pth, .pt, .safetensors).
+                ``weights``: an ONNX export, which runs in ONNX Runtime (``runtime="torch"``: in torch), or a
+                state_dict (.pth, .pt, .safetensors).
             monodepth2: ``strides`` ("v1.5" or "v1"), ``size``, ``dropout``. ``weights``: a state_dict. Or a folder with
                 Monodepth2's published encoder.pth and depth.pth, and ``spec`` (see ``PublishedSpec``).
             trained: ``backbone``, the module below the head if it is a custom one. ``weights``: a file of
                 ``save_trained``; several members become one network (``Ensemble``). ``load_trained`` returns them
                 separately, and accepts several files.
             onnx: ``spec`` (an ``OnnxSpec``, a dict or a JSON file), ``threads``, ``providers``.
-            litert: ``spec`` (a ``ProgramSpec``, a dict or a JSON file), ``threads``. ``weights``: a .tflite file.
             depth_anything: ``spec`` with "size", "keep_aspect" and, for a relative checkpoint, "alignment" (a dict or
                 a JSON file). ``weights``: a directory or hub name of ``transformers``.
             huggingface: ``spec`` with "kind" and other fields of ``HuggingFaceSpec``. ``weights`` as above.

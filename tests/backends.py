@@ -26,7 +26,7 @@ from ufmstar_torch.kernels.cpu import regress as regress_cpu
 from ufmstar_torch.kernels.cpu import rigid as rigid_cpu
 from ufmstar_torch.kernels.cpu import segment as segment_cpu
 from ufmstar_torch.kernels.host import moved
-from ufmstar_torch.kernels.select import select_check, select_kernels
+from ufmstar_torch.kernels.select import select_frame, select_kernels
 from ufmstar_torch.steps.correspond import Correspondence
 from ufmstar_torch.steps.segment_input import SegmentInput
 from ufmstar_torch.steps.step_parts import REFERENCE, Kernels
@@ -68,17 +68,17 @@ class Backend:
 def make_backend(name: str) -> Backend:
     """Return the named backend; skip the test where this machine cannot run it."""
     if name == "torch":
-        return Backend(name, "cpu", REFERENCE, select_check(name, "cpu"))
+        return Backend(name, "cpu", REFERENCE, select_frame(name, "cpu").check)
     if name == "numba":
         numba_kernels = replace(
             REFERENCE, spgf=segment_cpu.segment, floor_covariance=_floored, correspond=_corresponding, fuse=_fused,
             regress_image=_regressed,
         )  # fmt: skip
-        return Backend(name, "cpu", numba_kernels, select_check(name, "cpu"))
+        return Backend(name, "cpu", numba_kernels, select_frame(name, "cpu").check)
     if not INTERPRETED and not torch.cuda.is_available():
         pytest.skip("needs TRITON_INTERPRET=1 or a CUDA device")
     device = "cpu" if INTERPRETED else "cuda"
-    kernels, check = select_kernels(name, device), select_check(name, device)
+    kernels, check = select_kernels(name, device), select_frame(name, device).check
     if device != "cpu":
         kernels = Kernels(**{f.name: _on(device, getattr(kernels, f.name)) for f in fields(kernels)})
         check = _on(device, check)

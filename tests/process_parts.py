@@ -1,6 +1,6 @@
 """A plug-in for spawned processes: a sequence reader that kills the process, fails or waits.
 
-``NAME.act`` contains "kill", "fail", "wait" or "go".
+``NAME.act`` contains "kill", "fail", "wait", "go", or "hold": it goes once a file "release" is beside it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ class Acting:
     def read(path, options):
         act = path.read_text()
         path.with_suffix(f".{os.getpid()}").touch()
-        while act != "go" and len(list(path.parent.glob("*.[0-9]*"))) < 2:
+        while act == "hold" and not path.with_name("release").exists():
+            time.sleep(0.02)
+        while act not in ("go", "hold") and len(list(path.parent.glob("*.[0-9]*"))) < 2:
             time.sleep(0.02)  # until another process has started, too
         if act == "kill":
             os.kill(os.getpid(), signal.SIGKILL)

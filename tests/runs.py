@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 
 import numpy as np
@@ -45,6 +46,7 @@ def network_job(path, *members, mode="alternate", **options):
     """A job with networks, at 24x32 so that prediction and image differ in size."""
     members = members or (Brightness(),)
     source = networks(*members, identity={"networks": [network.gain for network in members]})
+    source.digest = hashlib.sha256(repr([(n.gain, n.spread) for n in members]).encode()).hexdigest()
     return job_of(open_sequence(path), source, every=mode == "full", **options)
 
 
@@ -63,7 +65,7 @@ def job_of(sequence, source, frames=slice(None), config=CONFIG, **options):
 def outputs(out):
     """By file, every output that must not depend on interruptions: exact bytes, or values without times."""
     result = {}
-    for file in sorted(out.rglob("*")):
+    for file in sorted(path for path in out.rglob("*") if "cache" not in path.parts):
         name = str(file.relative_to(out))
         if file.suffix == ".npz":
             with np.load(file) as stored:
@@ -72,7 +74,7 @@ def outputs(out):
             result[name] = [without_times(json.loads(line)) for line in file.read_text().splitlines()]
         elif name == "summary.json":
             result[name] = without_times(json.loads(file.read_text()))
-        elif file.is_file() and file.parent.name != "resume":
+        elif file.is_file():
             result[name] = file.read_bytes()
     return result
 

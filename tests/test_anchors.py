@@ -11,8 +11,9 @@ from oracle_anchors import weight
 
 import scenes
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
-from ufmstar_torch.anchors.anchors import AnchorInput, Anchors
+from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.evidence import Evidence, inliers, means, observe
+from ufmstar_torch.frames.frame import AnchorInput
 
 HEIGHT, WIDTH = 48, 64
 ON = UfMStarConfig(anchors=AnchorConfig(), unmeasured="paper")  # evidence alone

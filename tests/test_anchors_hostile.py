@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 import scenes
 from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig
-from ufmstar_torch.anchors.anchors import AnchorInput, Anchors
+from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.evidence import Evidence, inliers, observe
+from ufmstar_torch.frames.frame import AnchorInput
 
 H, W = 48, 64
 ON = UfMStarConfig(anchors=AnchorConfig())
@@ -72,7 +73,7 @@ def test_many_rejected_anchors_widen_the_variance(predicted, truth, right, far, 
     many, statistics = far > right, out.statistics
     assert statistics.anchors_rejected.tolist() == [far, 0]
     assert int(statistics.anchors_used[1]) > 0.9 * n
-    for sigma in (out.std, out.posterior_variance.sqrt()):
+    for sigma in (out.ufm_variance.sqrt(), out.std):
         assert float(sigma[1].median()) < 0.3 * predicted
         assert (sigma[0] > 0.3 * abs(truth - predicted)).all() if many else sigma[0].median() < 0.3 * predicted
     assert [record.message[:9] for record in caplog.records if "anchors are off" in record.message] == [

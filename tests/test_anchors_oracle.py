@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,11 +13,11 @@ from walks import HEIGHT, SPGF, WIDTH, oracle_settings
 
 import scenes
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
-from ufmstar_torch.anchors.anchors import AnchorInput, Anchors, check_anchors
+from ufmstar_torch.anchors.anchors import Anchors, check_anchors
 from ufmstar_torch.anchors.evidence import Evidence, inliers
-from ufmstar_torch.anchors.extension import learn
 from ufmstar_torch.anchors.kernels import learn as anchors_cpu
-from ufmstar_torch.frames.frame import check_frame
+from ufmstar_torch.anchors.learn import Learnt, learn
+from ufmstar_torch.frames.frame import AnchorInput, check_frame
 from ufmstar_torch.kernels.cpu.regress import regress_maps, views_of
 from ufmstar_torch.steps.regress import distribute
 
@@ -193,17 +195,19 @@ def test_the_compiled_lesson_is_the_references_own(n, dtype, tolerance):
     frame = check_frame(
         seen, torch.eye(4), torch.tensor(K), None, None, None, None, feature_count=0, rotation_tolerance=1e-3
     )
-    slow = fast = Evidence(torch.zeros(2, mixture.capacity, 3, dtype=dtype), torch.zeros(2, 3, dtype=dtype))
+    start = Evidence(torch.zeros(2, mixture.capacity, 3, dtype=dtype), torch.zeros(2, 3, dtype=dtype))
+    a = b = Learnt(start, *[torch.empty(0)] * 3)
     for _ in range(3):
         pixel = torch.rand(2, n, 2, generator=generator) * torch.tensor([WIDTH, HEIGHT]) - 0.5
         relative = 1.2 + 0.1 * torch.randn(2, n, generator=generator)
         u, v = pixel.round().long().clamp_min(0).unbind(-1)
         g = seen[0, v.clamp_max(HEIGHT - 1), u.clamp_max(WIDTH - 1)] * relative
         anchors = check_anchors(Anchors(pixel, g, (0.02 * g).square()), frame, (0.01 * seen,))
-        a = learn(slow, mixture, frame, anchors, config, distribute)
+        anchored = replace(frame, anchors=anchors)
+        a = learn(a.tensors(), mixture, anchored, config, distribute)
         components = seen_of(mixture, features=3)
         views = views_of(components, frame.depth, frame.intrinsics, config, dtype)
-        b = anchors_cpu.learn_in_view(fast, mixture.capacity, components, views, frame, anchors, config)
+        b = anchors_cpu.learn_in_view(b.tensors(), mixture.capacity, components, views, anchored, config)
         slow, fast = a.evidence, b.evidence
         assert torch.equal(a.used, b.used)
         for name in ("beyond", "stream"):

@@ -145,12 +145,12 @@ def test_the_pipeline_takes_anchors_in_the_images_pixels(preprocess):
             by_hand = Anchors((anchors.pixel + 0.5) / 2 - 0.5, anchors.depth, anchors.variance, anchors.valid)
         expected = ufm(1.2 * x[:, 0], pose, K_map, torch.full_like(x[:, 0], 0.01), anchors=by_hand)
         for name in ("variance", "anchored", "bias"):
-            torch.testing.assert_close(getattr(out.ufm, name), getattr(expected, name), equal_nan=True)
-        assert torch.equal(out.ufm.statistics.anchors_used, expected.statistics.anchors_used)
-        of_forty, of_twenty_five = out.ufm.statistics.anchors.tolist()
+            torch.testing.assert_close(getattr(out, name), getattr(expected, name), equal_nan=True)
+        assert torch.equal(out.statistics.anchors_used, expected.statistics.anchors_used)
+        of_forty, of_twenty_five = out.statistics.anchors.tolist()
         assert 38 <= of_forty <= 40, "all but the anchors at pixels without depth in the half-size image"
         assert 23 <= of_twenty_five <= 25
-    assert float(out.ufm.anchored[out.ufm.valid].mean()) > 0.05
+    assert float(out.anchored[out.valid].mean()) > 0.05
     with pytest.raises(ValueError, match="anchors"):
         UncertainDepth(Biased(), posterior=False)(image, pose, intrinsics, anchors=anchors)
 

@@ -7,7 +7,16 @@ import inspect
 import pytest
 
 import ufmstar_torch
-from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch import (
+    AnchorConfig,
+    ConfidenceConfig,
+    MergeConfig,
+    PosteriorConfig,
+    UfMStar,
+    UfMStarConfig,
+    UncertainDepth,
+)
+from ufmstar_torch.runtime.checked import flat
 
 PUBLIC = {
     "DepthPrediction",
@@ -22,7 +31,7 @@ PUBLIC = {
     "SPGFConfig",
     "UfMStar",
     "UfMStarConfig",
-    "UfMStarOutput",
+    "UncertaintyOutput",
     "UncertainDepth",
 }
 
@@ -43,10 +52,10 @@ def test_public_names():
 
 def test_signatures():
     observation = ["depth", "pose", "intrinsics", "aleatoric", "epistemic", "valid", "features"]
-    assert names(UfMStar.__init__) == ["config", "extensions", "dtype", "device"]
-    view = ["member", "informative"]
-    assert names(UfMStar.forward) == [*observation, *view, "inputs"]
-    assert names(UfMStar.mean_uncertainty) == [*observation, *view, "pixels", "fraction", "seed", "average", "inputs"]
+    assert names(UfMStar.__init__) == ["config", "recalibration", "dtype", "device"]
+    view, sampled = ["member", "informative"], ["pixels", "fraction", "seed", "average"]
+    assert names(UfMStar.forward) == [*observation, *view, "anchors", "confidence"]
+    assert names(UfMStar.mean_uncertainty) == [*observation, *view, *sampled, "anchors", "confidence"]
     assert names(UfMStar.query) == ["points", "frame"]
     assert names(UfMStar.reset) == ["streams", "keep_evidence"]
     made_of = [
@@ -65,6 +74,12 @@ def test_signatures():
     images = ["image", "pose", "intrinsics", "valid", "features", "anchors"]
     assert names(UncertainDepth.forward) == images
     assert names(UncertainDepth.mean_uncertainty) == [*images, "pixels", "fraction", "seed", "average"]
+
+
+def test_few_settings():
+    """The core has at most 50 settings, those of all sections together."""
+    sections = {"anchors": AnchorConfig(), "confidence": ConfidenceConfig(), "posterior": PosteriorConfig()}
+    assert len(flat(UfMStarConfig(**sections, merge=MergeConfig()).to_dict())) <= 50
 
 
 def test_the_papers_defaults():

@@ -13,6 +13,7 @@ from layouts import write_tum
 from onnx_files import small_network, write_fastdepth
 
 from ufmstar_torch import cli
+from ufmstar_torch.eval.bench.settings import BenchSettings
 from ufmstar_torch.eval.bench.timing import STAGES, StagedStep, paired_ratio, pinned_threads, spread
 from ufmstar_torch.eval.commands.bench import main, read
 
@@ -53,7 +54,7 @@ def test_every_moment_belongs_to_the_stage_that_needs_it(work):
             return work(1000)  # the output's assembly
 
     module = Module()
-    staged = StagedStep(module, module)
+    staged = StagedStep(module, module, clock=time.perf_counter)
     for seconds in (100, 1, 2, 3):
         staged(seconds)
     summary = staged.summary(warm_up=1)
@@ -108,7 +109,9 @@ def test_a_tiny_run_from_end_to_end(tmp_path, capsys):
     for row in rows.values():
         assert row["latency"]["multiview"]["count"] == row["ratios_to_depth"]["multiview"]["count"] == 2
         assert row["latency"]["multiview"]["min_ms"] > 0
-    assert plain["stages"].keys() == {"stages", "stages_total"}
+    assert plain["stages"].keys() == {"stages", "stages_total", "beside_the_paper"}
+    assert 0 < plain["stages"]["beside_the_paper"]["median"] < 1
+    assert plain["sample"]["ratio_to_step"]["count"] == plain["sample"]["latency"]["count"] == 2
     sizes = [row["memory"]["multiview"]["bytes_end"] for row in (plain, corners, posterior)]
     assert sizes == sorted(sizes), "landmarks and the posterior add to the mixture's memory"
     assert reference["memory"]["multiview"] == plain["memory"]["multiview"], "the same mixture"
@@ -129,3 +132,10 @@ def test_a_network_of_ones_own_on_a_recording(tmp_path):
     assert result["sequence"]["layout"] == "tum"
     assert result["networks"]["depth_only"]["latency"]["once"]["count"] == 2
     assert cli.main(["bench", "--sequence", "nowhere"]) == 2
+
+
+def test_the_processor_s_time_needs_one_thread_on_the_cpu():
+    assert BenchSettings(clock="cpu", threads=1).clock == "cpu"
+    for wrong in ({"threads": 2}, {}, {"threads": 1, "device": "cuda"}):
+        with pytest.raises(ValueError, match="--clock cpu needs --threads 1"):
+            BenchSettings(clock="cpu", **wrong)

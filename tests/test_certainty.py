@@ -21,7 +21,7 @@ from ufmstar_torch.frames.networks import NetworksInTurn
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models import Ensemble, wrap_network
 from ufmstar_torch.models.alignment import AlignedNetwork, Alignment
-from ufmstar_torch.runtime.stateful import flat
+from ufmstar_torch.runtime.checked import flat
 
 pytestmark = pytest.mark.numerics
 
@@ -72,9 +72,9 @@ def test_the_pipeline_follows_the_networks_stated_range(ranges, max_depth, expec
     model = UncertainDepth([Ranged(r) for r in ranges], UfMStarConfig(segment=replace(SPGF, max_depth=max_depth)))
     assert model.ufm.config.segment.max_depth == expected
     out = model(torch.rand(1, 3, H, W), torch.eye(4), K)
-    left = out.ufm.valid[..., : W // 2]
+    left = out.valid[..., : W // 2]
     assert bool(left.all()) is (expected == 80.0)
-    assert int(out.ufm.statistics.beyond[0]) == int((~left).sum())
+    assert int(out.statistics.beyond[0]) == int((~left).sum())
 
 
 def test_declared_ranges_reach_the_pipeline_and_the_evaluation():

@@ -15,7 +15,7 @@ from layouts import write_generic
 from runs import Brightness, outputs, read_summary
 from shared_data import require_shared
 
-from ufmstar_torch import SPGFConfig, UfMStarConfig
+from ufmstar_torch import SPGFConfig, UfMStarConfig, cli
 from ufmstar_torch.eval.commands.run import read
 from ufmstar_torch.eval.engine import load as sources
 from ufmstar_torch.models import Preprocess
@@ -57,6 +57,22 @@ def test_help_lists_the_commands(ufmstar):
     assert ufmstar("--version")[:2] == (0, "0.1.0\n")
 
 
+HEAVY = ("torch", "numba", "scipy", "cv2", "PIL", "pandas", "matplotlib", "onnx", "transformers", "lightning")
+
+
+@pytest.mark.parametrize("words", [*([name, "--help"] for name in cli.COMMANDS), ["eval", "--list"]], ids=" ".join)
+def test_help_imports_no_heavy_package(words):
+    # train's options contain settings that are defined beside networks
+    heavy = [name for name in HEAVY if words[0] != "train" or name != "torch"]
+    program = (
+        "import contextlib, io, sys; from ufmstar_torch.cli import main\n"
+        f"with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit): main({words!r})\n"
+        f"print(len(out.getvalue()) > 200, [name for name in {heavy!r} if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("True []\n", "")
+
+
 @pytest.mark.slow
 def test_help_loads_nothing_beyond_the_package():
     code = (
@@ -89,16 +105,16 @@ MISTAKES = {
     "size without maps": ("--model x --weights y --size 2x2", "--size goes with --depth only"),
     "full with one": ("--model x --weights y --mode full", "--mode full needs several --weights"),
     "unknown option": ("--depth self --eta 1", "--eta"),
-    "out of range": ("--depth self --ufm.eta 3", "UfMStarConfig.eta must lie in (0.0, 1.0], got 3.0"),
+    "out of range": ("--depth self --set eta=3", "UfMStarConfig.eta must lie in (0.0, 1.0], got 3"),
     "frames": ("ufmstar run /nowhere --depth self --out {out} --frames 3", "START:STOP"),
     "no frames": ("--depth self --frames 9:", "selects none of the 6"),
     "size": ("--depth self --size 24", "--size must be HxW"),
     "plug-in in a configuration": (
-        '--depth self --config {{"plugin":["a.py"]}}',
+        "--depth self --config {plugin}",
         "--plugin allows code to run: type it on the command line",
     ),
     "trust in a configuration": (
-        '--depth self --config {{"trust_code":true}}',
+        "--depth self --config {trust}",
         "--trust-code allows code to run: type it on the command line",
     ),
     "trust without a program": (
@@ -116,8 +132,7 @@ MISTAKES = {
     "no data": ("--depth self --device meta", "--device meta is not"),
     "threads": ("--depth self --threads 0", "--threads"),
     "threads without measure": ("--depth self --threads 10000", "--threads must be 1 to"),
-    "contradiction": ("--depth self --resume --overwrite", "--resume and --overwrite contradict"),
-    "report": ("ufmstar report", "out"),
+    "report": ("ufmstar report", "The folder of `ufmstar eval`. (required)"),
     "bench: kind": ("ufmstar bench --frames x", "frames"),
     "bench: frames": ("ufmstar bench --frames 0", "--frames must be at least 1"),
     "bench: history": ("ufmstar bench --history 0", "--history must be at least 1"),
@@ -129,17 +144,17 @@ MISTAKES = {
     "live: folder": (f"ufmstar live images --follow --intrinsics 1 1 1 1 {NETWORK}", "images needs --trajectory FILE"),
     "live: overwrite": (f"ufmstar live - --overwrite {NETWORK}", "--overwrite goes with --out"),
     "live: trajectory": (f"ufmstar live - --trajectory t.txt {NETWORK}", "--trajectory does not go with -: each line"),
-    "live: drive": (f"ufmstar live - --drive 3 {NETWORK}", "--drive goes with recordings, not with -"),
+    "live: drive": (f"ufmstar live - --reader drive=3 {NETWORK}", "--drive goes with recordings, not with -"),
     "live: speed": (f"ufmstar live tour:3 --speed 0 {NETWORK}", "--speed must be positive"),
     "live: intrinsics": (f"ufmstar live /nowhere --intrinsics 1 2 {NETWORK}", "--intrinsics must be a file"),
     "live: scale": (f"ufmstar live tour:3 --scale-from network {NETWORK}", "--scale-from goes with ufmstar run"),
-    "live: anchors": (f"ufmstar live tour:3 --plain --ufm.anchors.half_life 5 {NETWORK}", "needs --anchors"),
+    "live: anchors": (f"ufmstar live tour:3 --plain --set anchors.half_life=5 {NETWORK}", "needs --anchors"),
     "live: layout": (f"ufmstar live {{path}}/images {NETWORK}", "has no known layout"),
-    "data: no command": ("ufmstar data", "the following arguments are required"),
+    "data: no command": ("ufmstar data", "A sequence, or a folder below which there are sequences. (required)"),
     "data: another command": ("ufmstar data mend x", "mend"),
     "data: no folder": ("ufmstar data check /nowhere", "no such file or folder"),
     "data: layout": ("ufmstar data check {path}/images", "has no known layout, and nothing below it has"),
-    "data: poses": ("ufmstar data check {path} --poses upside-down", "choose from 'camera-to-world'"),
+    "data: poses": ("ufmstar data check {path} --poses upside-down", "Expected one of ('camera-to-world'"),
     "data: pairs": ("ufmstar data check {path} --pairs 0", "pairs must be at least 1"),
     "data: intrinsics": (
         "ufmstar data check {path} --intrinsics 1 2 3",
@@ -157,16 +172,15 @@ MISTAKES = {
     "eval: spec": (f"{EVAL} --network depth_only=torchscript:n.ts --spec s", "--spec must be a file *.json"),
     "eval: no root": (f"{EVAL} --root /nowhere", "no such file or folder: /nowhere"),
     "eval: frames": (f"{EVAL} --root /nowhere --frames 5", "--frames must be START:STOP"),
-    "eval: shard": (f"{EVAL} --root /nowhere --shard 3/2", "--shard must be 1/n to n/n"),
-    "eval: shard and overwrite": (f"{EVAL} --shard 1/2 --overwrite", "--overwrite goes without shards"),
+    "eval: two kinds of processes": (f"{EVAL} --processes 2 --scheduler tcp://h:1", "give one of them"),
     "eval: both": (f"{EVAL} --resume --overwrite", "--resume and --overwrite contradict"),
     "eval: processes": (f"{EVAL} --processes 0", "--processes must be at least 1"),
     "eval: sequences": (f"{EVAL} --sequences 0", "--sequences must be at least 1"),
     "eval: list": (f"{EVAL} --sequence-list /nowhere.txt", "/nowhere.txt"),
     "demo: frames": ("ufmstar demo --frames 1 --out {out}", "--frames must be 2 to 150"),
     "demo: seed": ("ufmstar demo --seed -1 --out {out}", "--seed must be at least 0"),
-    "anchors": ("--depth self --plain --ufm.anchors.half_life 10", "--ufm.anchors.* needs --anchors"),
-    "posterior": ("--depth self --plain --ufm.posterior.prior_sigma 1", "--ufm.posterior.* needs the posterior"),
+    "anchors": ("--depth self --plain --set anchors.half_life=10", "--set anchors.* needs --anchors"),
+    "posterior": ("--depth self --plain --set posterior.half_life=9", "--set posterior.* needs the posterior"),
     "export": ("ufmstar export {path} --to depth", "no output of `ufmstar run`"),
 }
 
@@ -175,7 +189,10 @@ MISTAKES = {
 def test_a_mistake_is_reported_in_one_line(ufmstar, path, tmp_path, mistake):
     line, expected = MISTAKES[mistake]
     line = line if line.startswith("ufmstar") else f"ufmstar run {{path}} {line} --out {{out}}"
-    names = {"path": path, "out": tmp_path / "out", "tour": "tour:5?frames=3&size=64x96"}
+    (tmp_path / "plugin.json").write_text('{"plugin": ["a.py"]}')
+    (tmp_path / "trust.json").write_text('{"trust_code": true}')
+    files = {"plugin": tmp_path / "plugin.json", "trust": tmp_path / "trust.json"}
+    names = {**files, "path": path, "out": tmp_path / "out", "tour": "tour:5?frames=3&size=64x96"}
     code, out, err = ufmstar(*line.format(**names).split()[1:])
     assert (code, out) == (2, "")
     assert err.startswith("ufmstar")
@@ -194,35 +211,35 @@ def test_debug_shows_the_traceback(ufmstar, tmp_path):
 
 
 def test_settings_come_from_a_file_and_options(ufmstar, path, tmp_path):
-    (tmp_path / "c.yaml").write_text("ufm:\n  eta: 0.4\n  ema_alpha: 1\n  segment:\n    min_rows: 2\nframes: '1:5:2'\n")
-    words = ("--config", tmp_path / "c.yaml", "--ufm.eta", "0.3", "--preset", "tartanair_indoor")
+    (tmp_path / "c.toml").write_text("frames = '1:5:2'\n[set]\neta = 0.4\nema_alpha = 1\nsegment.min_rows = 2\n")
+    words = ("--config", tmp_path / "c.toml", "--set", "eta=0.3", "--preset", "tartanair_indoor")
     assert ufmstar("run", path, "--depth", "self", *words, *QUICK, "--out", tmp_path / "out")[0] == 0
     settings = read_summary(tmp_path / "out")["settings"]
-    assert settings["ufm"]["eta"] == 0.3
-    assert settings["ufm"]["ema_alpha"] == 1
-    assert settings["ufm"]["on_bad_frame"] == "skip"
+    assert settings["set"]["eta"] == 0.3
+    assert settings["set"]["ema_alpha"] == 1
+    assert settings["set"]["on_bad_frame"] == "skip"
     expected = {**SPGFConfig.preset("tartanair_indoor").to_dict(), "min_rows": 2}
-    assert settings["ufm"]["segment"] == expected
+    assert settings["set"]["segment"] == expected
     lines = [json.loads(line) for line in (tmp_path / "out" / "frames.jsonl").read_text().splitlines()]
     assert [line["index"] for line in lines] == [1, 3]
 
 
 def test_the_papers_settings_by_name():
-    words = ["walk", "--depth", "self", "--out", "out", "--plain", "--ufm-preset", "paper", "--ufm.eta", "0.4"]
+    words = ["walk", "--depth", "self", "--out", "out", "--plain", "--ufm-preset", "paper", "--set", "eta=0.4"]
     assert read(words).config == UfMStarConfig.paper().replace(eta=0.4, on_bad_frame="skip")
-    assert read([*words, "--ufm.segment.min_rows", "8"]).config.segment.min_rows == 8
+    assert read([*words, "--set", "segment.min_rows=8"]).config.segment.min_rows == 8
     mixed = read([*words, "--preset", "tum"]).config
     assert (mixed.segment, mixed.regression) == (SPGFConfig.preset("tum"), "neighbourhood")
 
 
 def test_the_settings_in_a_summary_are_a_configuration_file(ufmstar, path, tmp_path):
-    words = ("run", path, "--depth", "self", "--ufm.eta", "0.3", "--frames", ":2", *QUICK)
+    words = ("run", path, "--depth", "self", "--set", "eta=0.3", "--frames", ":2", *QUICK)
     ufmstar(*words, "--out", tmp_path / "a")
     (tmp_path / "c.json").write_text(json.dumps(read_summary(tmp_path / "a")["settings"]))
     code, _, err = ufmstar("run", path, "--config", tmp_path / "c.json", "--out", tmp_path / "b")
     assert code == 0, err
     settings = read_summary(tmp_path / "b")["settings"]
-    assert settings["ufm"]["eta"] == 0.3
+    assert settings["set"]["eta"] == 0.3
     assert settings["frames"] == ":2"
     assert (tmp_path / "a" / "frames" / "8.npz").read_bytes() == (tmp_path / "b" / "frames" / "8.npz").read_bytes()
 
@@ -269,10 +286,9 @@ def test_other_weights_under_the_same_name_do_not_go_on(ufmstar, path, tmp_path,
     words = ("run", path, "--model", "any", "--weights", *brightness.files, *QUICK, "--out", tmp_path / "out")
     assert ufmstar(*words)[0] == 0
     brightness.files[1].write_text("1.2")
-    code, _, err = ufmstar(*words, "--resume")
+    code, _, err = ufmstar(*words)
     assert code == 2
     assert "source.files.1.sha256 was" in err
-    assert ufmstar(*words)[0] == 2
     assert ufmstar(*words, "--overwrite")[0] == 0
 
 
@@ -291,15 +307,15 @@ def test_a_signal_ends_the_run_after_the_frame_in_hand(ufmstar, path, tmp_path, 
     code, _, err = ufmstar(*words, "--out", tmp_path / "out")
     assert code == 130
     assert "stopping after this frame" in err
-    assert "interrupted: stopped by the user after 3 of 6 frames; --resume goes on" in err
+    assert "interrupted: stopped by the user after 3 of 6 frames; the same command" in err
     assert signal.getsignal(signal.SIGINT) is before
     assert read_summary(tmp_path / "out")["state"] == "interrupted"
     brightness.at = None
-    assert ufmstar(*words, "--out", tmp_path / "out", "--resume")[0] == 0
-    whole, resumed = outputs(tmp_path / "whole"), outputs(tmp_path / "out")
-    for result in (whole, resumed):
+    assert ufmstar(*words, "--out", tmp_path / "out")[0] == 0
+    whole, again = outputs(tmp_path / "whole"), outputs(tmp_path / "out")
+    for result in (whole, again):
         del result["summary.json"]["settings"]["out"]
-    assert whole == resumed
+    assert whole == again
 
 
 def test_a_second_signal_ends_it_at_once(ufmstar, path, tmp_path, brightness):

@@ -86,7 +86,7 @@ REFUSED = {
         lambda: UfMStar(CONFIG.replace(features=1))(DEPTH, POSE, K), ValueError, "features must be given"
     ),
     "anchors that are off": (lambda: ufm(DEPTH, POSE, K, anchors=1), ValueError, "anchors must be None where"),
-    "an argument of no extension": (lambda: ufm(DEPTH, POSE, K, ancors=1), TypeError, "takes no argument 'ancors'"),
+    "an unknown argument": (lambda: ufm(DEPTH, POSE, K, ancors=1), TypeError, "unexpected keyword argument 'ancors'"),
     "a config that is a dict": (lambda: UfMStar({}), TypeError, "config must be a UfMStarConfig"),
     "a state in half precision": (lambda: UfMStar(dtype=torch.float16), ValueError, "dtype must be torch.float32"),
     **{
@@ -212,7 +212,7 @@ def network_of_zeros():
 
 
 PUBLIC = {
-    "UfMStar": (UfMStar, {"config": None, "extensions": (), "dtype": torch.float32, "device": None}),
+    "UfMStar": (UfMStar, {"config": None, "recalibration": None, "dtype": torch.float32, "device": None}),
     "forward": (
         lambda **k: seen()(**k), GOOD | dict.fromkeys(("aleatoric", "epistemic", "valid", "features")),
     ),

@@ -123,7 +123,7 @@ def test_unregistered_depth(tour):
     spoil_depth(tour, lambda depth: register_depth(depth, K, K_depth, T, SIZE))
     result = check_data(tour, pairs=2)
     assert any("not registered to the images" in problem for problem in result.problems)
-    assert any("--depth-intrinsics" in remedy for remedy in result.remedies)
+    assert any("--reader depth_intrinsics" in remedy for remedy in result.remedies)
 
 
 def test_broken_and_missing_frames_are_reported(tour, capsys):
@@ -178,7 +178,7 @@ def test_no_depth_and_no_poses(tmp_path, capsys):
     code, out = command(capsys, path)
     assert code == 0
     assert re.search(r"undecided +no two readable frames have depth", out)
-    assert out.splitlines()[-1] == "not checked: no depth, no metric scale"
+    assert out.splitlines()[-1] == "not checked: without depth, neither poses nor scale can be compared"
     report = check_data(path)
     assert report.ok
     assert not report.compared
@@ -233,3 +233,11 @@ def test_every_command_and_piece_of_code_on_the_page_runs(tmp_path, monkeypatch,
     for code in blocks(text):
         exec(compile(code, PAGE.name, "exec"), {})
     assert capsys.readouterr().out.splitlines() == ["7 scannet []", "[('scene0000_00', 'scannet')]"]
+
+
+def test_corners_that_agree_count_as_a_check_without_depth(tour, capsys):
+    shutil.rmtree(tour / "depth")
+    code, out = command(capsys, tour)
+    assert code == 0
+    assert re.search(r"corners +.*[1-9]\d* pairs?", out)
+    assert out.splitlines()[-1] == "poses and images agree; scale cannot be checked without depth"

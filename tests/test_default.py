@@ -55,11 +55,9 @@ def test_depth_and_std_are_the_posteriors_and_the_networks_stay_where_they_were(
     outs = followed(UncertainDepth(TooFar()))
     by_name = followed(UncertainDepth(TooFar(), posterior=True, anchors="dense"))
     for out, same in zip(outs, by_name, strict=True):
-        depth, variance = out.ufm.posterior()
-        for map_, expected in ((out.depth, depth), (out.variance, variance), (out.std, variance.sqrt())):
-            torch.testing.assert_close(map_, expected, rtol=0, atol=0, equal_nan=True)
+        torch.testing.assert_close(out.std, out.variance.sqrt(), rtol=0, atol=0, equal_nan=True)
         torch.testing.assert_close(out.depth, same.depth, rtol=0, atol=0, equal_nan=True)
-        assert torch.equal(out.prediction.depth, out.ufm.depth)
+        assert torch.equal(out.prediction.depth, out.network_depth)
     assert error(outs[-1].prediction.depth, walk()[-1]) == pytest.approx(BIAS - 1, abs=1e-3)
     assert error(outs[-1].depth, walk()[-1]) < 0.06
     assert not alone(caplog)
@@ -71,11 +69,11 @@ def test_without_the_posterior_it_is_ufm_star_alone():
         expected = ufm(network(torch.zeros(1, 3, 120, 160)).depth, frame.T_world_cam, frame.intrinsics)
         torch.testing.assert_close(out.variance, expected.variance, rtol=0, atol=0, equal_nan=True)
         assert torch.equal(out.depth, expected.depth)
-        assert out.ufm.posterior_depth is out.ufm.anchored is None
+        assert out.posterior_outlier is out.anchored is None
     assert model.landmarks is None
     anchored = UncertainDepth(TooFar(), posterior=False, anchors="corners")
     out = followed(anchored, frames=slice(4))[-1]
-    assert out.ufm.anchored is not None
+    assert out.anchored is not None
     assert torch.equal(out.depth, out.prediction.depth)
 
 
@@ -89,7 +87,7 @@ def test_every_stream_of_a_batch_has_its_own_evidence():
         torch.testing.assert_close(batch.variance[:1], out.variance, rtol=0, atol=0, equal_nan=True)
         assert torch.equal(batch.depth[1].nan_to_num(), batch.prediction.depth[1].nan_to_num())  # no anchor in the dark
     again = UncertainDepth(TooFar())
-    again.load_state_dict(two.state_dict())
+    again.load_stream_state(two.stream_state())
     again.networks[0].calls = 4
     frame = walk()[4]
     images = np.stack([frame.image, dark])
@@ -155,7 +153,7 @@ def test_normalised_images_are_not_searched(caplog):
     plain = followed(UncertainDepth(TooFar(), preprocess=None, posterior=False), normalised, slice(4))
     for out, expected in zip(outs, plain, strict=True):
         assert torch.equal(out.depth, expected.depth)
-        torch.testing.assert_close(out.ufm.variance, expected.variance, rtol=0, atol=0, equal_nan=True)
+        torch.testing.assert_close(out.ufm_variance, expected.variance, rtol=0, atol=0, equal_nan=True)
     assert [text.partition(": ")[2] for text in alone(caplog)] == [
         "the images must be bytes, or floats in [0, 1] (logged once)"
     ]
@@ -168,7 +166,7 @@ def test_anchors_that_are_passed_replace_the_search():
         depth = torch.from_numpy(frame.depth[v, u]).double()[None]
         pixel = torch.from_numpy(np.stack([u, v], -1)).double()[None]
         out = model(frame.image, frame.T_world_cam, frame.intrinsics, anchors=Anchors(pixel, depth, 1e-4 * depth**2))
-        assert int(out.ufm.statistics.anchors[0]) == int((depth > 0).sum())
+        assert int(out.statistics.anchors[0]) == int((depth > 0).sum())
     assert error(out.depth, frame) < 0.01
     named = UncertainDepth(TooFar(), anchors="corners")
     with pytest.raises(ValueError, match="anchors come from the source"):
@@ -202,7 +200,7 @@ def test_after_a_jump_of_the_poses_the_depth_is_right_again_within_three_images(
     for i, frame in enumerate(walk()):
         T = frame.T_world_cam if i < 8 else shift @ frame.T_world_cam
         outs.append(model(frame.image, T, frame.intrinsics))
-    used = [int(out.ufm.statistics.anchors_used[0]) for out in outs]
+    used = [int(out.statistics.anchors_used[0]) for out in outs]
     assert used[8] < 0.1 * used[7]
     assert used[11] > 0.7 * used[7]
     assert error(outs[11].depth, walk()[11]) < 0.1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from contextlib import redirect_stdout
 from dataclasses import replace
 from importlib.resources import files
@@ -20,6 +21,7 @@ from ufmstar_torch.models import save_trained
 FRAMES, SEED = 5, 5
 SHIPPED = Path(str(files("ufmstar_torch.models").joinpath("weights", "demo.safetensors")))
 ROWS = ["Aleatoric", "Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble", "UfM*-Ensemble (anchors dense, posterior True)"]
+README = Path(__file__).parent.parent / "README.md"
 
 
 @pytest.fixture(scope="module")
@@ -42,14 +44,42 @@ def test_every_row_is_judged_in_both_kinds_of_rooms(done):
     assert code == 0
     results = load_results(out, with_sums=False)
     assert [row.label for row in results.rows] == ROWS
-    assert results.datasets == ("familiar", "unfamiliar")
+    assert results.datasets == ("unfamiliar", "familiar")
     assert {(r.dataset, r.frames["done"]) for r in results.records} == {("familiar", FRAMES), ("unfamiliar", FRAMES)}
     assert len(results.records) == 2 * len(ROWS)
-    for text in (*ROWS[:4], "posterior", "report.html"):
-        assert text.replace("*", "\\*") in message
-    for file in ("report.html", "results.csv", "tables/main.md", "figures/calibration-unfamiliar.svg"):
+    assert message.endswith(f"\nopen {out / 'report.html'} in a browser\n")
+    for file in ("report.html", "results.csv", "tables/main-unfamiliar.md", "figures/calibration-unfamiliar.svg"):
         assert (out / file).is_file()
     assert list((out / "figures").glob("strip-unfamiliar-*-ensemble_*.png"))
+
+
+def test_its_table_is_the_readmes(done):
+    out, _, _, message = done
+    text = README.read_text(encoding="utf-8")
+    table = text[text.index("| 36 frames of an unfamiliar hall") :].partition("\n\n")[0]
+    head, _, *lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()]
+    main = (out / "tables" / "main-unfamiliar.md").read_text(encoding="utf-8")
+    shown = [[cell.strip() for cell in line.split("|")[1:-1]] for line in main.splitlines() if line.startswith("| ")]
+    assert [words.split()[0] for words in shown[0][1:]] == head[1:]
+    assert [line[0] for line in shown[2:]] == [line[0] for line in lines]
+    assert message.index("of unfamiliar") < message.index("of familiar")
+    assert not (out / "tables" / "main.md").exists()  # no mean over both rooms
+
+
+def test_its_page_shows_a_frame_then_the_table_then_curves(done):
+    out, *_ = done
+    page = (out / "report.html").read_text(encoding="utf-8")
+    parts = [page.index(f'id="{name}"') for name in ("look", "table", "curves", "pictures", "cost", "limits")]
+    assert parts == sorted(parts)
+    look, table, curves, further = (page[a:b] for a, b in zip(parts, [*parts[1:4], None], strict=False))
+    assert look.count("<img") == 1
+    assert "style=hall" in look
+    assert "UfM* alone and with the posterior" in look
+    assert "1 sequence of unfamiliar" in table.partition("<details>")[0]
+    assert all(len(heading.split()) > 6 for heading in re.findall("<h3>(.*?)</h3>", curves))
+    assert "calibration sequences" not in further.lower()  # each data set has one
+    drawn = (out / "figures" / "calibration-unfamiliar.svg").read_text(encoding="utf-8")
+    assert "posterior" in drawn
 
 
 def test_a_second_demo_computes_nothing(done, monkeypatch, capsys):
@@ -58,7 +88,7 @@ def test_a_second_demo_computes_nothing(done, monkeypatch, capsys):
     monkeypatch.setattr(evaluate, "_report", lambda *_: 0)  # takes most of the time
     assert cli.main(words) == 0
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*.pt")} == before
-    assert "--resume: the evaluation in" not in capsys.readouterr().err
+    assert "the evaluation in" not in capsys.readouterr().err
 
 
 # ---- refusals ----

@@ -103,7 +103,7 @@ def test_a_constant_of_the_posterior_variance_leaves_the_depth(script: Any) -> N
     posterior = script("measure_posterior")
     prepared = posterior.prepare("tour:1?frames=6&size=96x128", True)
     for kind in (posterior.DENSE, posterior.NEAR):
-        configs = (PosteriorConfig(unseen=value, prior_weight=1e6) for value in (0.0, 1.0))
+        configs = (posterior.changed(PosteriorConfig(), unseen=value, prior_weight=1e6) for value in (0.0, 1.0))
         rows = (posterior.figures(prepared, kind, config) for config in configs)
         slow, fast = (dict(zip(posterior.FIGURES, row, strict=True)) for row in rows)
         assert fast["rmse"] == slow["rmse"] > 0

@@ -21,11 +21,9 @@ from ufmstar_torch.eval.methods.suite import Suite, suite_named
 from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.eval.metrics.recalibration import fit
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.eval.suite.work_items import Shard
 from ufmstar_torch.eval.tour import make_tour, render, tour_path
 from ufmstar_torch.eval.tour.view import intrinsics
 from ufmstar_torch.frames.choose import choose
-from ufmstar_torch.frames.online import TrainDecision
 
 NAN, INF = math.nan, math.inf
 EYE, K = torch.eye(4, dtype=torch.float64), torch.from_numpy(intrinsics(24, 32))
@@ -93,8 +91,6 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: network("depth_only=onnx:net.onnx,a.json,b.json"), "one spec"),
     (lambda: network("aleatoric=ground-truth"), "goes with depth_only"),
     (lambda: network("depth_only=ground-truth:48"), "HxW"),
-    # shards
-    *[(partial(Shard.parse, text), "--shard must be") for text in ("0/2", "3/2", "1", "1/0", "a/b", "1/2/3", "-1/2")],
     # recalibration
     *[
         (partial(Recalibration, *knots), "Recalibration")
@@ -111,10 +107,6 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: choose([1.0, 2.0], poses=torch.eye(4)[None]), r"poses must be \[2, 4, 4\]"),
     (lambda: choose([1.0, 2.0], poses=torch.eye(4).repeat(2, 1, 1) * NAN), "poses must be finite"),
     (lambda: choose([1.0, -2.0], poses=torch.eye(4).repeat(2, 1, 1)), "scores of at least 0"),
-    *[
-        (partial(TrainDecision, **values), "cost must be finite, first at least 2")
-        for values in ({"cost": NAN}, {"cost": 0.1, "first": 1}, {"cost": 0.1, "half_life": 0.0})
-    ],
     # tours
     *[(partial(tour, name), "tour:SEED") for name in ("tour:", "tour:-1", "tour:a")],
     (lambda: tour("tour:1?colour=red"), "unknown option 'colour'"),

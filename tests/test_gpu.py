@@ -110,11 +110,11 @@ def test_the_posterior_equals_the_cpu_s():
             gpu(depth.cuda(), pose.cuda(), K.cuda(), anchors=anchors.to("cuda")),
             cpu(depth, pose, K, anchors=anchors),
         )
-        for name in ("posterior_depth", "posterior_variance", "posterior_outlier"):
+        for name in ("depth", "variance", "posterior_outlier"):
             found = getattr(a, name)
             assert found.is_cuda
             torch.testing.assert_close(found.cpu(), getattr(b, name), rtol=1e-3, atol=1e-5, equal_nan=True)
-    assert (b.posterior_depth / depth).nanmedian() > 1.1
+    assert (b.depth / depth).nanmedian() > 1.1
 
 
 def test_networks_on_the_gpu_and_ufmstar_on_the_cpu():
@@ -153,9 +153,9 @@ def test_anchors_of_images_on_the_gpu_reach_ufmstar_on_the_cpu():
         image, pose = texture[None, ..., 4 * i : 4 * i + 128].contiguous(), torch.eye(4)
         pose[0, 3] = 0.08 * i
         expected, out = plain(image, pose, K), split(image.cuda(), pose, K)
-        used += int(expected.ufm.statistics.anchors_used.sum())
-        for name in ("variance", "posterior_depth", "posterior_variance"):
-            found = getattr(out.ufm, name)
+        used += int(expected.statistics.anchors_used.sum())
+        for name in ("ufm_variance", "depth", "variance"):
+            found = getattr(out, name)
             assert found.device.type == "cpu"
-            torch.testing.assert_close(found, getattr(expected.ufm, name), rtol=1e-3, atol=1e-5, equal_nan=True)
+            torch.testing.assert_close(found, getattr(expected, name), rtol=1e-3, atol=1e-5, equal_nan=True)
     assert used > 100

@@ -200,7 +200,7 @@ def test_pixels_that_are_not_valid_have_no_interval():
 
 
 def test_a_recalibrated_variance_has_the_normal_distribution_s_interval():
-    ufm = UfMStar(extensions=[Recalibration((1e-6, 1.0), (0.01, 0.09))])
+    ufm = UfMStar(recalibration=Recalibration((1e-6, 1.0), (0.01, 0.09)))
     out = last_output_plain(ufm)
     lower, upper = out.interval(0.9)
     torch.testing.assert_close(upper - lower, 2 * 1.6448536 * out.std, rtol=1e-3, atol=0)
@@ -212,16 +212,14 @@ def last_output_plain(ufm):
 
 
 def test_uncertain_depth_has_the_same_intervals():
-    model = UncertainDepth(None, CONFIG)
+    model, ufm = UncertainDepth(None, CONFIG), UfMStar(CONFIG)
     for depth, T, anchors in frames():
         out = model.update(DepthPrediction(depth), T, K, anchors=anchors)
-    from ufmstar_torch.uncertain_depth import UncertainPrediction
-
-    prediction = UncertainPrediction(DepthPrediction(depth), out, None)
-    for a, b in zip(prediction.interval(0.9), out.interval(0.9), strict=True):
-        assert torch.equal(a, b)
-    assert torch.equal(prediction.probability_nearer(2.0), out.probability_nearer(2.0))
-    assert torch.equal(prediction.probability_between(1.0, 2.0), out.probability_between(1.0, 2.0))
+        expected = ufm(depth, T, K, anchors=anchors)
+    assert out.prediction is not None
+    for value, same in zip(out.interval(0.9), expected.interval(0.9), strict=True):
+        torch.testing.assert_close(value, same, rtol=0, atol=0, equal_nan=True)
+    assert torch.equal(out.probability_nearer(1.0).nan_to_num(), expected.probability_nearer(1.0).nan_to_num())
 
 
 def test_the_correction_is_saved_with_the_state():

@@ -35,11 +35,11 @@ KERNELS = (
 def test_seam():
     compiled = select.select_step("numba", "cpu")
     assert select.select_step("auto", "cpu") is compiled is step_cpu.step
-    assert select.select_check("auto", "cpu") is check_cpu.check_values
+    assert select.select_frame("auto", "cpu").check is check_cpu.check_values
     for device in ("cpu", "cuda"):
         assert select.select_kernels("torch", device) is select.select_step("torch", device).keywords["kernels"]
         assert select.select_kernels("torch", device) is REFERENCE
-        assert select.select_check("torch", device) is frame.check_values
+        assert select.select_frame("torch", device).check is frame.check_values
     mixed = select.select_kernels("auto", "mps")
     assert mixed.spgf is not REFERENCE.spgf, "on the host"
     assert replace(mixed, spgf=REFERENCE.spgf) == REFERENCE

@@ -26,8 +26,8 @@ title = "Kills"
 methods = ["DepthOnly", "UfM-DepthOnly", "UfM*-DepthOnly"]
 """
 TRAINING = (
-    "--preset fastdepth-ensemble --members 2 --data sequences --part 0:12 --validation-part 12:16 --epochs 2 "
-    "--batch-size 4 --network.widths 0.05 --network.size [32,32] --network.preprocess resize"
+    "--preset fastdepth-ensemble --members 2 --data sequences --set data.part=0:12 --set data.validation_part=12:16 "
+    "--epochs 2 --batch-size 4 --set network.widths=0.05 --set network.size=[32,32] --set network.preprocess=resize"
 )
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 

@@ -445,9 +445,9 @@ def test_the_state_goes_on_where_it_ended(model, tmp_path):
 
 
 def test_a_state_that_does_not_fit_is_refused_and_stays(model, tmp_path):
-    file, before = tmp_path / "state.pt", {name: value.clone() for name, value in model.state_dict().items()}
+    file, before = tmp_path / "state.pt", {name: value.clone() for name, value in model.stream_state().items()}
     plain = UncertainDepth(Network(), posterior=False)
-    torch.save(plain.state_dict(), file)
+    torch.save(plain.stream_state(), file)
     (tmp_path / "damaged.pt").write_bytes(file.read_bytes()[:500])
     for path, words in ((file, "the state must hold"), (tmp_path / "damaged.pt", "damaged")):
         content = path.read_bytes()
@@ -456,7 +456,7 @@ def test_a_state_that_does_not_fit_is_refused_and_stays(model, tmp_path):
         ):
             LiveDepth(model, print, K, state=path)
         assert path.read_bytes() == content
-    after = model.state_dict()
+    after = model.stream_state()
     assert all(torch.equal(after[name], value) for name, value in before.items())
 
 

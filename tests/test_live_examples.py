@@ -16,10 +16,10 @@ from onnx_files import small_network, write_fastdepth
 
 from ufmstar_torch import cli
 from ufmstar_torch.eval.bench import onboard
+from ufmstar_torch.eval.bench.quantise import quantise
 from ufmstar_torch.eval.sequences import live as sources
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.eval.tour import tour_sequence
-from ufmstar_torch.models.quantise import quantise
 from ufmstar_torch.models.trained import load_trained
 
 

@@ -15,6 +15,7 @@ from random_gaussians import as_lists, covariances, mixture
 import scenes
 from ufmstar_torch import AnchorConfig, MergeConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.gaussians.mixture import GaussianMixture
+from ufmstar_torch.kernels.select import select_frame
 from ufmstar_torch.steps.merge import merge, merged
 from ufmstar_torch.steps.regress import regress
 
@@ -198,3 +199,27 @@ def test_a_skipped_frame_merges_nothing():
     config = UfMStarConfig(merge=MergeConfig(every=4))
     assert merged(state, torch.tensor([False]), config) is state
     assert merged(state, torch.tensor([True]), config) is not state
+
+
+@pytest.mark.parametrize("capacity", [1, 14, 150])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_compiled_parts_merge_as_the_reference(seed, capacity):
+    m, sums = crowd(seed, capacity)
+    expected = merge(m, sums, ALL, CONFIG)
+    found = merge(m, sums, ALL, CONFIG, select_frame("numba", "cpu").merge)
+    if capacity > 1:
+        assert bool((expected[0].components < m.components).all()), "the test must merge something"
+    assert torch.equal(found[0].components, expected[0].components)
+    for name, value in (expected[0].tensors() | {"sums": expected[1]}).items():
+        other = (found[0].tensors() | {"sums": found[1]})[name]
+        torch.testing.assert_close(other, value, rtol=1e-10, atol=1e-12, msg=name)
+
+
+def test_pairs_beyond_the_first_room_are_found():
+    m, sums = crowd(0, 120)
+    together = m.replace(mean=1e-3 * m.mean)
+    expected, found = (
+        merge(together, sums, ALL, CONFIG, kernels)[0] for kernels in (None, select_frame("numba", "cpu").merge)
+    )
+    assert torch.equal(found.components, expected.components)
+    torch.testing.assert_close(found.mean, expected.mean, rtol=1e-10, atol=1e-12)

@@ -43,7 +43,6 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: settings({"backend": "cuda"}), "backend"),
     (lambda: settings({"max_components": 0}), "max_components"),
     (lambda: settings({"variance_floor": NAN}), "variance_floor"),
-    (lambda: settings({"near_radius": 0.6}), "near_radius"),
     (lambda: settings({"add_aleatoric": 1}), "add_aleatoric"),
     (lambda: settings({"features": 1.5}), "features"),
     (lambda: settings({"initial_capacity": True}), "initial_capacity"),

@@ -8,11 +8,11 @@ import numpy as np
 import online_training as example
 import pytest
 import torch
+from train_decision import TrainDecision, image_statistics
 
 import scenes
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
-from ufmstar_torch.frames.online import TrainDecision, image_statistics
 
 DEPTHS, POSES, K = scenes.sequence(2, 48, 64, 0.05)
 
@@ -104,6 +104,9 @@ def test_what_makes_no_sense_is_refused():
         (lambda: decision.learn(huge, 1.0), "also their squares"),
         (lambda: decision.expected(torch.ones(4)), "3 finite values as before"),
         (lambda: decision.expected(torch.full((3,), math.nan)), "3 finite values as before"),
+        (lambda: TrainDecision(math.nan), "cost must be finite, first at least 2"),
+        (lambda: TrainDecision(0.1, first=1), "cost must be finite, first at least 2"),
+        (lambda: TrainDecision(0.1, half_life=0.0), "cost must be finite, first at least 2"),
         (lambda: TrainDecision(0.1).expected(torch.ones(3)), r"call learn\(\) first"),
     ):
         with pytest.raises(ValueError, match=message):

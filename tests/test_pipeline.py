@@ -152,7 +152,7 @@ def test_state_continues_and_resets():
     expected = [whole(image(i), POSES[i], K).variance for i in range(5)]
     for i in range(3):
         first(image(i), POSES[i], K)
-    second.load_state_dict(first.state_dict())
+    second.load_stream_state(first.stream_state())
     assert torch.equal(second(image(3), POSES[3], K).variance, expected[3])
     whole.reset()
     assert whole(image(0), POSES[0], K).member == 0
@@ -162,21 +162,21 @@ def test_a_state_holds_no_weights_and_names_other_networks(caplog):
     first = UncertainDepth([Scaled(1.0), Scaled(1.1)], CONFIG, posterior=False)
     for i in range(3):
         first(image(i), POSES[i], K)
-    state = first.state_dict()
+    state = first.stream_state()
     assert not [name for name in state if name.startswith("networks.")]
     same_networks = UncertainDepth([Scaled(1.0), Scaled(1.1)], CONFIG, posterior=False)
-    same_networks.load_state_dict(state)
+    same_networks.load_stream_state(state)
     assert not caplog.messages
     others = UncertainDepth([Scaled(1.0), Scaled(1.2)], CONFIG, posterior=False)
-    others.load_state_dict({**state, "networks.1.factor": torch.tensor(9.0)})  # as states were saved before
+    others.load_stream_state(state)
     assert [network.factor.item() for network in others.networks] == [1.0, pytest.approx(1.2)]
     assert int(others.ufm.frames) == 3
     assert caplog.messages == [
         "the state was saved with other networks: it holds their disagreement; reset() begins anew"
     ]
     for name in ("image_index", "weights_mark"):
-        with pytest.raises(RuntimeError, match=f"UncertainDepth:\n\t{name} must be a whole number of at least 0"):
-            others.load_state_dict({**state, name: torch.tensor(-1)})
+        with pytest.raises(ValueError, match=f"{name} must be a whole number of at least 0"):
+            others.load_stream_state({**state, name: torch.tensor(-1)})
     assert [network.factor.item() for network in others.networks] == [1.0, pytest.approx(1.2)]
 
 
@@ -219,10 +219,10 @@ class Foreign(nn.Module):
 def test_networks_with_states_of_any_kind_are_saved(caplog):
     model = UncertainDepth(Foreign(1.0), CONFIG, posterior=False)
     model(image(0), POSES[0], K)
-    state = model.state_dict()
-    UncertainDepth(Foreign(1.0), CONFIG, posterior=False).load_state_dict(state)
+    state = model.stream_state()
+    UncertainDepth(Foreign(1.0), CONFIG, posterior=False).load_stream_state(state)
     assert not caplog.messages
-    UncertainDepth(Foreign(2.0), CONFIG, posterior=False).load_state_dict(state)
+    UncertainDepth(Foreign(2.0), CONFIG, posterior=False).load_stream_state(state)
     assert caplog.messages
 
 

@@ -97,7 +97,9 @@ def test_a_length_between_images_gives_the_scale(walk, tmp_path, capfd):
 
 
 def test_a_length_from_an_image_that_is_not_there_is_refused_before_it_takes_time(walk, tmp_path, capfd, monkeypatch):
-    monkeypatch.setattr("ufmstar_torch.eval.commands.poses.write_keyframes", lambda *_, **__: pytest.fail("too late"))
+    monkeypatch.setattr(
+        "ufmstar_torch.eval.reconstruct.keyframes.write_keyframes", lambda *_, **__: pytest.fail("too late")
+    )
     words = ["poses", str(walk[1]), "--length", "000000", "99:3,4", "0.8", "--out", str(tmp_path / "out")]
     assert cli.main(words) != 0
     assert "--length: there is no image 99" in capfd.readouterr().err

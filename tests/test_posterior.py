@@ -281,7 +281,8 @@ def test_errors_that_neighbouring_anchors_do_not_share_are_not_taken_for_the_net
 @pytest.mark.parametrize("p", [0.0, 0.5])
 def test_extreme_errors_and_probabilities_stay_finite(p):
     """After six frames of a wall as predicted, a tenth of the anchors are off by a factor of 90."""
-    model, packed = dataclasses.replace(MODEL, wrong=p, misscaled=p), torch.zeros(1, SIZE, dtype=torch.float64)
+    model = type("Extreme", (PosteriorConfig,), {"wrong": p, "misscaled": p})()
+    packed = torch.zeros(1, SIZE, dtype=torch.float64)
     depth, rng = np.full((56, 56), 2.0), np.random.default_rng(0)
     rows, cols = (x.ravel() for x in np.mgrid[0:56:2, 0:56:2])
     for share in (0, 0, 0, 0, 0, 0, 0.1):
@@ -386,9 +387,9 @@ def test_errors_that_all_anchors_have_in_common_widen_every_pixel():
         anchors = Anchors(*arguments, **common)
         outs.append(UfMStar(CONFIG)(torch.from_numpy(depth)[None], torch.eye(4)[None], K[None], anchors=anchors))
     plain, by_scale, by_pose = outs
-    d = plain.posterior_depth
-    torch.testing.assert_close(by_scale.posterior_variance - plain.posterior_variance, 0.01 * d**2, equal_nan=True)
-    torch.testing.assert_close(by_pose.posterior_variance - plain.posterior_variance, 0.002 * d**4, equal_nan=True)
+    d = plain.depth
+    torch.testing.assert_close(by_scale.variance - plain.variance, 0.01 * d**2, equal_nan=True)
+    torch.testing.assert_close(by_pose.variance - plain.variance, 0.002 * d**4, equal_nan=True)
 
 
 def ufm_frames(n=3, streams=1):
@@ -409,14 +410,13 @@ def test_before_the_first_anchor_it_is_plain_ufm_star_to_the_bit():
     plain, posterior = UfMStar(), UfMStar(CONFIG)
     for depth, T, _ in ufm_frames():
         a, b = plain(depth, T, K), posterior(depth, T, K)
-        assert torch.equal(a.variance.nan_to_num(), b.posterior()[1].nan_to_num())
-        assert torch.equal(torch.where(b.valid, depth, 0), b.posterior()[0].nan_to_num())
         assert torch.equal(a.variance.nan_to_num(), b.variance.nan_to_num())
+        assert torch.equal(torch.where(b.valid, depth, 0), b.depth.nan_to_num())
+        assert torch.equal(a.variance.nan_to_num(), b.ufm_variance.nan_to_num())
         assert bool(b.statistics.calibration.isnan())
         assert bool(b.posterior_outlier.isnan().all())
         assert torch.equal(a.variance.nan_to_num(), b.posterior_inlier_variance.nan_to_num())
-    with pytest.raises(ValueError, match="posterior needs"):
-        a.posterior()
+    assert a.posterior_outlier is a.quantiles is None
 
 
 def test_before_the_first_anchor_of_a_source_nothing_reads_as_certain():
@@ -445,9 +445,9 @@ def test_a_frame_without_anchors_keeps_the_correction_learns_nothing_and_grows_l
     assert after.frames == learnt.frames
     assert (after.covariance.diagonal() > learnt.covariance.diagonal()).all()
     assert (after.covariance.diagonal() < 1.1 * np.array(MODEL.prior_variance)).all()
-    ratio = (outs[0].posterior()[0] / depth)[outs[0].valid]
+    ratio = (outs[0].depth / depth)[outs[0].valid]
     assert 1.1 < float(ratio.median()) < 2
-    first, last = (out.posterior()[1].nanmedian() for out in (outs[0], outs[-1]))
+    first, last = (out.variance.nanmedian() for out in (outs[0], outs[-1]))
     assert float(last) > 1.2 * float(first)
 
 
@@ -460,14 +460,14 @@ def test_poses_that_contradict_the_images_make_a_stream_forget():
     before = memories(ufm)
     shared, none = torch.tensor([0.0, torch.inf]), torch.zeros(anchors.depth.shape, dtype=torch.bool)
     out = ufm(depth, T, K, anchors=dataclasses.replace(anchors, valid=none, shared=shared))
-    remembered, forgotten = ((out.posterior()[0][i] / depth[i])[out.valid[i]] for i in range(2))
+    remembered, forgotten = ((out.depth[i] / depth[i])[out.valid[i]] for i in range(2))
     assert 1.1 < float(remembered.median()) < 2
     torch.testing.assert_close(forgotten, torch.ones_like(forgotten))
     after = memories(ufm)
     assert [bool(memory.coefficients.any()) for memory in after] == [True, False]
     np.testing.assert_allclose(after[1].covariance.diagonal(), MODEL.prior_variance)
     assert [memory.ratios for memory in after] == [memory.ratios for memory in before]
-    assert bool((out.posterior()[1][1].nanmean().sqrt() > 0.5 * depth.mean()).all())
+    assert bool((out.variance[1].nanmean().sqrt() > 0.5 * depth.mean()).all())
 
 
 def test_state_saved_and_loaded_goes_on_to_the_bit():
@@ -478,7 +478,7 @@ def test_state_saved_and_loaded_goes_on_to_the_bit():
         first(depth, T, K, anchors=anchors)
     second.load_state_dict(first.state_dict())
     for depth, T, anchors in frames[2:]:
-        a, b = (m(depth, T, K, anchors=anchors).posterior() for m in (whole, second))
+        a, b = ((out.depth, out.variance) for out in (m(depth, T, K, anchors=anchors) for m in (whole, second)))
         assert all(torch.equal(x.nan_to_num(), y.nan_to_num()) for x, y in zip(a, b, strict=True))
     second.reset([0])
     assert not bool(second.posterior.any())
@@ -492,5 +492,5 @@ def test_streams_are_independent():
         silent = dataclasses.replace(anchors, valid=torch.stack([torch.ones(60), torch.zeros(60)]).bool())
         both = together(depth, T, K, anchors=silent)
         one = alone(depth[:1], T, K, anchors=Anchors(anchors.pixel[:1], anchors.depth[:1], anchors.variance[:1]))
-        torch.testing.assert_close(both.posterior()[0][:1], one.posterior()[0], rtol=1e-5, atol=0, equal_nan=True)
-    assert torch.equal(torch.where(both.valid, depth, 0)[1], both.posterior()[0][1].nan_to_num())
+        torch.testing.assert_close(both.depth[:1], one.depth, rtol=1e-5, atol=0, equal_nan=True)
+    assert torch.equal(torch.where(both.valid, depth, 0)[1], both.depth[1].nan_to_num())

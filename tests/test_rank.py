@@ -128,7 +128,7 @@ def test_a_ranking_that_fails_is_no_earlier_one(ufmstar, tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device", "contact_sheet.png")
 
     with monkeypatch.context() as patch:
-        patch.setattr("ufmstar_torch.eval.commands.rank.contact_sheet", full)
+        patch.setattr("ufmstar_torch.eval.run.panels.contact_sheet", full)
         code, _, err = ufmstar(*words)
     assert code == 1
     assert "No space left on device: 'contact_sheet.png'" in err
@@ -166,7 +166,7 @@ def test_scores_are_those_of_mean_uncertainty(ufmstar, tmp_path):
 
 
 def test_a_part_that_the_network_does_not_state_is_refused_before_compiling(ufmstar, tmp_path, weights, monkeypatch):
-    monkeypatch.setattr("ufmstar_torch.eval.commands.rank.warm_up_job", lambda *_: pytest.fail("compiled before"))
+    monkeypatch.setattr("ufmstar_torch.eval.run.run.warm_up_job", lambda *_: pytest.fail("compiled before"))
     words = ("--model", "trained", "--weights", weights, "--by", "epistemic", "--out", tmp_path / "out")
     code, _, err = ufmstar("rank", TOURS[0], *words)
     assert code == 2

@@ -102,7 +102,7 @@ def test_the_module_maps_v_and_nothing_else():
     generator = torch.Generator().manual_seed(0)
     depth = 2 + torch.rand(2, 1, 24, 32, generator=generator)
     T, K = torch.eye(4, dtype=torch.float64)[None], torch.tensor([[30.0, 0, 15.5], [0, 30, 11.5], [0, 0, 1]])[None]
-    plain, mapped = UfMStar(UfMStarConfig()), UfMStar(UfMStarConfig(), extensions=[MAP])
+    plain, mapped = UfMStar(UfMStarConfig()), UfMStar(UfMStarConfig(), recalibration=MAP)
     for frame in depth:
         a = torch.full_like(frame, 0.02)
         one, other = plain(frame, T, K, a), mapped(frame, T, K, a)
@@ -114,9 +114,9 @@ def test_the_module_maps_v_and_nothing_else():
 
 def test_other_settings_and_another_network_are_refused():
     fitted = Recalibration((1.0,), (2.0,), ufm=UfMStarConfig(ema_alpha=0.5, on_bad_frame="skip").to_dict(), network="a")
-    UfMStar(UfMStarConfig(ema_alpha=0.5, backend="torch"), extensions=[fitted])
+    UfMStar(UfMStarConfig(ema_alpha=0.5, backend="torch"), recalibration=fitted)
     with pytest.raises(ValueError, match=r"ema_alpha = 0\.5 \(now 1\.0\)"):
-        UfMStar(UfMStarConfig(ema_alpha=1.0), extensions=[fitted])
+        UfMStar(UfMStarConfig(ema_alpha=1.0), recalibration=fitted)
     fitted.require(UfMStarConfig(ema_alpha=0.5), "a")
     with pytest.raises(ValueError, match="fitted to the network a, not b"):
         fitted.require(UfMStarConfig(ema_alpha=0.5), "b")
@@ -181,9 +181,9 @@ def test_run_uses_the_map_beside_the_weights(evaluated, tmp_path, capsys, caplog
         capsys.readouterr()
         assert cli.main([*default, "--out", str(tmp_path / "named"), "--recalibration", str(file)]) == 2
         assert "anchors.half_life = None (now 30.0)" in capsys.readouterr().err
-        assert cli.main([*words, "--out", str(tmp_path / "other"), "--ufm.ema_alpha", "0.7"]) == 2
+        assert cli.main([*words, "--out", str(tmp_path / "other"), "--set", "ema_alpha=0.7"]) == 2
         assert "ema_alpha = " in capsys.readouterr().err
-        assert cli.main([*words, "--out", str(tmp_path / "plain"), "--resume"]) == 2
+        assert cli.main([*words, "--out", str(tmp_path / "plain")]) == 2
     finally:
         file.unlink()
     fitted, other = (json.loads((tmp_path / n / "summary.json").read_text())["warnings"] for n in ("fitted", "mapped"))

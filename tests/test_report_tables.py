@@ -270,7 +270,7 @@ class TestLoading:
     def test_settings_survive_their_dict(self, name):
         for row, label in row_labels(suite_named(name).rows).items():
             assert setting_from(json.loads(json.dumps(row.setting.to_dict()))) == row.setting
-            assert label.startswith(row.name)
+            assert label == row.title if row.title else label.startswith(row.name)
             assert row.name.replace("-Anchored", "").replace("-Posterior", "") == row.method.name
 
     @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from ros_stand_in import STORE, Node, received, ros
 
 from ufmstar_torch import DepthPrediction, UncertainDepth
 from ufmstar_torch.eval.sequences.bag import Bag
-from ufmstar_torch.uncertain_depth import UncertainPrediction
+from ufmstar_torch.uncertain_depth import UncertaintyOutput
 
 __all__ = ["ros"]
 EXAMPLES = Path(ros_node.__file__).parent
@@ -193,7 +193,7 @@ def test_obstacles_are_the_points_that_are_near_with_their_probability(make, mes
     def nearer(out, than):
         return torch.special.ndtr((than - out.depth) / out.std)
 
-    monkeypatch.setattr(UncertainPrediction, "probability_nearer", nearer, raising=False)
+    monkeypatch.setattr(UncertaintyOutput, "probability_nearer", nearer, raising=False)
     sent, _ = messages(poses="pose")
     for probability in (0.5, 0.01):
         node, camera = make(poses="pose", obstacle_range=2.5, obstacle_probability=probability)
@@ -207,7 +207,7 @@ def test_no_obstacle_before_anything_supports_a_probability(make, messages, monk
     def nearer(out, than):
         raise ValueError("no anchors yet")
 
-    monkeypatch.setattr(UncertainPrediction, "probability_nearer", nearer, raising=False)
+    monkeypatch.setattr(UncertaintyOutput, "probability_nearer", nearer, raising=False)
     node, camera = make(poses="pose", obstacle_range=2.5)
     with camera:
         play(node, camera, messages(poses="pose")[0])

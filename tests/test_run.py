@@ -19,7 +19,7 @@ from runs import CONFIG, Brightness, network_job, outputs, own_depth_job, read_s
 
 from ufmstar_torch import UncertainDepth
 from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.eval.run import run_folder, writers
+from ufmstar_torch.eval.run import writers
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.run.writers import read_frame
@@ -65,8 +65,8 @@ def test_a_run_equals_a_loop_by_hand(scene, tmp_path):
         np.testing.assert_array_equal(stored["depth"], result.depth[0].numpy())
         np.testing.assert_array_equal(stored["variance"], result.variance[0].numpy())
         np.testing.assert_array_equal(stored["disagreement"], result.disagreement[0].numpy())
-        np.testing.assert_array_equal(stored["measured"], result.ufm.measured[0].numpy())
-        unmeasured.append(int(result.ufm.statistics.unmeasured[0]))
+        np.testing.assert_array_equal(stored["measured"], result.measured[0].numpy())
+        unmeasured.append(int(result.statistics.unmeasured[0]))
         target = preprocess.apply_depth(torch.from_numpy(frame.depth))
         assert np.abs(target.numpy() - preprocess.apply_depth(torch.from_numpy(depth)).numpy()).max() < 1e-3
         ours.update(result.depth[0], result.variance[0], target)
@@ -125,7 +125,7 @@ def test_pictures_and_mixture(path, tmp_path):
 
 def test_ufm_star_stays_on_the_cpu_where_the_networks_run_elsewhere(path):
     job = replace(own_depth_job(path), device=torch.device("cuda"))
-    assert job.ufm(run_folder.Checkpoint()).mean.device.type == "cpu"
+    assert job.row()[1].mean.device.type == "cpu"
 
 
 def test_without_ground_truth(tmp_path):
@@ -183,25 +183,6 @@ def test_an_ensemble_alternates(path, tmp_path):
 # ---- interruptions ----
 
 
-def at_state(count):
-    """Crash at the ``count``-th replacement of the checkpoint, which is written after every frame."""
-
-    def break_(monkeypatch):
-        calls = []
-        write = run_folder.write_atomic
-
-        def broken(file, *rest, **options):
-            calls.extend([1] * (file.name == "state.pt"))
-            if len(calls) == count:
-                raise Crash
-            write(file, *rest, **options)
-
-        monkeypatch.setattr(run_folder, "write_atomic", broken)
-        monkeypatch.setattr(run_folder, "CHECKPOINT_EVERY", 0.0)
-
-    return break_
-
-
 def between_files(count, error=Crash):
     """Raise after the ``count``-th of the frames' files (three per frame), before it is recorded."""
 
@@ -220,14 +201,14 @@ def between_files(count, error=Crash):
     return break_
 
 
-@pytest.mark.parametrize("break_", [at_state(1), at_state(4), between_files(2), between_files(12)])
+@pytest.mark.parametrize("break_", [between_files(1), between_files(3), between_files(12)])
 def test_a_crash_anywhere_is_made_good(path, tmp_path, uninterrupted, break_):
     with pytest.MonkeyPatch.context() as patch:
         break_(patch)
         with pytest.raises(Crash):
             run(network_job(path, *pair()), tmp_path / "out")
     assert read_summary(tmp_path / "out")["state"] == "failed"
-    assert run(network_job(path, *pair()), tmp_path / "out", resume=True)["state"] == "finished"
+    assert run(network_job(path, *pair()), tmp_path / "out")["state"] == "finished"
     assert outputs(tmp_path / "out") == uninterrupted
 
 
@@ -235,7 +216,7 @@ def interrupt():
     raise KeyboardInterrupt
 
 
-def test_ctrl_c_leaves_what_is_finished_and_resume_goes_on(path, tmp_path, uninterrupted):
+def test_ctrl_c_leaves_what_is_finished_and_the_same_command_does_the_rest(path, tmp_path, uninterrupted):
     out = tmp_path / "out"
     summary = run(network_job(path, *pair(at=1, then=interrupt)), out)
     done = 3
@@ -245,17 +226,18 @@ def test_ctrl_c_leaves_what_is_finished_and_resume_goes_on(path, tmp_path, unint
     # The summary covers finished frames only, although the next frame was in progress.
     assert len(summary["mixture"]["components_over_time"]) == done
     assert summary["metrics"]["pixels"] == done * 24 * 32
-    assert run(network_job(path, *pair()), out, resume=True)["state"] == "finished"
+    assert "the same command computes the rest" in summary["reason"]
+    again = pair()
+    assert run(network_job(path, *again), out)["state"] == "finished"
+    assert sum(network.calls for network in again) == 6 - done, "finished predictions are read from the cache"
     assert outputs(out) == uninterrupted
-    sessions = read_summary(out)["time"]["sessions"]
-    assert [(s["first"], s["frames"]) for s in sessions] == [(0, done), (done, 6 - done)]
 
 
-def test_a_finished_run_resumes_to_itself(path, tmp_path, uninterrupted):
+def test_a_finished_run_is_repeated_without_its_networks(path, tmp_path, uninterrupted):
     out = tmp_path / "out"
     run(network_job(path, *pair()), out)
-    never = Brightness(1.0, at=0, then=crash), Brightness(1.1, at=0, then=crash)
-    assert run(network_job(path, *never), out, resume=True)["state"] == "finished"
+    never = (Brightness(gain, spread=0.02, at=0, then=crash) for gain in (1.0, 1.1))
+    assert run(network_job(path, *never), out)["state"] == "finished"
     assert outputs(out) == uninterrupted
 
 
@@ -270,14 +252,14 @@ def test_an_error_of_the_network_is_in_the_summary(path, tmp_path):
     assert summary["reason"] == "RuntimeError: out of memory"
 
 
-def test_a_full_disk_leaves_finished_frames_and_resume_continues(path, tmp_path, uninterrupted):
+def test_a_full_disk_leaves_finished_frames(path, tmp_path, uninterrupted):
     out = tmp_path / "out"
     with pytest.MonkeyPatch.context() as patch:
         between_files(13, OSError(errno.ENOSPC, "No space left on device"))(patch)
         summary = run(network_job(path, *pair()), out)
     assert (summary["state"], summary["frames"]["done"]) == ("failed", 4)
     assert "No space left on device" in summary["reason"]
-    run(network_job(path, *pair()), out, resume=True)
+    run(network_job(path, *pair()), out)
     assert outputs(out) == uninterrupted
 
 
@@ -288,7 +270,7 @@ def _killed(path, out):
 
 
 @pytest.mark.slow
-def test_sigkill_loses_the_last_seconds_only(path, tmp_path, uninterrupted):
+def test_sigkill_loses_no_prediction(path, tmp_path, uninterrupted):
     out = tmp_path / "out"
     process = start(_killed, path, out)
     process.join(200)
@@ -298,27 +280,26 @@ def test_sigkill_loses_the_last_seconds_only(path, tmp_path, uninterrupted):
     assert "killed" in summary["reason"]
     written = len(list((out / "frames").iterdir()))
     assert written <= 3
-    resumed = run(network_job(path, *pair()), out, resume=True)
-    sessions = [(s["first"], s["frames"]) for s in resumed["time"]["sessions"]]
-    first = sessions[-1][0]
-    assert sessions == ([(0, first), (first, 6 - first)] if first else [(0, 6)])
-    assert first <= written  # queued frames are lost, and frames since the last saved state
+    again = pair()
+    assert run(network_job(path, *again), out)["state"] == "finished"
+    assert sum(network.calls for network in again) == 3
     assert outputs(out) == uninterrupted
+    assert not list(out.rglob(".*.tmp"))
 
 
 # ---- the output folder ----
 
 
-def test_only_the_same_run_goes_on(path, tmp_path):
+def test_another_run_does_not_replace_the_first(path, tmp_path):
     out = tmp_path / "out"
     run(network_job(path, *pair(at=1, then=interrupt)), out)
     before = outputs(out)
     with pytest.raises(FolderError, match=r"ufm\.eta was 0\.5, now 0\.4"):
-        run(network_job(path, *pair(), config=CONFIG.replace(eta=0.4)), out, resume=True)
+        run(network_job(path, *pair(), config=CONFIG.replace(eta=0.4)), out)
     with pytest.raises(FolderError, match=r"source\.networks was .*1\.1.*, now .*1\.2"):
-        run(network_job(path, Brightness(1.0), Brightness(1.2)), out, resume=True)
+        run(network_job(path, Brightness(1.0), Brightness(1.2)), out)
     with pytest.raises(FolderError, match=r"sequence\.frames was 6, now 3"):
-        run(network_job(path, *pair(), frames=slice(None, None, 2)), out, resume=True)
+        run(network_job(path, *pair(), frames=slice(None, None, 2)), out)
     assert outputs(out) == before
 
 
@@ -329,18 +310,18 @@ def test_other_pixels_or_poses_under_the_same_names_are_noticed(tmp_path):
     poses = np.loadtxt(path / "poses.txt")
     np.savetxt(path / "poses.txt", poses + [0, 0, 0, 1e-6] * 4)
     with pytest.raises(FolderError, match=r"sequence\.names_and_poses"):
-        run(network_job(path), out, resume=True)
+        run(network_job(path), out)
     np.savetxt(path / "poses.txt", poses)
     (path / "images" / "7.png").write_bytes((path / "images" / "8.png").read_bytes())
     with pytest.raises(FolderError, match=r"sequence\.first_frame"):
-        run(network_job(path), out, resume=True)
+        run(network_job(path), out)
 
 
 def test_an_earlier_run_is_replaced_only_when_asked(path, tmp_path, uninterrupted):
     out = tmp_path / "out"
     run(network_job(path, frames=slice(0, 2)), out)
     (out / "notes.txt").write_text("mine")
-    with pytest.raises(FolderError, match="--resume goes on with it, --overwrite replaces it"):
+    with pytest.raises(FolderError, match=r"other input: .*--overwrite replaces it"):
         run(network_job(path, *pair()), out)
     run(network_job(path, *pair()), out, overwrite=True)
     assert (out / "notes.txt").read_text() == "mine"
@@ -356,7 +337,7 @@ def test_overwriting_removes_what_the_run_wrote_and_nothing_else(path, tmp_path,
         out / "depth" / "photo.png",
         out / "frames" / "mine.npz",
         out / "sigma" / "notes.txt",
-        out / "resume" / "a.pt",
+        out / "cache" / "a.pt",
     ]
     Image.fromarray(np.full((5, 5, 3), 9, np.uint8)).save(mine[0])
     np.savez(mine[1], depth=np.ones((3, 3)))
@@ -371,8 +352,8 @@ def test_overwriting_removes_what_the_run_wrote_and_nothing_else(path, tmp_path,
     assert outputs(out) == uninterrupted
 
 
-@pytest.mark.parametrize("options", [{"overwrite": True}, {"resume": True}])
-@pytest.mark.parametrize("link", ["depth", "frames", "resume", "frames/7.npz", "summary.json", "preview.mp4"])
+@pytest.mark.parametrize("options", [{"overwrite": True}, {}])
+@pytest.mark.parametrize("link", ["depth", "frames", "run.json", "frames/7.npz", "summary.json", "preview.mp4"])
 def test_nothing_is_written_through_a_link(path, tmp_path, link, options):
     out, victim = tmp_path / "out", tmp_path / "victim"
     run(network_job(path, frames=slice(0, 2)), out)
@@ -390,7 +371,7 @@ def test_nothing_is_written_through_a_link(path, tmp_path, link, options):
     run(network_job(path, frames=slice(0, 2)), tmp_path / "elsewhere")  # a folder that the user named
 
 
-@pytest.mark.parametrize("options", [{}, {"overwrite": True}, {"resume": True}])
+@pytest.mark.parametrize("options", [{}, {"overwrite": True}])
 def test_a_folder_of_someone_else_is_left_alone(path, tmp_path, options):
     out = tmp_path / "dataset"
     write_depth_png(out / "depth" / "7.png", np.ones((4, 4)), 1000)
@@ -406,46 +387,18 @@ def test_two_runs_do_not_share_a_folder(path, tmp_path):
 
     def another():
         with pytest.raises(FolderError, match="another run") as caught:
-            run(network_job(path, *pair()), out, resume=True)
+            run(network_job(path, *pair()), out)
         refused.append(caught)
 
     assert run(network_job(path, *pair(at=1, then=another)), out)["state"] == "finished"
     assert len(refused) == 1
 
 
-DAMAGED = {
-    "resume/state.pt": "cannot be read",
-    "resume/run.json": "is not a run's",
-    "frames.jsonl": "line 1 is not the record of a frame",
-    "frames/8.npz": "1 finished frames are gone",
-}
-
-
-@pytest.mark.parametrize("name", ["valid_pixels", "mean_sigma", "ground_truth", "ms"])
-def test_a_record_without_a_figure_is_named_when_a_run_is_resumed(path, tmp_path, name):
+@pytest.mark.parametrize("content", ["", "{}", '{"program": "ufmstar run", "format": 7}'])
+def test_a_damaged_manifest_is_named(path, tmp_path, content):
     out = tmp_path / "out"
     run(network_job(path, frames=slice(0, 2)), out)
-    first, second = (json.loads(line) for line in (out / "frames.jsonl").read_text().splitlines())
-    del second[name]
-    (out / "frames.jsonl").write_text(f"{json.dumps(first)}\n{json.dumps(second)}\n")
-    with pytest.raises(FolderError, match=rf"frames.jsonl, line 2 has no .*{name}"):
-        run(network_job(path, frames=slice(0, 2)), out, resume=True)
-    manifest = json.loads((out / "resume" / "run.json").read_text())
-    del manifest["identity"]
-    (out / "resume" / "run.json").write_text(json.dumps(manifest))
-    with pytest.raises(FolderError, match=r"run.json is damaged .*--overwrite starts again"):
-        run(network_job(path, frames=slice(0, 2)), out, resume=True)
-
-
-@pytest.mark.parametrize("name", DAMAGED)
-def test_a_damaged_run_says_so(path, tmp_path, name):
-    out = tmp_path / "out"
-    run(network_job(path, frames=slice(0, 3)), out)
-    if name == "frames.jsonl":
-        (out / name).write_bytes(b"{}\n" * 3)
-    elif name == "frames/8.npz":
-        (out / name).unlink()
-    else:
-        truncate(out / name)
-    with pytest.raises(FolderError, match=DAMAGED[name]):
-        run(network_job(path, frames=slice(0, 3)), out, resume=True)
+    (out / "run.json").write_text(content)
+    with pytest.raises(FolderError, match=r"run.json is .*--overwrite starts again"):
+        run(network_job(path, frames=slice(0, 2)), out)
+    assert run(network_job(path, frames=slice(0, 2)), out, overwrite=True)["state"] == "finished"

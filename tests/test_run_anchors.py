@@ -155,42 +155,42 @@ def test_a_frame_with_a_bad_pose_does_not_spoil_the_tracks(tour, tmp_path):
     assert records(tmp_path / "spoiled")[-1]["anchors"]["used"] > 3
 
 
-# ---- going on ----
+# ---- beginning again ----
 
 
 @pytest.mark.parametrize("at", [1, 5])
-def test_a_stopped_run_goes_on_with_the_same_tracks(tour, finished, tmp_path, at):
+def test_a_stopped_run_begins_again_with_the_same_tracks(tour, finished, tmp_path, at):
     out = tmp_path / "out"
     stopped = run(map_job(tour, read=lambda frame: too_far(frame, stop_at=at)), out)
     assert (stopped["state"], stopped["frames"]["done"]) == ("interrupted", at)
     assert stopped["anchors"]["used_per_frame"] == np.mean([record["anchors"]["used"] for record in records(out)])
-    assert run(map_job(tour), out, resume=True)["state"] == "finished"
+    assert run(map_job(tour), out)["state"] == "finished"
     assert outputs(out) == outputs(finished[0])
 
 
-def test_only_a_run_with_anchors_goes_on_with_anchors(tour, finished, tmp_path, monkeypatch):
+def test_only_a_run_with_anchors_is_repeated_with_anchors(tour, finished, tmp_path, monkeypatch):
     run(map_job(tour, OFF, frames=slice(2)), tmp_path / "out")
     with pytest.raises(FolderError, match=r"other input: source.anchors was null, now .corners"):
-        run(map_job(tour, frames=slice(2)), tmp_path / "out", resume=True)
+        run(map_job(tour, frames=slice(2)), tmp_path / "out")
     with monkeypatch.context() as patch:
         patch.setattr(TrackerConfig, "to_dict", lambda config: {**dataclasses.asdict(config), "window": 9})
         with pytest.raises(FolderError, match=r"other input: source.tracker.window was 10, now 9"):
-            run(map_job(tour), finished[0], resume=True)
+            run(map_job(tour), finished[0])
 
 
 # ---- the command ----
 
 
 def test_the_flag(tmp_path, capfd):
-    words = ["run", TOUR, "--depth", "self", "--plain", "--anchors", "corners", "--ufm.disagreement", "overlap"]
+    words = ["run", TOUR, "--depth", "self", "--plain", "--anchors", "corners", "--set", "disagreement=overlap"]
     words += ["--no-video", "--no-sheet"]
     assert cli.main([*words, "--frames", ":5", "--out", str(tmp_path / "a")]) == 0
     printed = capfd.readouterr().out
     summary = read_summary(tmp_path / "a")
     assert (summary["settings"]["anchors"], summary["settings"]["plain"], summary["result"]) == ("corners", True, "ufm")
     assert "posterior" not in summary
-    assert summary["settings"]["ufm"]["anchors"] == AnchorConfig().to_dict()
-    assert summary["settings"]["ufm"]["disagreement"] == "overlap"
+    assert summary["settings"]["set"]["anchors"] == AnchorConfig().to_dict()
+    assert summary["settings"]["set"]["disagreement"] == "overlap"
     assert "UfM*, anchored  " in printed
     used, result = (summary["anchors"][key] for key in ("used_per_frame", "found_per_frame"))
     assert f"anchors: {used:.1f} used a frame, of {result:.1f} triangulated" in printed
@@ -205,7 +205,7 @@ def test_a_run_with_a_posterior_corrects_the_depth_and_goes_on_after_a_stop(tour
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     summary = run(map_job(tour, config), whole)
     run(map_job(tour, config, lambda frame: too_far(frame, stop_at=5)), parts)
-    assert run(map_job(tour, config), parts, resume=True)["posterior"] == summary["posterior"]
+    assert run(map_job(tour, config), parts)["posterior"] == summary["posterior"]
     corrected, before = summary["metrics"], summary["ufm"]["metrics"]
     assert summary["result"] == "posterior"
     assert corrected["rmse"] < 0.8 * before["rmse"]
@@ -262,7 +262,7 @@ def test_pictures_have_a_column_for_what_anchors_add(tour, finished):
 def test_images_are_needed(tour, monkeypatch, tmp_path, caplog):
     words = [TOUR, "--depth", "self", "--out", str(tmp_path / "out")]
     blind = with_entries(tour, lambda _, e: dataclasses.replace(e, load_image=None))
-    monkeypatch.setattr("ufmstar_torch.eval.commands.run.open_sequence", lambda *_, **__: blind)
+    monkeypatch.setattr("ufmstar_torch.eval.sequences.open.open_sequence", lambda *_, **__: blind)
     with pytest.raises(ValueError, match=r"--anchors corners searches images, of which the sequence .* has none"):
         job_from(read([*words, "--anchors", "corners"]), TOUR)
     assert not caplog.messages

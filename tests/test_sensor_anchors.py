@@ -165,7 +165,7 @@ def test_depth_that_served_as_anchors_is_not_judged(finished):
     assert summary["source"]["sensor"] == "stereo"
 
 
-def test_a_run_is_continued_with_the_same_results(tour, finished, tmp_path):
+def test_a_stopped_run_begins_again_with_the_same_results(tour, finished, tmp_path):
     out, _ = finished
 
     def stop():
@@ -173,8 +173,8 @@ def test_a_run_is_continued_with_the_same_results(tour, finished, tmp_path):
 
     assert run(sensor_job(holed(tour), tour), tmp_path / "out", stop=stop)["state"] == "interrupted"
     with pytest.raises(FolderError, match="source"):
-        run(replace(sensor_job(holed(tour), tour), sensor="tof"), tmp_path / "out", resume=True)
-    run(sensor_job(holed(tour), tour), tmp_path / "out", resume=True)
+        run(replace(sensor_job(holed(tour), tour), sensor="tof"), tmp_path / "out")
+    run(sensor_job(holed(tour), tour), tmp_path / "out")
     assert outputs(tmp_path / "out") == outputs(out)
 
 

@@ -178,7 +178,7 @@ def second_camera(bag):
 
 def test_topics_are_named_where_there_are_several(tmp_path):
     path, truth = written.write_bag(tmp_path, change=second_camera)
-    with pytest.raises(ValueError, match=r"image may be /camera/image, /left/image: name one with --topics"):
+    with pytest.raises(ValueError, match=r"image may be /camera/image, /left/image: name one with --reader topics"):
         open_sequence(path)
     with pytest.raises(ValueError, match=r"the pose may be /odom, /slam: name one"):
         open_sequence(path, topics=["/left/image"])
@@ -192,7 +192,7 @@ def test_topics_are_named_where_there_are_several(tmp_path):
         open_sequence(path, topics=["/camera/image", "/left/depth", "/odom"])
     with pytest.raises(ValueError, match=r"topics: '/lidar' cannot be used; .* has /camera/camera_info \(sensor_msgs"):
         open_sequence(path, topics=["/lidar"])
-    assert cli.main(["data", "check", str(path), "--topics", "/camera/image", "/odom"]) == 0
+    assert cli.main(["data", "check", str(path), "--reader", "topics=/camera/image,/odom"]) == 0
 
 
 def test_depth_of_another_camera_is_left_out_and_named(tmp_path, caplog):
@@ -223,10 +223,10 @@ def test_the_frame_of_a_pose_can_be_named(tmp_path, capfd):
     require_same(open_sequence(path), truth, 6e-4)
     moved = open_sequence(path, topics=["/pose=base"])
     np.testing.assert_allclose(moved[3].T_world_cam, truth.T_world_cam[3] @ written.T_BODY_CAMERA, atol=1e-9)
-    with pytest.raises(ValueError, match=r"does not connect 'arm', .* say --topics /pose=optical"):
+    with pytest.raises(ValueError, match=r"does not connect 'arm', .* say --reader topics=/pose=optical"):
         open_sequence(path, topics=["/pose=arm"])
-    assert cli.main(["data", "check", str(path), "--topics", "/pose=arm"]) == 1
-    assert "--topics /pose=optical" in capfd.readouterr().out
+    assert cli.main(["data", "check", str(path), "--reader", "topics=/pose=arm"]) == 1
+    assert "--reader topics=/pose=optical" in capfd.readouterr().out
 
 
 def static(parent, child):

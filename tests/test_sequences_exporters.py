@@ -305,7 +305,7 @@ def test_the_largest_of_several_models_is_read(tmp_path, caplog, text):
     (path / "sparse" / "unsorted").mkdir()
     sequence = open_sequence(path)
     assert len(sequence) == 6
-    assert "the model 10 with 6 images is read, not 0 with 2; --model-index chooses another one" in caplog.text
+    assert "the model 10 with 6 images is read, not 0 with 2; --reader model_index chooses another one" in caplog.text
     assert len(open_sequence(path, model_index=0)) == 2
     with pytest.raises(ValueError, match=r"model_index must be one of the models of .* \(0, 10\), got 3"):
         open_sequence(path, model_index=3)

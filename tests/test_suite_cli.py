@@ -11,8 +11,9 @@ from tiny_suite import TRUTH, Stub
 
 from ufmstar_torch.eval.bench import measure as measurement
 from ufmstar_torch.eval.commands.evaluate import job_from, read
+from ufmstar_torch.eval.commands.options import joined
 from ufmstar_torch.eval.methods.suite import names, suite_named
-from ufmstar_torch.eval.suite.shards import warned_once
+from ufmstar_torch.eval.suite.tasks import warned_once
 
 
 @pytest.fixture
@@ -77,22 +78,23 @@ def test_a_signal_stops_in_good_order_and_resume_goes_on(ufmstar, rooms, tmp_pat
 
 
 def test_a_dry_run_counts_and_writes_nothing(ufmstar, rooms, tmp_path):
-    words = words_for(rooms, tmp_path / "out", "--dry-run", "--frames", "1:", "--shard", "1/2")
+    words = words_for(rooms, tmp_path / "out", "--dry-run", "--frames", "1:")
     code, text, _ = ufmstar(*words)
     assert code == 0
-    assert "5 rows:" in text
-    assert "2 of 3 sequences:\n  rooms/ash: 3 frames\n  rooms/cedar: 3 frames\n6 frames, 10 records" in text
+    assert "6 rows:" in text
+    lines = "".join(f"  rooms/{name}: 3 frames\n" for name in ("ash", "birch", "cedar"))
+    assert f"3 sequences:\n{lines}9 frames, 18 records" in text
     assert not (tmp_path / "out").exists()
 
 
 def test_several_roots_and_networks_and_a_file_of_options(rooms, tmp_path):
     words = words_for(rooms, "out", "--root", "tour:1?frames=2&size=32x48", "a=tour:2?frames=2", "--sequences", "1")
     job = job_from(read(list(map(str, words[1:]))))
-    assert [item.dataset for item in job.items] == ["a", "rooms", "tour"]
+    assert [item.dataset for item in job.items] == ["rooms", "tour", "a"]
     in_file = {"suite": "depth-only", "root": [f"rooms={rooms}"], "network": [TRUTH], "out": "out", "seed": 3}
-    (tmp_path / "eval.yaml").write_text(json.dumps(in_file))
-    options = read(["--config", str(tmp_path / "eval.yaml"), "--seed", "4"])
-    assert (list(options.data.root), options.data.seed) == (in_file["root"], 4)
+    (tmp_path / "eval.json").write_text(json.dumps(in_file))
+    options = read(["--config", str(tmp_path / "eval.json"), "--seed", "4"])
+    assert (joined(options.data.root), options.data.seed) == (tuple(in_file["root"]), 4)
     assert len(job_from(options).items) == 3
 
 
@@ -110,9 +112,7 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
     rows = ["DepthOnly", "UfM-DepthOnly", "UfM-DepthOnly-100K", "UfM*-DepthOnly"]
     (tmp_path / "timed.toml").write_text(f"efficiency = true\n[[rows]]\nmethods = {rows}\n")
     words = words_for(rooms, tmp_path / "out", "--no-report", "--threads", "1", suite=tmp_path / "timed.toml")
-    assert "this shard is complete, others are not" in ufmstar(*words, "--shard", "1/2")[2]
-    assert measured == [], "another part may still be running"
-    code, _, err = ufmstar(*words, "--shard", "2/2")
+    code, _, err = ufmstar(*words)
     assert (code, "measuring time, energy and memory" in err) == (0, True)
     written = json.loads((tmp_path / "out" / "efficiency.json").read_text())
     assert (written["sequence"], written["count"]) == ({"name": "3 sequences"}, 2.0), "means over the sequences"
@@ -150,7 +150,7 @@ def test_a_dry_run_needs_nothing_and_states_what_is_missing(ufmstar):
     assert all(f"  --network {base}=MODEL:FILE: " in text for base in suite_named("paper-table-1").bases)
     assert "no --root: folders with sequences" in text
     assert "no --out: " in text
-    assert "0 of 0 sequences" in text
+    assert "\n0 sequences:" in text
     assert ufmstar("eval", "--dry-run")[0] == 2, "the suite is needed"
 
 

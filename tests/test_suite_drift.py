@@ -13,6 +13,7 @@ from scipy.stats import kstest
 from tiny_suite import row
 
 from ufmstar_torch.eval.engine.anchors import anchor_sources
+from ufmstar_torch.eval.engine.estimators import Estimator, output_of
 from ufmstar_torch.eval.engine.judge import references
 from ufmstar_torch.eval.engine.maps import own_depth
 from ufmstar_torch.eval.engine.rows import RowRunner
@@ -132,16 +133,17 @@ def test_a_setting_of_drift(name):
     assert Setting(seed=2, anchors="truth").pose_noise == ()
 
 
-class Poses:
+class Poses(Estimator):
     """An estimator that records its input poses."""
 
     def __init__(self):
+        super().__init__()
         self.given = []
 
     def update(self, predicted, T_world_cam, anchors=None):
         self.given.append(T_world_cam.numpy())
         depth = predicted.depth
-        return {"depth": depth, "variance": None, "valid": depth > 0}
+        return output_of(depth, None, depth > 0)
 
 
 def test_a_row_sees_drift_and_noise_on_top_of_it():

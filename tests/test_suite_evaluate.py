@@ -106,7 +106,7 @@ def test_full_and_alone_put_the_members_together(network_files, networks, sequen
     def piped(pipeline):
         for _, image, pose, K in frames_of(sequence):
             out = pipeline(image, pose, K)
-            yield out.depth, out.variance, out.ufm.valid, out.intrinsics
+            yield out.depth, out.variance, out.valid, out.intrinsics
 
     def alone():
         for _, image, _, K in frames_of(sequence):

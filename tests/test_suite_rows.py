@@ -18,7 +18,7 @@ from walks import SPGF, oracle_settings
 import oracle
 import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig
-from ufmstar_torch.eval.engine.estimators import Gaussians, ufm_star_config
+from ufmstar_torch.eval.engine.estimators import Gaussians, make_estimator, ufm_star_config
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.methods.perturb import perturbed
 from ufmstar_torch.eval.methods.setting import Setting
@@ -202,8 +202,8 @@ def test_a_in_h_agrees_with_the_oracle():
         answer = estimator.update(maps, torch.tensor(T))
         _, M = judge.step(depth, T, K, features=a[None])
         A = oracle.aleatoric_in_h(judge.mixture_cam, depth, depth > 0, K, a, prior_weight=1.0)
-        np.testing.assert_allclose(answer["aleatoric"][0].numpy(), A, rtol=1e-5)
-        np.testing.assert_allclose(answer["variance"][0].numpy(), M + A, rtol=1e-3, atol=1e-5)
+        np.testing.assert_allclose(answer.aleatoric[0].numpy(), A, rtol=1e-5)
+        np.testing.assert_allclose(answer.variance[0].numpy(), M + A, rtol=1e-3, atol=1e-5)
         frame = maps.depth, torch.tensor(T), torch.tensor(K), maps.aleatoric_variance
         mean = sampled.mean_uncertainty(*frame, features=torch.ones(1, 1, *depth.shape), fraction=1.0)
         assert mean.aleatoric.mean.item() == pytest.approx(np.nanmean(A), rel=1e-4), "together with a feature, compiled"
@@ -268,3 +268,19 @@ def test_a_row_prepares_its_images_as_it_says(tmp_path):
     assert maps.prepared("resize") is maps
     with pytest.raises(ValueError, match="goes with networks: maps exist already"):
         maps.prepared("crop")
+
+
+def test_the_relative_baseline_compares_no_views():
+    one = row("Relative-DepthOnly")
+    assert one.method.name == "Relative-DepthOnly"
+    estimator = make_estimator(one, torch.device("cpu"))
+    depth = torch.tensor([[[1.0, 4.0, 0.0, torch.nan]]])
+    prediction = DepthPrediction(depth=depth, aleatoric_variance=torch.full_like(depth, 9.0))
+    for _ in range(2):
+        answer = estimator.update(prediction, torch.eye(4, dtype=torch.float64))
+        torch.testing.assert_close(answer.variance[0, 0, :2], torch.tensor([0.04, 0.64]))
+        assert answer.valid.tolist() == [[[True, True, False, False]]]
+        assert answer.variance.isnan().tolist() == [[[False, False, True, True]]]
+    assert estimator.memory() == {}
+    with pytest.raises(ValueError, match="no method is called 'relative-DepthOnly'"):
+        row("relative-DepthOnly")

@@ -127,7 +127,7 @@ def test_what_the_judge_cannot_use_is_broken_and_what_it_cannot_write_ends_all(r
     for error in (CacheError("disk full"), OSError("disk full"), TypeError("a mistake of ours")):
         with pytest.raises(type(error)):
             go(job, fails(error), resume=True)
-    assert go(job, resume=True)[0].complete
+    assert go(job, resume=True)[0].finished
 
 
 def test_images_without_poses_are_for_networks_alone(tmp_path):

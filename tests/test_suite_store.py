@@ -20,17 +20,9 @@ from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
 from ufmstar_torch.eval.run.folder import FolderError, hold
 from ufmstar_torch.eval.suite.folder import evaluation_folder
-from ufmstar_torch.eval.suite.work_items import Shard, WorkItem, find_work, read_names
+from ufmstar_torch.eval.suite.work_items import WorkItem, find_work, read_names
 
 # ---- work list ----
-
-
-@given(st.integers(0, 60), st.integers(1, 12))
-def test_shards_take_every_sequence_exactly_once_and_equally_many(count, parts):
-    items = [WorkItem("d", f"s{n:03}", "p") for n in range(count)]
-    shares = [Shard(index, parts).of(items) for index in range(1, parts + 1)]
-    assert sorted(item for share in shares for item in share) == items
-    assert max(map(len, shares)) - min(map(len, shares)) <= 1
 
 
 @given(st.lists(st.text(min_size=1, max_size=30), min_size=1, unique=True))
@@ -133,18 +125,15 @@ def test_overwriting_removes_our_files_alone(tmp_path):
     assert all(file.read_text() == "mine" for file in users)
     assert [file.exists() for file in made] == [False, False, True]
     after = {path.name for path in out.rglob("*") if path.is_file()}
-    assert after == {"eval.json", "eval.lock", "eval-1-of-1.lock", ".writable", "kept", *(file.name for file in users)}
+    assert after == {"eval.json", "eval.lock", "kept", *(file.name for file in users)}
 
 
-def test_a_shard_is_evaluated_by_one_process_and_not_overwritten_meanwhile(tmp_path):
+def test_a_folder_is_evaluated_by_one_process(tmp_path):
     out = tmp_path / "out"
-    with evaluation_folder(out, ABOUT, shard=Shard(1, 2)):
-        with evaluation_folder(out, ABOUT, shard=Shard(2, 2), resume=True):
-            pass
-        with pytest.raises(FolderError, match="another process is evaluating shard 1/2 there now"):
-            enter(out, ABOUT, shard=Shard(1, 2), resume=True)
-        with pytest.raises(FolderError, match="another process is working there now"):
-            enter(out, ABOUT, overwrite=True)
+    with evaluation_folder(out, ABOUT):
+        for how in ({"resume": True}, {"overwrite": True}):
+            with pytest.raises(FolderError, match="another evaluation is writing there now"):
+                enter(out, ABOUT, **how)
     enter(out, ABOUT, overwrite=True)
 
 

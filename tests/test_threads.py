@@ -38,8 +38,8 @@ CALLS = {
     "update": lambda model: model.update(DepthPrediction(torch.full((1, 24, 32), 2.0)), POSE, K),
     "mean_uncertainty": lambda model: model.mean_uncertainty(IMAGE, POSE, K),
     "reset": lambda model: model.reset(),
-    "load_state_dict": lambda model: model.load_state_dict({}),
-    "_save_to_state_dict": lambda model: model.state_dict(),
+    "load_stream_state": lambda model: model.load_stream_state({}),
+    "stream_state": lambda model: model.stream_state(),
     "_apply": lambda model: model.double(),
     "_predicted": lambda model: next(model.stream([(IMAGE, POSE, K)])),
 }
@@ -61,7 +61,7 @@ def test_a_second_thread_is_refused_by_name_and_changes_nothing():
     network.go_on.set()
     thread.join()
     assert model.image_index == 2
-    assert model(IMAGE, POSE, K).ufm.statistics.fault.tolist() == [0], "the module goes on"
+    assert model(IMAGE, POSE, K).statistics.fault.tolist() == [0], "the module goes on"
     assert model.ufm.frames.tolist() == [3]
 
 

@@ -35,7 +35,6 @@ def frame_of(script, out, truth):
 
 def test_the_planner_of_the_page_brakes_before_a_near_wall(outputs):
     """The wall is 2 m away; its image is as large as the page's map."""
-    from ufmstar_torch import uncertain_depth as pipeline
 
     class Model:
         """Returns the last output, with depth and variance of a wall at a given distance."""
@@ -46,12 +45,12 @@ def test_the_planner_of_the_page_brakes_before_a_near_wall(outputs):
         def __call__(self, image, pose, K):
             from dataclasses import replace
 
-            wide = {n: v.expand(1, 36, 48).mean().expand(1, 224, 224) for n, v in vars(outputs[-1]).items()
-                    if n.startswith("posterior_")}  # fmt: skip
-            d, V = self.scale * wide["posterior_depth"], self.scale**2 * wide["posterior_variance"]
-            wide |= {"posterior_depth": d, "posterior_variance": V, "posterior_inlier_variance": 0.5 * V}
-            ufm = replace(outputs[-1], depth=d, variance=V, **wide)
-            return pipeline.UncertainPrediction(DepthPrediction(d), ufm, None)
+            last = outputs[-1]
+            wide = {n: v.expand(1, 36, 48).mean().expand(1, 224, 224) for n, v in
+                    {"depth": last.depth, "variance": last.variance, **last.maps}.items()}  # fmt: skip
+            d, V = self.scale * wide.pop("depth"), self.scale**2 * wide.pop("variance")
+            maps = wide | {"posterior_inlier_variance": 0.5 * V}
+            return replace(last, depth=d, variance=V, maps=maps, prediction=DepthPrediction(d))
 
     (code,) = blocks((DOCS / "thresholds.md").read_text())
     body = code.split("\n", 1)[1]
@@ -72,8 +71,9 @@ def test_rules_of_a_wall(script, outputs):
 
 def test_gates_divide_the_pixels_and_state_their_errors(script, outputs):
     frame, out = frame_of(script, outputs[-1], 2.0), outputs[-1]
-    parts = script.gates(out.depth[0], (0.07 * out.depth[0]).square(), frame)
-    assert [len(part) for part in parts] == [0, out.depth[0].numel(), 0, 0]
+    depth = out.network_depth[0]
+    parts = script.gates(depth, (0.07 * depth).square(), frame)
+    assert [len(part) for part in parts] == [0, depth.numel(), 0, 0]
     torch.testing.assert_close(parts[1], torch.full_like(parts[1], 0.3 / 1.3), rtol=1e-5, atol=0)
 
 

@@ -274,7 +274,7 @@ def test_a_monodepth2_of_another_resnet_is_refused(tmp_path, held, wanted):
     torch.save(decoder, tmp_path / "depth.pth")
     started = starting_network(NetworkSpec("monodepth2", layers=held), tmp_path)
     assert torch.equal(started.backbone.levels[4].before.weight, network.levels[4].before.weight)
-    with pytest.raises(ValueError, match=r"does not fit MonodepthResNet .* another --network\.layers may"):
+    with pytest.raises(ValueError, match=r"does not fit MonodepthResNet .* another network\.layers may"):
         starting_network(NetworkSpec("monodepth2", layers=wanted), tmp_path)
 
 
@@ -298,7 +298,7 @@ def test_the_shared_weights_are_starts():
 
     for key, value in FastDepth.from_onnx(onnx).state_dict().items():
         assert torch.equal(network.backbone.state_dict()[key], value)
-    with pytest.raises(ValueError, match=r"--network\.widths pruned or full"):
+    with pytest.raises(ValueError, match=r"network\.widths=pruned or full"):
         starting_network(NetworkSpec(widths=0.5), onnx)
     spec = NetworkSpec(architecture="monodepth2", strides="v1")
     weights = torch.load(require_shared(resnet), weights_only=True)
@@ -322,7 +322,8 @@ def test_only_the_named_part_is_trained(frames, tmp_path):
 
 def words(frames, out, *more):
     base = ["train", "--preset", "fastdepth-aleatoric", "--data", "sequences", "--root", frames, "--out", out]
-    base += ["--part", "0:12", "--validation-part", "12:16", "--network.size", "[32,32]", "--network.widths", "0.05"]
+    settings = ("data.part=0:12", "data.validation_part=12:16", "network.size=[32,32]", "network.widths=0.05")
+    base += [f"--set={setting}" for setting in settings]
     base += ["--accelerator", "cpu", "--batch-size", "4", "--no-tensorboard", "--no-progress"]
     return [*base, *more]
 
@@ -348,7 +349,7 @@ def test_a_file_that_cannot_be_read_ends_a_training_in_a_line(ufmstar, tmp_path)
         file.write_bytes(b"no depth")
     code, _, err = ufmstar(*words(path, tmp_path / "out", "--max-steps", 1))
     assert code == 1
-    assert re.search(r"ufmstar train: failed: walk/\S+: .*--on-bad-file skip", err), err
+    assert re.search(r"ufmstar train: failed: walk/\S+: .*--set data.on_bad_file=skip", err), err
 
 
 def test_a_stopped_training_says_how_to_go_on(ufmstar, frames, tmp_path):
@@ -359,7 +360,7 @@ def test_a_stopped_training_says_how_to_go_on(ufmstar, frames, tmp_path):
 @pytest.mark.parametrize(
     ("more", "told"),
     [
-        (["--learning-speed", "2"], r"[Uu]nrecognized arguments: --learning-speed 2"),
+        (["--learning-speed", "2"], "Unrecognized options: --learning-speed, 2"),
         (["--resume", "--overwrite"], "contradict each other"),
         (["--data", "tour"], "--data tour takes no --root"),
         (["--threads", "0"], "--threads must be at least 1"),

@@ -29,14 +29,38 @@ def command(job):
     """The command line of a job on two processes."""
     r, n = job.recipe, job.recipe.network
     words = ["--preset", "fastdepth-aleatoric", "--data", "sequences", "--root", *job.data.paths]
-    words += ["--part", job.data.part, "--validation-part", job.data.validation_part, "--out", str(job.settings.out)]
-    words += ["--network.widths", str(n.widths), "--network.norm", "false", "--network.positive", n.positive]
-    words += ["--network.dropout", str(n.dropout)]
-    words += ["--network.size", str(list(n.size)), "--network.preprocess", n.preprocess]
+    words += [
+        "--set",
+        f"data.part={job.data.part}",
+        "--set",
+        f"data.validation_part={job.data.validation_part}",
+        "--out",
+        str(job.settings.out),
+    ]
+    words += [
+        "--set",
+        f"network.widths={n.widths}",
+        "--set",
+        "network.norm=false",
+        "--set",
+        f"network.positive={n.positive}",
+    ]
+    words += ["--set", f"network.dropout={n.dropout}"]
+    words += ["--set", f"network.size={list(n.size)}", "--set", f"network.preprocess={n.preprocess}"]
     for name in ("epochs", "batch_size", "learning_rate", "average", "clip", "warmup_steps"):
         words += [f"--{name.replace('_', '-')}", str(getattr(r, name))]
-    words += ["--log-every", "1", "--no-progress", "--no-tensorboard", "--accelerator", "cpu"]
-    return [sys.executable, "-m", "ufmstar_torch.cli", "train", *words, "--devices", "2", "--strategy", "ddp"]
+    words += ["--set", "session.log_every=1", "--no-progress", "--no-tensorboard", "--accelerator", "cpu"]
+    return [
+        sys.executable,
+        "-m",
+        "ufmstar_torch.cli",
+        "train",
+        *words,
+        "--devices",
+        "2",
+        "--set",
+        "session.strategy=ddp",
+    ]
 
 
 def losses(out):

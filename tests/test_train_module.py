@@ -143,7 +143,18 @@ def test_a_checkpoint_from_the_command_line(frames, tmp_path, kind, capsys):
     folder = write_depth_anything(tmp_path / "checkpoint", kind, seed=SEED)
     (tmp_path / "spec.json").write_text('{"size": [70, 84], "keep_aspect": false}')
     words = ["--backbone", folder, "--head", "aleatoric", "--spec", tmp_path / "spec.json", "--data", "sequences"]
-    words += ["--root", frames, "--part", "0:12", "--validation-part", "12:16", "--max-steps", "2", "--batch-size", "4"]
+    words += [
+        "--root",
+        frames,
+        "--set",
+        "data.part=0:12",
+        "--set",
+        "data.validation_part=12:16",
+        "--max-steps",
+        "2",
+        "--batch-size",
+        "4",
+    ]
     words += ["--no-progress", "--no-tensorboard", "--accelerator", "cpu", "--out", tmp_path / "out"]
     assert cli.main(["train", *map(str, words)]) == 0
     assert "val_nll" in capsys.readouterr().out

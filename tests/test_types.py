@@ -55,8 +55,7 @@ def own_network():
     print(model(torch.ones(1, 3, 48, 64), torch.eye(4), (50.0, 50.0, 32.0, 24.0)).std.median())
 def choosing():
     from ufmstar_torch.frames.choose import choose
-    from ufmstar_torch.frames.online import TrainDecision
-    print("chosen", choose([1.0, 2.0]), TrainDecision(0.1)(torch.ones(3)))
+    print("chosen", choose([1.0, 2.0]))
 def metrics():
     from ufmstar_torch.eval.metrics import mean_and_ci
 def ranking():
@@ -74,7 +73,7 @@ def test_every_package_of_an_extra_is_known():
     with (ROOT / "pyproject.toml").open("rb") as file:
         extras = tomllib.load(file)["project"]["optional-dependencies"]
     imported = {"opencv-python-headless": "cv2", "pillow": "PIL"}
-    for extra in ("models", "eval", "viz", "train", "energy", "litert"):
+    for extra in ("models", "eval", "viz", "train", "energy"):
         for line in extras[extra]:
             package = line.partition(">")[0].partition("[")[0]
             name = imported.get(package, package.replace("-", "_"))
@@ -116,7 +115,7 @@ def test_a_type_checker_knows_what_a_call_returns_and_accepts_the_short_examples
         assert len([line for line in example.read_text().splitlines() if line]) < 64, name
     mypy = [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "own.py", *names]
     output = subprocess.run(mypy, cwd=tmp_path, capture_output=True, text=True, check=False).stdout
-    assert 'own.py:7: note: Revealed type is "ufmstar_torch.uncertain_depth.UncertainPrediction"' in output, output
+    assert 'own.py:7: note: Revealed type is "ufmstar_torch.frames.output.UncertaintyOutput"' in output, output
     assert 'own.py:8: note: Revealed type is "torch._tensor.Tensor"' in output, output
     assert "own.py:9: error: Too few arguments" in output, output
     assert 'own.py:10: error: Argument "mode"' in output, output

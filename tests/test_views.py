@@ -180,7 +180,7 @@ def walk_of(images, *, moving: bool = True):
         pose = np.eye(4)
         pose[0, 3] = 0.1 * i * moving
         out = model(image, pose, camera)
-    return out.ufm
+    return out
 
 
 def test_a_covered_lens_is_named_and_measures_nothing(caplog):
@@ -196,7 +196,7 @@ def test_a_covered_lens_is_named_and_measures_nothing(caplog):
     assert len([text for text in caplog.messages if "images in a row show nothing" in text]) == 1
     assert int(out.statistics.segments) == 0
     assert torch.equal(out.statistics.components, seen.statistics.components)  # the map is as before
-    ratio = (out.std / out.depth)[out.valid]
+    ratio = (out.ufm_variance.sqrt() / out.network_depth)[out.valid]
     torch.testing.assert_close(ratio, torch.full_like(ratio, 0.2), rtol=0.1, atol=0)
 
 

@@ -148,13 +148,13 @@ def test_warm_up_leaves_networks_images_and_state_as_they_are():
             return DepthPrediction(2 + torch.rand_like(image[:, 0]))
 
     model = UncertainDepth([Noisy(), Noisy()], posterior=True)
-    before, random = {k: v.clone() for k, v in model.state_dict().items()}, torch.get_rng_state()
+    before, random = {k: v.clone() for k, v in model.stream_state().items()}, torch.get_rng_state()
     done = []
     model.warm_up((32, 48), streams=2, progress=lambda *counts: done.append(counts))
     assert Noisy.sizes == [(2, 3, 32, 48)] * 4  # every member twice
     assert done[-1] == (22, 22)  # two frames, a mean and the search
     assert torch.equal(torch.get_rng_state(), random)
-    assert all(same(v, before[k]) for k, v in model.state_dict().items())
+    assert all(same(v, before[k]) for k, v in model.stream_state().items())
     UncertainDepth(None).warm_up((32, 48))
     with pytest.raises(TypeError, match=r"size must be \(H, W\), positive whole numbers, got int"):
         model.warm_up(224)

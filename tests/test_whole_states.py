@@ -31,7 +31,7 @@ class Warner(Recalibration):
 
     loud = False
 
-    def map_variance(self, variance):
+    def mapped(self, variance, confidence):
         if self.loud:
             warnings.warn("after the step", RuntimeWarning, stacklevel=2)
         return variance
@@ -63,7 +63,7 @@ def model_of(kind, frames=0):
 
 
 def snapshot(model):
-    return {name: value.clone() for name, value in model.state_dict().items()} | {"next": torch.tensor(model._next)}
+    return {name: value.clone() for name, value in model.stream_state().items()} | {"next": torch.tensor(model._next)}
 
 
 def unchanged(model, before):
@@ -78,7 +78,7 @@ def test_a_frame_that_raises_leaves_everything_as_it_was(kind):
     image, pose, intrinsics = frame(3)
     broken = pose.copy()
     broken[0, 3] = np.nan
-    warner = model.ufm._extensions.each[-1]
+    warner = model.ufm.recalibration
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(ValueError, match="stream 0: pose holds NaN"):
@@ -130,12 +130,12 @@ DAMAGED = {
 
 @pytest.mark.parametrize(("kind", "name", "damage", "message"), DAMAGED.values(), ids=DAMAGED)
 def test_a_damaged_state_is_refused_as_a_whole(kind, name, damage, message):
-    model, saved = model_of(kind, 1), model_of(kind, 4).state_dict()
+    model, saved = model_of(kind, 1), model_of(kind, 4).stream_state()
     before = snapshot(model)
-    with pytest.raises(RuntimeError, match=message):
-        model.load_state_dict(saved | {name: damage(saved[name])})
+    with pytest.raises(ValueError, match=message):
+        model.load_stream_state(saved | {name: damage(saved[name])})
     assert unchanged(model, before)
-    model.load_state_dict(saved)
+    model.load_stream_state(saved)
     assert model._next == 4
 
 
@@ -150,8 +150,8 @@ def test_a_warning_about_the_config_that_is_an_error_changes_nothing():
             model.ufm.load_state_dict(other.ufm.state_dict())
         assert unchanged(model, before)
         with pytest.raises(UserWarning, match=r"eta was 0\.4, is 0\.5"):
-            model.load_state_dict(other.state_dict())
+            model.load_stream_state(other.stream_state())
         assert unchanged(model, before)
     with pytest.warns(UserWarning, match="eta was"):
-        model.load_state_dict(copy.deepcopy(other.state_dict()))
+        model.load_stream_state(copy.deepcopy(other.stream_state()))
     assert model._next == 2

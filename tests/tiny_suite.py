@@ -24,7 +24,7 @@ from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.suite.job import EvalJob
-from ufmstar_torch.eval.suite.shards import evaluate_suite
+from ufmstar_torch.eval.suite.tasks import evaluate_suite
 from ufmstar_torch.eval.suite.work_items import find_work
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models import NetworkSpec, build_network, save_trained
@@ -97,10 +97,10 @@ def rows_of(*names, **setting):
     return tuple(row(name, **setting) for name in names)
 
 
-def evaluate(sequence, rows, networks, store=None, *, sinks=(), progress=lambda _: None, stop=lambda: False, **judge):
+def evaluate(sequence, rows, networks, store=None, *, progress=lambda _: None, stop=lambda: False, **options):
     """Evaluate a sequence on the CPU: {slug of the row: result}."""
-    how = Judge(networks, CPU, store, **judge)
-    results = evaluate_sequence(sequence, rows, how, sinks=sinks, progress=progress, stop=stop)
+    examples, judge = options.pop("examples", None), Judge(networks, CPU, store, **options)
+    results = evaluate_sequence(sequence, rows, judge, examples=examples, progress=progress, stop=stop)
     assert [result.row for result in results] == list(rows)
     return {result.row.slug: result for result in results}
 

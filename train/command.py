@@ -4,24 +4,35 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
-from typing import Any, ClassVar
+from dataclasses import Field, dataclass, field, fields, replace
+from functools import cached_property
+from typing import Any, ClassVar, Literal
 
-from ufmstar_torch.eval.commands.options import UsageError, fields_of, option, parse
+from ufmstar_torch.eval.commands.options import (
+    Count,
+    File,
+    Flag,
+    Number,
+    Repeated,
+    Text,
+    Texts,
+    UsageError,
+    assigned,
+    parse,
+)
 from ufmstar_torch.models.spec import NetworkSpec
 from ufmstar_torch.train.augment import AugmentationConfig
-from ufmstar_torch.train.data_config import KINDS, DataConfig
-from ufmstar_torch.train.presets import METHOD_ROWS, PRESETS, Recipe, preset, table
+from ufmstar_torch.train.data_config import DataConfig
+from ufmstar_torch.train.presets import Recipe, preset, table
 from ufmstar_torch.train.settings import FitSettings, Job
 
-
-@dataclass(frozen=True, kw_only=True)
-class RecipeOptions:
-    """Instead of the preset's values."""
-
-    recipe: dict[str, Any] = fields_of(Recipe, without=("network", "members"), unset=True)
-    network: dict[str, Any] = fields_of(NetworkSpec, "network.", without=("members", "module"), unset=True)
+_SECTIONS: dict[str, tuple[Any, tuple[str, ...]]] = {
+    "network": (NetworkSpec, ("members", "module")),
+    "augment": (AugmentationConfig, ()),
+    "data": (DataConfig, ("kind", "paths", "augmentation")),
+    "session": (FitSettings, ("out", "trainable", "progress", "tensorboard")),
+    "": (Recipe, ("network", "members")),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,18 +40,18 @@ class BackboneOptions:
     """A network of your own instead of a preset.
 
     Attributes:
-        backbone: directory or hub name of a depth model of transformers.
-        head: what is trained on it.
-        fine_tune: train the network too, not the head alone.
-        features: part of the network whose input the head reads; default: the last convolution.
-        spec: JSON with declarations about the network: kind, scale, size, alignment.
+        backbone: Train on this directory or hub name of a depth model of transformers.
+        head: Train this head on it.
+        fine_tune: Train the network too, not the head alone.
+        features: The head reads the input of this part of the network (default: the last convolution).
+        spec: This JSON file declares the network's kind, scale, size and alignment.
     """
 
-    backbone: Path | None = None
-    head: str = option("aleatoric", choices=tuple(METHOD_ROWS))
-    fine_tune: bool = False
-    features: str | None = None
-    spec: Path | None = None
+    backbone: File = None
+    head: Literal["depth-only", "aleatoric", "evidential", "mc-dropout", "ensemble", "batch-ensemble"] = "aleatoric"
+    fine_tune: Flag = False
+    features: Text = None
+    spec: File = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,16 +59,14 @@ class DataOptions:
     """Data.
 
     Attributes:
-        data: what --root contains; tours need none.
-        root: folder of NYU Depth V2, or sequences.
-        no_augmentation: train on the frames as they are.
+        data: Train on NYU Depth V2, on sequences, or on rendered tours.
+        root: The folder of NYU Depth V2, or of each sequence; tours need none.
+        no_augmentation: Train on the frames as they are.
     """
 
-    data: str | None = option(None, choices=KINDS)
-    root: tuple[str, ...] = ()
-    config: dict[str, Any] = fields_of(DataConfig, without=("kind", "paths", "augmentation"))
-    no_augmentation: bool = False
-    augment: dict[str, Any] = fields_of(AugmentationConfig, "augment.")
+    data: Literal["tour", "nyu", "sequences"] | None = None
+    root: Texts = ()
+    no_augmentation: Flag = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,57 +74,100 @@ class SessionOptions:
     """Session.
 
     Attributes:
-        trainable: train only parameters whose names begin with one of these.
-        no_progress: no progress bar.
-        no_tensorboard: no logs for TensorBoard.
+        seed: Draw initial weights, order and augmentation with this seed.
+        init: Start from these weights: a trained .safetensors, FastDepth's .onnx, a ResNet's .pth, Monodepth2's folder,
+            or the word imagenet.
+        accelerator: Train on cpu or gpu (default: a GPU if there is one).
+        devices: Use this many processes or GPUs.
+        nodes: Use this many computers.
+        trainable: Train only parameters whose names begin with one of these.
+        max_minutes: Stop in good order after this time; --resume continues.
+        no_progress: Show no progress bar.
+        no_tensorboard: Write no logs for TensorBoard.
     """
 
-    settings: dict[str, Any] = fields_of(FitSettings, without=("out", "trainable", "progress", "tensorboard"))
-    trainable: tuple[str, ...] = ()
-    no_progress: bool = False
-    no_tensorboard: bool = False
+    seed: int = 0
+    init: File = None
+    accelerator: str = "auto"
+    devices: str = "1"
+    nodes: int = 1
+    trainable: Texts = ()
+    max_minutes: float = 0.0
+    no_progress: Flag = False
+    no_tensorboard: Flag = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
     """Train a depth network with an uncertainty head, or an ensemble of them.
 
-    A preset states everything but the data; options change single values of it. OUT/trained.safetensors contains all
+    A preset states everything but the data; --set changes single values of it. OUT/trained.safetensors contains all
     members in the end, for `ufmstar run --model trained --weights OUT/trained.safetensors`.
 
     Attributes:
-        list: print the presets and stop.
-        preset: what is trained and how.
-        members: number of members of the ensemble or BatchEnsemble.
-        out: folder for all results.
-        resume: go on with the training in --out.
-        overwrite: replace the training in --out.
-        threads: CPU threads; default: one for each core.
+        list: Print the presets and stop.
+        preset: Train what this preset states.
+        members: The ensemble or BatchEnsemble has this many members.
+        out: Write all results to this folder.
+        resume: Continue the training in --out.
+        overwrite: Replace the training in --out.
+        threads: Use this many CPU threads (default: one for each core).
+        epochs: Train for this many epochs instead of the preset's.
+        max_steps: Stop each member after this many steps.
+        batch_size: Each step uses this many images instead of the preset's.
+        learning_rate: Start at this learning rate instead of the preset's.
+        set: Set another value as NAME=VALUE: of Recipe (weight_decay), network. (NetworkSpec), augment.
+            (AugmentationConfig), data. (DataConfig) or session. (FitSettings); repeatable (docs/training.md).
     """
 
     USAGE: ClassVar[str] = (
         "ufmstar train {--preset NAME,--backbone DIR} --data {nyu,sequences,tour} [--root DIR...] --out OUT [options]"
     )
 
-    list: bool = False
-    preset: str | None = option(None, choices=tuple(PRESETS))
-    members: int | None = None
-    out: Path | None = None
-    resume: bool = False
-    overwrite: bool = False
-    threads: int | None = None
+    list: Flag = False
+    preset: Text = None
+    members: Count = None
+    out: File = None
+    resume: Flag = False
+    overwrite: Flag = False
+    threads: Count = None
+    epochs: Count = None
+    max_steps: Count = None
+    batch_size: Count = None
+    learning_rate: Number = None
+    set: Repeated = ()
     backbone_options: BackboneOptions = field(default_factory=BackboneOptions)
-    changes: RecipeOptions = field(default_factory=RecipeOptions)
     source: DataOptions = field(default_factory=DataOptions)
     session: SessionOptions = field(default_factory=SessionOptions)
+
+    def __post_init__(self) -> None:
+        _ = self.changes  # checks the names
+
+    @cached_property
+    def changes(self) -> dict[str, dict[str, Any]]:
+        """The values that options change, by section. Raises ValueError: no such section or value."""
+        named = {name: getattr(self, name) for name in ("epochs", "max_steps", "batch_size", "learning_rate")}
+        changes: dict[str, dict[str, Any]] = {section: {} for section in _SECTIONS}
+        changes[""] = {name: value for name, value in named.items() if value is not None}
+        for name, value in assigned(self.set).items():
+            section, _, inner = name.rpartition(".")
+            by_name = _fields_of(section)
+            if inner not in by_name:
+                expected = ", ".join(by_name or [f"{prefix}." for prefix in _SECTIONS if prefix])
+                within = f"{section}." if section and by_name else ""
+                raise ValueError(f"--set has no {name}; expected {within}{expected}")
+            if by_name[inner].default == () and not isinstance(value, list):
+                value = [value]
+            changes[section][inner] = tuple(value) if isinstance(value, list) else value
+        return changes
 
     def recipe(self) -> Recipe:
         """The preset with the values that the options change. Raises ValueError: no preset, or an impossible value."""
         if self.preset is None:
             raise ValueError("--preset or --backbone is missing; ufmstar train --help")
         recipe = preset(self.preset)
-        network = replace(recipe.network, **self.changes.network)
-        recipe = replace(recipe, network=network, **self.changes.recipe)
+        network = replace(recipe.network, **self.changes["network"])
+        recipe = replace(recipe, network=network, **self.changes[""])
         return recipe if self.members is None else recipe.with_members(self.members)
 
     def job(self) -> Job:
@@ -131,15 +183,14 @@ class TrainOptions:
             raise ValueError("--resume and --overwrite contradict each other")
         if (d.data == "tour") == bool(d.root):
             raise ValueError(f"--data {d.data} {'takes no' if d.root else 'needs'} --root")
-        augmentation = None if d.no_augmentation else AugmentationConfig(**d.augment)
-        data = DataConfig(kind=d.data, paths=d.root, augmentation=augmentation, **d.config)
-        settings = FitSettings(
-            out=self.out,
-            trainable=s.trainable,
-            progress=not s.no_progress,
-            tensorboard=not s.no_tensorboard,
-            **s.settings,
-        )
+        augmentation = None if d.no_augmentation else AugmentationConfig(**self.changes["augment"])
+        data = DataConfig(kind=d.data, paths=d.root, augmentation=augmentation, **self.changes["data"])
+        named = {
+            name: getattr(s, name) for name in ("seed", "init", "accelerator", "nodes", "trainable", "max_minutes")
+        }
+        named |= {"devices": int(s.devices) if s.devices.isdecimal() else s.devices}
+        named |= {"progress": not s.no_progress, "tensorboard": not s.no_tensorboard, **self.changes["session"]}
+        settings = FitSettings(out=self.out, **named)
         if recipe is not None:
             return Job(recipe, data, settings)
         from ufmstar_torch.train.own_network import own_job
@@ -149,9 +200,10 @@ class TrainOptions:
             "fine_tune": chosen.fine_tune,
             "features": chosen.features,
             "spec": chosen.spec,
-            "network": self.changes.network,
+            "network": self.changes["network"],
+            **self.changes[""],
         }
-        return own_job(chosen.backbone, chosen.head, data, settings, members=self.members, **how, **self.changes.recipe)
+        return own_job(chosen.backbone, chosen.head, data, settings, members=self.members, **how)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,6 +211,12 @@ class _Command(TrainOptions):
     """The options and the words that they were read from, for the summary."""
 
     words: Sequence[str]
+
+
+def _fields_of(section: str) -> dict[str, Field[Any]]:
+    """The fields that ``--set`` changes in a section, by name; {} without such a section."""
+    kind, without = _SECTIONS.get(section, (None, ()))
+    return {} if kind is None else {f.name: f for f in fields(kind) if f.name not in without}
 
 
 def read(words: Sequence[str]) -> _Command:
@@ -192,7 +250,7 @@ def main(options: _Command) -> int:
         try:
             summary = fit(job, resume=options.resume, overwrite=options.overwrite, asked=stop, command=command)
         except FrameError as error:
-            raise ValueError(f"{error} (--on-bad-file skip leaves such files out)") from error
+            raise ValueError(f"{error} (--set data.on_bad_file=skip leaves such files out)") from error
     if "members" not in summary:
         return 0  # a further process of a distributed training: the first one reports
     print(report(summary))

@@ -9,7 +9,6 @@ from ufmstar_torch.eval.tour.style import style_of
 from ufmstar_torch.runtime.checked import Checked, choice, number
 from ufmstar_torch.train.augment import AugmentationConfig
 
-KINDS = ("nyu", "sequences", "tour")
 _PART = re.compile(r"(\d+(?:\.\d+)?)\s*(%?):(\d+(?:\.\d+)?)\s*(%?)")
 
 

@@ -215,7 +215,7 @@ class TrainingModule(pl.LightningModule):
         if self.trainer.world_size > 1:
             samples = f"process {self.global_rank}{f' with loss {loss}' if loss is not None else ''}, {samples}"
         return (
-            f"the {what} is not finite in {moment}, {samples}; a smaller learning rate or --clip 1 may help; "
+            f"the {what} is not finite in {moment}, {samples}; a smaller learning rate or --set clip=1 may help; "
             "the previous checkpoint remains"
         )
 

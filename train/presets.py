@@ -158,12 +158,12 @@ PRESETS: dict[str, Recipe] = {
 } | {"fastdepth-ufmstar": _DISTILLED, "demo": _DEMO}
 
 
-_SOURCES = """From the paper (Section VII): method, members, size, epochs, decay, dropout, Adam's momentum .9.
-From its table 1: heads at four scales of monodepth2 (--network.head_scales 1: one). From DecTrain, the authors'
-release: monodepth2's batch and learning rate, and its start from ImageNet (--init imagenet). Ours: Adam's .999, the
-schedule, fastdepth's batch and learning rate; dropout after the second convolution of a level (--network.dropout_both
-true: after both); every image trains all members of a BatchEnsemble (--split-batch true: one each, with --batch-size 10
-or more). fastdepth ends in a ReLU as published; --network.positive softplus is ours and better from scratch. The
+_SOURCES = """From the paper (Section VII): method, members, size, epochs, decay, dropout, Adam's momentum .9. From its
+table 1: heads at four scales of monodepth2 (--set network.head_scales=1: one). From DecTrain, the authors' release:
+monodepth2's batch and learning rate, and its start from ImageNet (--init imagenet). Ours: Adam's .999, the schedule,
+fastdepth's batch and learning rate; dropout after the second convolution of a level (--set network.dropout_both=true:
+after both); every image trains all members of a BatchEnsemble (--set split_batch=true: one each, with --batch-size 10
+or more). fastdepth ends in a ReLU as published; --set network.positive=softplus is ours and better from scratch. The
 presets demo and fastdepth-ufmstar, whose head learns UfM*'s variance, are ours."""
 
 

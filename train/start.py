@@ -120,8 +120,8 @@ def _from_onnx(spec: NetworkSpec, path: Path) -> Backbone:
     backbone = build_backbone(spec)
     source = FastDepth.from_onnx(path, dropout=spec.dropout, size=spec.size)
     if not isinstance(backbone, FastDepth) or source.widths != backbone.widths:
-        raise ValueError(f"init: {path} has the channels {source.widths}; --network.widths pruned or full may fit")
-    fill(backbone, source.state_dict(), f"{path} (--network.norm {'true' if spec.norm else 'false'})")
+        raise ValueError(f"init: {path} has the channels {source.widths}; --set network.widths=pruned or full may fit")
+    fill(backbone, source.state_dict(), f"{path} (--set network.norm={'true' if spec.norm else 'false'})")
     return backbone
 
 
@@ -136,7 +136,7 @@ def _from_resnet(spec: NetworkSpec, path: Path) -> Backbone:
         try:
             load_monodepth2(backbone, path / "encoder.pth", path / "depth.pth")
         except CheckpointError as error:
-            raise CheckpointError(f"init: {error}; another --network.layers may fit") from error
+            raise CheckpointError(f"init: {error}; another network.layers may fit") from error
         return backbone
     weights = None if str(path) == IMAGENET else path
     source = MonodepthResNet.imagenet(weights, spec.layers, strides=spec.strides)

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from ufmstar_torch.config import PosteriorConfig as PosteriorConfig
     from ufmstar_torch.config import SPGFConfig as SPGFConfig
     from ufmstar_torch.config import UfMStarConfig as UfMStarConfig
-    from ufmstar_torch.frames.output import UfMStarOutput as UfMStarOutput
+    from ufmstar_torch.frames.output import UncertaintyOutput as UncertaintyOutput
     from ufmstar_torch.frames.prediction import DepthPrediction as DepthPrediction
     from ufmstar_torch.gaussians.mixture import GaussianMixture as GaussianMixture
     from ufmstar_torch.live import LiveDepth as LiveDepth
@@ -37,6 +37,6 @@ __all__ = [
     "SPGFConfig",
     "UfMStar",
     "UfMStarConfig",
-    "UfMStarOutput",
     "UncertainDepth",
+    "UncertaintyOutput",
 ]

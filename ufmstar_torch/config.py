@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
 from ufmstar_torch.files.limits import require_bytes
 from ufmstar_torch.posterior.config import PosteriorConfig as PosteriorConfig
@@ -173,22 +173,24 @@ class ConfidenceConfig(Checked):
     """A network's confidence as a factor of the variance (``ufmstar_torch.anchors.confidence``).
 
     Attributes:
-        anchors: the last ones of a stream from which the factor is learnt
-        each: of them, at most so many of one frame
-        bins: of equal size, by confidence
         shrinkage: anchors in a bin with which its factor counts half, and 1 the other half
-        least: smallest factor of the variance
-        largest: largest factor, and largest squared error of an anchor over the variance
         half_life: age after which a frame's verdict on the confidence counts half
     """
 
-    anchors: int = number(1024, "N", "1", 64, 2**20)
-    each: int = number(64, "n", "1", 1, 2**20)
-    bins: int = number(16, "K", "1", 2, 64)
     shrinkage: float = number(16.0, "kappa", "anchors", 0.0, open_low=True)
-    least: float = number(0.1, "h_min", "1", 0.0, 1.0, open_low=True)
-    largest: float = number(25.0, "h_max", "1", 1.0, 1e6)
     half_life: float = number(20.0, "ln 2/ln(1/gamma)", "frames", 5.0)
+
+    # Constants, chosen on rendered tours (docs/measure_confidence.py).
+    # N [1]: the factor is learnt from so many last anchors of a stream
+    anchors: ClassVar[int] = 1024
+    # n [1]: at most so many of them are of one frame
+    each: ClassVar[int] = 64
+    # K [1]: bins of equal size, by confidence
+    bins: ClassVar[int] = 16
+    # h_min [1]: smallest factor of the variance
+    least: ClassVar[float] = 0.1
+    # h_max [1]: largest factor, and largest squared error of an anchor over the variance
+    largest: ClassVar[float] = 25.0
 
 
 @dataclass(frozen=True)
@@ -208,8 +210,8 @@ class MergeConfig(Checked):
 
 @dataclass(frozen=True)
 class UfMStarConfig(Checked):
-    """All settings of UfM*. The defaults are the paper's except for those listed in :meth:`paper`. Extensions that are
-    not in the paper have a section each, None = off.
+    """All settings of UfM*. The defaults are the paper's except for those listed in :meth:`paper`. What is not in
+    the paper has a section each, None = off.
 
     Attributes:
         segment: thresholds of the segmentation
@@ -227,9 +229,6 @@ class UfMStarConfig(Checked):
             was seen once, prior_mean where no Gaussian is near), or NaN (nan)
         unmeasured_relative: relative: standard deviation as a share of the depth
         regression: exact sum over the Gaussians in view, or the paper's neighbourhood
-        near_radius: neighbourhood: Gaussians whose extent comes this near to a pixel's point are summed
-        far_radius: neighbourhood: the same where none comes within near_radius
-        neighbourhood_sigmas: neighbourhood: extent of a Gaussian in standard deviations
         ema_alpha: weight of the new disagreement map in the running average
         variance_floor: smallest variance of a pixel
         add_aleatoric: add the network's aleatoric variance to the result
@@ -240,13 +239,12 @@ class UfMStarConfig(Checked):
         initial_capacity: slots for Gaussians at the start; the number grows as needed
         max_components: largest number of Gaussians, beyond which the farthest are dropped, then the oldest; null = no
             limit
-        rotation_tolerance: largest deviation of a pose's rotation from an orthogonal matrix
         on_bad_frame: refuse a frame with a fault, or skip and count it
         backend: implementation of the kernels
-        anchors: use anchors, sparse measured depths (an extension)
-        confidence: with anchors, learn what the network's confidence means (an extension)
-        posterior: with anchors, also a corrected depth and its variance (an extension)
-        merge: join Gaussians that overlap (an extension)
+        anchors: use anchors, sparse measured depths (not in the paper)
+        confidence: with anchors, learn what the network's confidence means (not in the paper)
+        posterior: with anchors, also a corrected depth and its variance (not in the paper)
+        merge: join Gaussians that overlap (not in the paper)
     """
 
     segment: SPGFConfig = section(SPGFConfig)
@@ -270,9 +268,6 @@ class UfMStarConfig(Checked):
     unmeasured: str = choice("relative", "paper", "nan")
     unmeasured_relative: float = number(0.2, "rho", "1", 0.0, open_low=True)
     regression: str = choice("exact", "neighbourhood")
-    near_radius: float = number(0.1, "r", "m", 0.0, open_low=True)
-    far_radius: float = number(0.5, "R", "m", 0.0, open_low=True)
-    neighbourhood_sigmas: float = number(2.0, "s", "1", 0.0, open_low=True)
     ema_alpha: float = number(0.5, "alpha", "1", 0.0, 1.0, open_low=True)
     variance_floor: float = number(0.0, "v_min", "m^2", 0.0)
     add_aleatoric: bool = True
@@ -285,15 +280,24 @@ class UfMStarConfig(Checked):
     max_components: int | None = number(None, "K_max", "components", 1)
 
     # Input checks and speed
-    rotation_tolerance: float = number(0.01, "|R^T R - I|_max", "1", 0.0, 0.1)
     on_bad_frame: str = choice("raise", "skip")
     backend: str = choice("auto", "torch", "numba", "triton")
 
-    # Extensions, not in the paper
+    # Not in the paper
     anchors: AnchorConfig | None = section(AnchorConfig, optional=True)
     confidence: ConfidenceConfig | None = section(ConfidenceConfig, optional=True)
     posterior: PosteriorConfig | None = section(PosteriorConfig, optional=True)
     merge: MergeConfig | None = section(MergeConfig, optional=True)
+
+    # Constants: the paper's neighbourhood, and a bound far above the rounding of poses in text files.
+    # r [m]: neighbourhood: Gaussians whose extent comes this near to a pixel's point are summed
+    near_radius: ClassVar[float] = 0.1
+    # R [m]: neighbourhood: the same where none comes within near_radius
+    far_radius: ClassVar[float] = 0.5
+    # s [1]: neighbourhood: extent of a Gaussian in standard deviations
+    neighbourhood_sigmas: ClassVar[float] = 2.0
+    # |R^T R - I|_max [1]: largest deviation of a pose's rotation from an orthogonal matrix
+    rotation_tolerance: ClassVar[float] = 0.01
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -306,10 +310,6 @@ class UfMStarConfig(Checked):
                 "(posterior=False; --plain), got another setting"
             )
         require_bytes("UfMStarConfig.initial_capacity", self.initial_capacity * (_SLOT + 4 * self.entries))
-        if self.far_radius < self.near_radius:
-            raise ValueError(
-                f"UfMStarConfig.far_radius must be at least near_radius = {self.near_radius}, got {self.far_radius}"
-            )
 
     @classmethod
     def paper(cls) -> UfMStarConfig:

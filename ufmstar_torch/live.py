@@ -32,11 +32,12 @@ from ufmstar_torch.frames.arguments import (
     require_number,
 )
 from ufmstar_torch.frames.clock import JUMP, StreamClock, Verdict
-from ufmstar_torch.frames.frame import FRAME_FAULTS, pose_fault
+from ufmstar_torch.frames.frame import FRAME_FAULTS, NOT_FINITE
+from ufmstar_torch.frames.output import UncertaintyOutput
 from ufmstar_torch.frames.warnings import LOGGER
-from ufmstar_torch.gaussians.camera import rotation_deviation
 from ufmstar_torch.gaussians.trajectory import SAME_TIME, Trajectory, interpolate_pose
-from ufmstar_torch.uncertain_depth import UncertainDepth, UncertainPrediction
+from ufmstar_torch.kernels.cpu.check import pose_fault
+from ufmstar_torch.uncertain_depth import UncertainDepth
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
@@ -58,7 +59,7 @@ class LiveResult:
     stamp: float  # of the image, as it was pushed [s]
     image: ImageLike  # as it was pushed (a copy)
     T_world_cam: np.ndarray  # [4, 4] float64, interpolated at the stamp [m]
-    out: UncertainPrediction  # depth, variance and the rest
+    out: UncertaintyOutput  # depth, variance and the rest
     received: float  # when the image was pushed
     started: float  # when its pose was available and the network began
     finished: float  # when the variance was computed
@@ -110,7 +111,7 @@ class LiveDepth:
         intrinsics: of the images [px], [3, 3] or fx, fy, cx, cy; None = pass them to every ``push_image``.
         max_wait: longest wait for a pose after an image [s].
         max_gap: longest interval between the poses around an image, beyond which it is skipped [s].
-        state: file of ``model.state_dict()``, from which the model continues if the file exists, and to which the state
+        state: file of ``model.stream_state()``, from which the model continues if it exists, and to which the state
             is written atomically, every ``save_every`` seconds [s] and at the end. Delete the file for a new place.
             None = no file.
         save_every: see ``state``.
@@ -239,7 +240,8 @@ class LiveDepth:
             self._counts["poses"] += 1
             if not self._replaced(stamp, pose):
                 self._insert(stamp, pose)
-            self._changed.notify_all()
+            if self._waiting:  # a worker without an image has no use for a pose
+                self._changed.notify_all()
 
     def _replaced(self, stamp: float, pose: np.ndarray) -> bool:
         """Replace the pose in the buffer that has the same stamp; False if there is none."""
@@ -395,7 +397,7 @@ class LiveDepth:
         started = perf_counter()
         out = self.model(frame.image, T, frame.intrinsics)
         finished = perf_counter()
-        if fault := int(out.ufm.statistics.fault[0]):
+        if fault := int(out.statistics.fault[0]):
             with self._changed:
                 self._skip(FRAME_FAULTS[fault], frame.stamp)
             return False
@@ -406,7 +408,7 @@ class LiveDepth:
 
     def _save(self) -> None:
         if self._state is not None:
-            values = self.model.state_dict()
+            values = self.model.stream_state()
             write_atomic(self._state, lambda file: torch.save(values, file))
             with self._changed:
                 self._counts["saved"] += 1
@@ -430,7 +432,7 @@ def load_state(model: UncertainDepth, file: Path) -> None:
     try:
         with file.open("rb") as opened:
             state = read_tensors(opened, "it")
-        model.load_state_dict(state)
+        model.load_stream_state(state)
     except (RuntimeError, TypeError, ValueError, OSError) as error:
         text = f"state {file} cannot be continued: {error}. Delete the file, or name another one, to begin anew"
         raise ValueError(text) from error
@@ -454,10 +456,10 @@ def _pose(T: CameraLike, tolerance: float) -> np.ndarray:
     pose = as_pose(T).detach().cpu().double()
     if pose.dim() != 2:
         raise ValueError(f"T must be one pose, [4, 4] or [3, 4], got {tuple(pose.shape)}")
-    if not bool(pose.isfinite().all()):
+    rigid = np.array(pose.numpy())
+    fault = pose_fault(rigid.tolist(), tolerance)
+    if fault == NOT_FINITE:
         return np.full((4, 4), np.nan)
-    fault = int(pose_fault(pose[None], rotation_deviation(pose[None, :3, :3]), tolerance)[0])
     if fault:
         raise ValueError(f"T: {FRAME_FAULTS[fault]}")
-    rigid: np.ndarray = pose.numpy().copy()
     return rigid

@@ -4,31 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors.anchors import Anchors, check_anchors
+from ufmstar_torch.anchors.doubts import AnchorDoubts
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.arguments import Array, CameraLike, as_device, as_tensor, require_flag
-from ufmstar_torch.frames.extension import Extension
-from ufmstar_torch.frames.extensions import extensions_of
-from ufmstar_torch.frames.frame import CheckKernel, FrameInput, check_frame, raise_faults
-from ufmstar_torch.frames.network_variance import NetworkVariance
-from ufmstar_torch.frames.output import MeanUncertainty, StepOutput, UfMStarOutput
+from ufmstar_torch.frames.frame import FrameInput, as_confidence, check_frame, raise_faults
+from ufmstar_torch.frames.output import MeanUncertainty, StepOutput, UncertaintyOutput
 from ufmstar_torch.frames.warnings import StreamWarnings
-from ufmstar_torch.gaussians.camera import invert_rigid
-from ufmstar_torch.gaussians.fixed_order import apply
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.gaussians.state import NAMES, UfMStarState
-from ufmstar_torch.kernels.select import LateStep, select_check, select_step
+from ufmstar_torch.kernels.select import FrameKernels, LateStep, select_frame, select_step
+from ufmstar_torch.posterior import memory
+from ufmstar_torch.posterior.recalibrate import CONFIDENCE, Recalibration
 from ufmstar_torch.runtime.one_caller import one_caller
 from ufmstar_torch.runtime.stateful import StatefulModule, full_precision, outliving
 from ufmstar_torch.runtime.warm_up import warm_up
-from ufmstar_torch.steps import unmeasured
-from ufmstar_torch.steps.regress import Regression, regress
-from ufmstar_torch.steps.sample import mean_uncertainty, sample_pixels, sample_size
+from ufmstar_torch.steps import variance
+from ufmstar_torch.steps.query import query
+from ufmstar_torch.steps.regress import Regression, at_pixels
+from ufmstar_torch.steps.sample import mean_uncertainty, sample_size
 from ufmstar_torch.steps.step import Step
 from ufmstar_torch.steps.step_parts import StepObserver
 
@@ -46,8 +45,8 @@ class UfMStar(StatefulModule):
     Args:
         config: None = ``UfMStarConfig()``, which differs from the paper's settings as listed in
             :meth:`UfMStarConfig.paper`.
-        extensions: extensions in addition to those of the config's sections, for example a
-            :class:`~ufmstar_torch.posterior.recalibrate.Recalibration` of V.
+        recalibration: a map of V, applied last: a :class:`~ufmstar_torch.posterior.recalibrate.Recalibration`, or a
+            function from V [...] to V' [...] [m^2]; None = no map.
         dtype: of the state, torch.float32 or torch.float64.
         device: of the state until ``.to()``; None = that of the first frame.
 
@@ -59,13 +58,13 @@ class UfMStar(StatefulModule):
     STATE = NAMES
     config: UfMStarConfig
     observer: StepObserver | None = None
-    _cached_step: tuple[tuple[str, str], Step, CheckKernel] | None = None
+    _cached_step: tuple[tuple[str, str], Step, FrameKernels] | None = None
 
     def __init__(
         self,
         config: UfMStarConfig | None = None,
         *,
-        extensions: Sequence[Extension] = (),
+        recalibration: variance.VarianceMap | None = None,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> None:
@@ -75,10 +74,11 @@ class UfMStar(StatefulModule):
         if not isinstance(dtype, torch.dtype) or dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         self.config = config if config is not None else UfMStarConfig()
-        self._extensions, self._warnings = extensions_of(self.config, extensions), StreamWarnings()
-        self._empty = self._extensions.initial(0, self.config, dtype, as_device("device", device))
+        self.recalibration = variance.require_map(recalibration, self.config)
+        self._warnings, self._doubts = StreamWarnings(), AnchorDoubts()
+        self._empty = memory.initial(0, self.config, dtype, as_device("device", device))
         self.STATE = tuple(self._empty.tensors())
-        self.ALWAYS_FLOAT64 = (*UfMStar.ALWAYS_FLOAT64, *self._extensions.always_float64)
+        self.ALWAYS_FLOAT64 = (*UfMStar.ALWAYS_FLOAT64, *memory.ALWAYS_FLOAT64)
         for name, value in self._empty.tensors().items():
             self.register_buffer(name, value)
 
@@ -94,8 +94,9 @@ class UfMStar(StatefulModule):
         features: Array | None = None,
         member: int | Tensor = 0,
         informative: Tensor | None = None,
-        **inputs: Any,
-    ) -> UfMStarOutput:
+        anchors: Anchors | None = None,
+        confidence: Array | None = None,
+    ) -> UncertaintyOutput:
         """Process one predicted depth map per stream and return its variance.
 
         Args:
@@ -113,32 +114,38 @@ class UfMStar(StatefulModule):
             features: [B, F, H, W] with F = ``config.features``, averaged per component and regressed; of at most 1e12.
             member: index of the network, or random sample, that predicted, an integer or [B]; see ``views``.
             informative: [B] bool, False where the image shows nothing, so that the depth is neither fused nor measured.
-            **inputs: inputs of extensions, by the name of the extension's section in the config; None = no input.
+            anchors: sparse depths of this frame, with ``config.anchors``; None = none.
+            confidence: like ``depth``, the network's confidence, with ``config.confidence`` or a recalibration of it.
 
         Raises:
             TypeError: wrong kind of argument or dtype.
             ValueError: wrong shape or device; another number of streams than before (call :meth:`reset` first); a pose
-                that is not rigid or invalid intrinsics (with ``on_bad_frame="skip"``: counted instead); input of an
-                extension that is off.
+                that is not rigid or invalid intrinsics (with ``on_bad_frame="skip"``: counted instead); anchors or a
+                confidence that the config does not use.
         """
         depth = as_tensor("depth", depth)
         a, e = (None if v is None else as_tensor(n, v) for n, v in (("aleatoric", aleatoric), ("epistemic", epistemic)))
-        frame = self._checked(depth, pose, intrinsics, a, e, valid, features, member=member, informative=informative)
-        out, maps = self._observe(frame, inputs)
-        originals: dict[str, Any] = {} if self.config.variances_in_h else {"aleatoric": a, "epistemic": e}
+        frame = self._checked(
+            depth, pose, intrinsics, a, e, valid, features, member=member, informative=informative, anchors=anchors,
+            confidence=confidence,
+        )  # fmt: skip
+        out, maps, quantiles = self._observe(frame)
+        maps |= {} if self.config.variances_in_h else {"aleatoric": a, "epistemic": e}
+        maps |= {"network_depth": depth, "measured": out.measured, "valid": frame.valid}
 
-        def shaped(value: Tensor) -> Tensor:  # no map: [B, n]
-            return value if value.shape == depth.shape or value.dim() == 2 else value.reshape(depth.shape)
+        def shaped(value: Tensor) -> Tensor:  # the argument may be [B, 1, H, W]
+            return value if value.shape == depth.shape else value.reshape(depth.shape)
 
-        maps = {name: None if value is None else shaped(value) for name, value in maps.items()}
-        return UfMStarOutput(
-            depth=depth,
-            **maps | originals,
-            features=out.features[..., : self.config.features],
-            measured=shaped(out.measured),
-            valid=shaped(frame.valid),
-            current_cam=out.current_cam,
-            statistics=out.statistics,
+        if self.config.posterior is None:
+            maps["depth"] = depth
+        named = {name: shaped(value) for name, value in maps.items() if value is not None}
+        best, variance, usable = (named.pop(name) for name in ("depth", "variance", "valid"))
+        if self.config.features:
+            named["features"] = out.features[..., : self.config.features]
+        if frame.confidence is not None:
+            named["confidence"] = shaped(frame.confidence)
+        return UncertaintyOutput(
+            best, variance, usable, named, out.statistics, quantiles=quantiles, current_cam=out.current_cam
         )
 
     if TYPE_CHECKING:
@@ -160,11 +167,12 @@ class UfMStar(StatefulModule):
         fraction: float | None = None,
         seed: int = 0,
         average: bool = False,
-        **inputs: Any,
+        anchors: Anchors | None = None,
+        confidence: Array | None = None,
     ) -> MeanUncertainty:
         """Averages of V, M, A, E and B per image for active learning (section "Compute- and memory efficiency"). Like
         :meth:`forward`, but regresses only a sample of pixels. For a first view (``measured`` near 0),
-        ``config.unmeasured`` determines the mean. Extensions that need whole maps do nothing.
+        ``config.unmeasured`` determines the mean. The posterior needs whole maps and does nothing.
 
         Args:
             pixels: size of the sample per image; None, without ``fraction``: 1000.
@@ -176,11 +184,14 @@ class UfMStar(StatefulModule):
             ValueError: both ``pixels`` and ``fraction``, or one out of range; and as :meth:`forward`.
         """
         depth = as_tensor("depth", depth)
-        optional, view = (aleatoric, epistemic, valid, features), {"member": member, "informative": informative}
-        frame = self._checked(depth, pose, intrinsics, *optional, **view)
-        index, used = sample_pixels(frame.valid, sample_size(frame.size, pixels, fraction), seed)
-        out, maps = self._observe(frame, inputs, index, average=require_flag("average", average))
-        return mean_uncertainty(out, maps | {"depth": torch.gather(frame.depth.flatten(1), 1, index)}, used)
+        frame = self._checked(
+            depth, pose, intrinsics, aleatoric, epistemic, valid, features, member=member, informative=informative,
+            anchors=anchors, confidence=confidence,
+        )  # fmt: skip
+        kernels = self._kernels(depth.device.type)[1].sample
+        index, used = kernels.pixels(frame.valid, *sample_size(frame.size, pixels, fraction, seed))
+        out, maps, _ = self._observe(frame, index, average=require_flag("average", average))
+        return mean_uncertainty(out, maps, frame.depth, index, used, kernels.statistics)
 
     def warm_up(
         self, size: tuple[int, int], *, streams: int = 1, progress: Callable[[int, int], object] | None = None
@@ -209,22 +220,8 @@ class UfMStar(StatefulModule):
         Raises:
             ValueError: wrong shape or frame, or there was no frame yet.
         """
-        if not isinstance(frame, str) or frame not in ("world", "first"):
-            raise ValueError(f"frame must be 'world' or 'first', got {frame!r}")
-        points, streams = as_tensor("points", points), self.mean.shape[0]
-        if streams == 0:
-            raise ValueError("query needs a mixture: call the module on a frame first")
-        if points.dim() != 3 or points.shape[0] != streams or points.shape[2] != 3:
-            raise ValueError(f"points must be [{streams}, N, 3], got {tuple(points.shape)}")
-        with torch.no_grad(), full_precision(points.device):
-            local = points.detach()
-            if frame == "world":
-                T = invert_rigid(self.T_world_first)
-                local = apply(T[:, None, :3, :3], local.double()) + T[:, None, :3, 3]
-            dtype = torch.float64 if points.dtype == torch.float64 else torch.float32
-            result = regress(unmeasured.before_regression(self.mixture), local.to(dtype), self.config)
-            result = unmeasured.after_regression(result, None, self.config)[0]
-            return replace(result, features=result.features[..., : self.config.features])
+        with torch.no_grad():
+            return query(self.state, as_tensor("points", points), frame, self.config)
 
     @property
     def mixture(self) -> GaussianMixture:
@@ -242,85 +239,97 @@ class UfMStar(StatefulModule):
 
         Args:
             streams: indices, or a bool mask [B]; None = all, after which the batch size may change.
-            keep_evidence: keep the extensions' statistics per stream, to start again in the same place with B streams.
+            keep_evidence: keep what anchors have taught of the B streams, to start again in the same place.
 
         Raises:
             IndexError: an index is out of range.
-            ValueError: a mask of the wrong length; ``keep_evidence`` without an extension that has statistics.
+            ValueError: a mask of the wrong length; ``keep_evidence`` without ``config.anchors``.
         """
         if require_flag("keep_evidence", keep_evidence) and not self._empty.by_stream:
-            raise ValueError("keep_evidence needs UfMStarConfig with an extension that learns, got one without")
+            raise ValueError("keep_evidence needs UfMStarConfig(anchors=AnchorConfig()), got one without anchors")
         with outliving(), torch.no_grad():  # buffers must outlive the caller's inference mode
             old, b = self.state, self.mean.shape[0]
             if streams is None:
                 self._warnings.reset()
-                new = self._extensions.initial(b if keep_evidence else 0, self.config, old.mean.dtype, old.mean.device)
+                new = memory.initial(b if keep_evidence else 0, self.config, old.mean.dtype, old.mean.device)
             else:
                 self._warnings.reset((chosen := self._chosen(streams, b)).nonzero().flatten().tolist())
                 new = old.restarted(chosen)
             self._store(new.tensors() | (dict(old.by_stream) if keep_evidence else {}))
 
-    def takes(self, name: str) -> bool:
-        """True if an extension has an input of this name."""
-        return any(one.argument == name for one in self._extensions.each)
+    @property
+    def uses_confidence(self) -> bool:
+        """True if V depends on the network's confidence."""
+        mapped = isinstance(self.recalibration, Recalibration) and self.recalibration.covariate == CONFIDENCE
+        return self.config.confidence is not None or mapped
 
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
         self._empty.with_tensors(state).require(self.config, self._empty)
         if state["weight"].device.type != "meta":
-            self._extensions.require_state(state)
+            memory.require(state, self.config)
 
-    def _checked(self, depth: Tensor, T: CameraLike, K: CameraLike, *maps: Array | None, **view: Any) -> FrameInput:
-        return check_frame(
+    def _checked(
+        self, depth: Tensor, T: CameraLike, K: CameraLike, *maps: Array | None, anchors: Anchors | None,
+        confidence: Array | None, **view: Any,
+    ) -> FrameInput:  # fmt: skip
+        used = {"anchors": self.config.anchors is not None, "confidence": self.uses_confidence}
+        for name, value in (("anchors", anchors), ("confidence", confidence)):
+            if value is not None and not used[name]:
+                raise ValueError(f"{name} must be None where UfMStarConfig.{name} is None, which switches it off")
+        frame = check_frame(
             depth, T, K, *maps, **view, feature_count=self.config.features, variances_in_h=self.config.variances_in_h,
             rotation_tolerance=self.config.rotation_tolerance, max_depth=self.config.segment.depth_limit,
-            kernel=self._kernels(depth.device.type)[1],
+            kernel=self._kernels(depth.device.type)[1].check,
         )  # fmt: skip
+        if confidence is not None:
+            frame = replace(frame, confidence=as_confidence(confidence, frame))
+        if anchors is None:
+            return frame
+        variances = [v for v in variance.network_variances(frame, self.config) if v is not None]
+        checked = check_anchors(anchors, frame, variances, self._kernels(depth.device.type)[1].check_anchors)
+        self._doubts.judge(anchors, checked, frame.size)
+        return replace(frame, anchors=checked)
 
     def _observe(
-        self, frame: FrameInput, inputs: Mapping[str, Any], pixels: Tensor | None = None, *, average: bool = True
-    ) -> tuple[StepOutput, dict[str, Any]]:
-        """Run the step and store the new state. Returns the output, and by name V, M, A and E [m^2] (None = not part of
-        V) and the maps of extensions, at every pixel [B, H, W], or at ``pixels`` [B, n] of the flattened image.
-        ``inputs``: inputs of extensions."""
-        of_network = NetworkVariance.of(frame, self.config)
+        self, frame: FrameInput, pixels: Tensor | None = None, *, average: bool = True
+    ) -> tuple[StepOutput, dict[str, Tensor | None], Tensor | None]:
+        """Run the step and the corrections by anchors, and store the new state.
 
-        def chosen(value: Tensor) -> Tensor:
-            return value if pixels is None else torch.gather(value.flatten(1), 1, pixels)
-
-        def total(disagreement: Tensor, features: Tensor) -> Tensor:
-            variance = of_network.at(chosen, features, self.config).total(disagreement, self.config.variance_floor)
-            return extensions.map_variance(self._extensions.map_variance(variance), chosen)
-
-        extensions = self._extensions.of_frame(frame, of_network.maps(), inputs, dense=pixels is None)
+        Returns:
+            The step's output; the maps by name (``MAPS``) at every pixel [B, H, W], or at ``pixels`` [B, n] of the
+            flattened image; and the quantiles of intervals [B, 3], or None.
+        """
         # Outside the caller's inference mode, since the state must outlive it.
         with outliving(), torch.no_grad(), full_precision(frame.depth.device):
-            state = self._state_for(frame)
+            state = memory.for_frame(self._stored(), frame, self.config)
             if self.config.on_bad_frame == "raise":
                 raise_faults(frame)
             if self.observer is not None:
                 self.observer.stage("check")
-            step, _ = self._kernels(frame.depth.device.type)
-            state, out = step(
-                state, frame, self.config, pixels=pixels, smooth=average, extensions=extensions, observer=self.observer
-            )
-            state, out = extensions.after_frame(state, out, partial(total, features=out.features))
-            disagreement = extensions.disagreement(out.disagreement, chosen(frame.depth))
-        maps = {"disagreement": out.disagreement, **vars(of_network.at(chosen, out.features, self.config))}
-        maps |= {**extensions.outputs(), "variance": total(disagreement, out.features)}
-        self._store(state.tensors())  # last, so that an earlier error changes nothing
-        self._warnings.after_frame(frame, out.statistics, state.frames, self.config)
-        return out, maps
+            step, kernels = self._kernels(frame.depth.device.type)
+            state, out = step(state, frame, self.config, pixels=pixels, smooth=average, observer=self.observer)
+            after = variance.corrected(state, frame, out, self.config, self.recalibration, pixels, kernels.merge)
+        # With gradients to A and E.
+        V = variance.total_variance(
+            after.disagreement, frame, out, self.config, self.recalibration, pixels, after.factor
+        )
+        network = variance.network_variances_at(frame, out.features, self.config, pixels)
+        maps = {"depth": at_pixels(frame.depth, pixels), "variance": V, "ufm_variance": V, **network._asdict()}
+        maps |= {"disagreement": out.disagreement, **after.maps}
+        self._store(after.state.tensors())  # last, so that an earlier error changes nothing
+        out = replace(out, statistics=replace(out.statistics, **after.counts))
+        self._warnings.after_frame(frame, out.statistics, after.state.frames, self.config)
+        return out, maps, after.quantiles
 
     def _stored(self) -> UfMStarState:
-        buffers = cast("dict[str, Tensor]", self._buffers)  # no buffer is None; avoids ``__getattr__``
-        return self._empty.with_tensors(buffers)
+        return self._empty.with_tensors(cast("dict[str, Tensor]", self._buffers))  # avoids ``__getattr__``
 
-    def _kernels(self, device_type: str) -> tuple[Step, CheckKernel]:
+    def _kernels(self, device_type: str) -> tuple[Step, FrameKernels]:
         """The step and the check for a device. The step is cached, since it may hold pending components."""
         key = (self.config.backend, device_type)
         if self._cached_step is None or self._cached_step[0] != key:
             self._settle()
-            self._cached_step = key, select_step(*key), select_check(*key)
+            self._cached_step = key, select_step(*key), select_frame(*key)
         return self._cached_step[1:]
 
     def _settle(self) -> None:
@@ -333,17 +342,6 @@ class UfMStar(StatefulModule):
         """A copy creates its own step."""
         self._settle()
         return self.__dict__ | {"_cached_step": None}
-
-    def _state_for(self, frame: FrameInput) -> UfMStarState:
-        state = self._stored()
-        streams, device, mean = len(frame.depth), frame.depth.device, state.mean
-        if len(mean) == 0:
-            return self._extensions.initial(streams, self.config, mean.dtype, device)
-        if len(mean) != streams:
-            raise ValueError(f"depth has {streams} streams but the state holds {len(mean)}: call reset() first")
-        if mean.device != device:
-            raise ValueError(f"depth lies on {device} but the state on {mean.device}: move one with .to()")
-        return state
 
     def extra_repr(self) -> str:
         return f"streams={self.mean.shape[0]}, capacity={self.mean.shape[1]}, backend={self.config.backend!r}"

@@ -41,74 +41,20 @@ from ufmstar_torch.frames.networks import (
     shared_preprocess,
     weights_mark,
 )
-from ufmstar_torch.frames.output import FrameStatistics, MeanUncertainty, UfMStarOutput
+from ufmstar_torch.frames.output import FrameStatistics, MeanUncertainty, UncertaintyOutput
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.posterior.recalibrate import Recalibration
 from ufmstar_torch.runtime.one_caller import OneCaller, one_caller
-from ufmstar_torch.runtime.stateful import outliving
 from ufmstar_torch.runtime.warm_up import along_wall, camera_of, require_size, warm_up
 from ufmstar_torch.ufmstar import UfMStar
 
 _BLACK = {torch.uint8: 1, torch.float32: 1 / 255, torch.float64: 1 / 255}  # largest value of a black image
-_MARK = "weights_mark"  # key of the checksum of the networks' weights in a state
+# Keys of a stream's state, or prefixes of keys: of UfM*, of the anchors' source, the number of processed images, and a
+# checksum of the networks' weights.
+_UFM, _LANDMARKS, _INDEX, _MARK = "ufm.", "landmarks.", "image_index", "weights_mark"
 _BRIGHT = 8.0  # largest value of a normalised image, by a wide margin
 _MISSED = "UfM* alone, without anchors and the depth that the posterior corrects with them: %s"
-
-
-@dataclass(frozen=True)
-class UncertainPrediction:
-    """The depth of an image and its variance: the posterior's, or, without a posterior, the network's depth with the
-    variance of UfM*. Before a stream's first anchor, the posterior's depth is the network's, with a large variance.
-
-    Attributes:
-        prediction: the network's output (for "full": the predictive mean, mean A and E over the members).
-        ufm: the output of UfM* for the network's depth: V, M, A, E and B, ``measured`` and the counts.
-        member: index of the network that was run; None if all were, or none.
-    """
-
-    prediction: DepthPrediction
-    ufm: UfMStarOutput
-    member: int | None
-
-    @property
-    def depth(self) -> Tensor:
-        """[B, H, W] [m]; the posterior's is NaN where not valid."""
-        corrected = self.ufm.posterior_depth
-        return self.prediction.depth if corrected is None else corrected
-
-    @property
-    def intrinsics(self) -> Tensor:
-        """[B, 3, 3] of the depth map [px]."""
-        return self.prediction.K
-
-    @property
-    def variance(self) -> Tensor:
-        """[B, H, W] of ``depth`` [m^2], NaN where not valid."""
-        corrected = self.ufm.posterior_variance
-        return self.ufm.variance if corrected is None else corrected
-
-    @property
-    def std(self) -> Tensor:
-        """[B, H, W] square root of ``variance`` [m]."""
-        return self.variance.sqrt()
-
-    @property
-    def disagreement(self) -> Tensor:
-        """[B, H, W] M [m^2]."""
-        return self.ufm.disagreement
-
-    def interval(self, level: float) -> tuple[Tensor, Tensor]:
-        """As :meth:`UfMStarOutput.interval`, [B, H, W] [m]."""
-        return self.ufm.interval(level)
-
-    def probability_nearer(self, than: float | Tensor) -> Tensor:
-        """As :meth:`UfMStarOutput.probability_nearer`, [B, H, W]."""
-        return self.ufm.probability_nearer(than)
-
-    def probability_between(self, near: float | Tensor, far: float | Tensor) -> Tensor:
-        """As :meth:`UfMStarOutput.probability_between`, [B, H, W]."""
-        return self.ufm.probability_between(near, far)
 
 
 @dataclass(frozen=True)
@@ -117,7 +63,7 @@ class _Predicted:
 
     Attributes:
         image, pose, intrinsics: the image and its camera, as tensors.
-        prediction, member: as in :class:`UncertainPrediction`.
+        prediction, member: as in :class:`UncertaintyOutput`.
         features: [B, F, H, W] for UfM*, or None.
         ready: recorded after the copies; None = no copy to wait for.
     """
@@ -138,8 +84,8 @@ class _Predicted:
     "_predicted",
     "_fused",
     "reset",
-    "load_state_dict",
-    "_save_to_state_dict",
+    "stream_state",
+    "load_stream_state",
     "_apply",
 )
 class UncertainDepth(NetworksInTurn):
@@ -191,10 +137,8 @@ class UncertainDepth(NetworksInTurn):
         model = UncertainDepth(network)
         for image, pose, intrinsics in video:  # [H, W, 3] uint8, [4, 4], [3, 3]
             out = model(image, pose, intrinsics)
-            out.depth, out.std  # corrected [m]; the network's are in out.prediction, M, A, E and B in out.ufm
+            out.depth, out.std  # corrected [m]; the network's depth is out.network_depth, M is out.disagreement
     """
-
-    image_index: Tensor
 
     def __init__(
         self,
@@ -236,8 +180,7 @@ class UncertainDepth(NetworksInTurn):
             config = config.replace(anchors=config.anchors or AnchorConfig())
         if posterior:
             config = config.replace(posterior=config.posterior or PosteriorConfig())
-        mapped = () if recalibration is None else (recalibration,)
-        self.ufm = UfMStar(config.within(self.max_depth, self.states_confidence), extensions=mapped)
+        self.ufm = UfMStar(config.within(self.max_depth, self.states_confidence), recalibration=recalibration)
         self.landmarks = None if anchors is None else StreamLandmarks(anchors)
         self._unsearchable = False  # whether an image could not be searched for anchors
         self._searched = False  # whether the source of anchors has processed the current image
@@ -249,9 +192,7 @@ class UncertainDepth(NetworksInTurn):
         self._image_check = ImageCheck()
         self.mode = mode
         self.multiview_device = None if multiview_device is None else as_device("multiview_device", multiview_device)
-        self.register_buffer("image_index", torch.zeros((), dtype=torch.int64))
-        self._next = 0
-        self.register_state_dict_post_hook(_without_weights)
+        self._next = 0  # number of processed images
 
     def accepted(
         self, networks: object, preprocess: Preprocess | Literal["own"] | None
@@ -275,7 +216,7 @@ class UncertainDepth(NetworksInTurn):
         *,
         features: Array | None = None,
         anchors: Anchors | None = None,
-    ) -> UncertainPrediction:
+    ) -> UncertaintyOutput:
         """Predict depth and its variance for the next image of every stream.
 
         Args:
@@ -296,7 +237,7 @@ class UncertainDepth(NetworksInTurn):
     if TYPE_CHECKING:
         __call__ = forward
 
-    def stream(self, frames: Iterable[tuple[ImageLike, CameraLike, CameraLike]]) -> Iterator[UncertainPrediction]:
+    def stream(self, frames: Iterable[tuple[ImageLike, CameraLike, CameraLike]]) -> Iterator[UncertaintyOutput]:
         """The predictions of a video, in order, with the networks one image ahead of UfM*.
 
         With networks on a GPU and ``multiview_device="cpu"``, both run at the same time. Each result is yielded after
@@ -330,7 +271,7 @@ class UncertainDepth(NetworksInTurn):
         *,
         features: Array | None = None,
         anchors: Anchors | None = None,
-    ) -> UncertainPrediction:
+    ) -> UncertaintyOutput:
         """Process an existing prediction, for example a cached one, as :meth:`forward` does after its networks.
 
         Args:
@@ -345,12 +286,12 @@ class UncertainDepth(NetworksInTurn):
         """
         require_kind("prediction", prediction, DepthPrediction, "a DepthPrediction")
         maps = maps_of(prediction, self.ufm)
-        ufm = self.ufm(pose=pose, intrinsics=intrinsics, valid=valid, features=features, anchors=anchors, **maps)
-        self._count(self._next + 1)
+        out = self.ufm(pose=pose, intrinsics=intrinsics, valid=valid, features=features, anchors=anchors, **maps)
+        self._next += 1
         if prediction.intrinsics is None:
             K = as_intrinsics(intrinsics)
             prediction = replace(prediction, intrinsics=K.expand(len(prediction.depth), 3, 3))
-        return UncertainPrediction(prediction, ufm, None)
+        return replace(out, prediction=prediction)
 
     def mean_uncertainty(
         self,
@@ -385,7 +326,7 @@ class UncertainDepth(NetworksInTurn):
                 **maps_of(p, self.ufm), **sample,
             )  # fmt: skip
         self._undo(mean.statistics)
-        self._count(self._next + 1)
+        self._next += 1
         return mean
 
     def warm_up(
@@ -429,10 +370,10 @@ class UncertainDepth(NetworksInTurn):
 
     def _fused(
         self, predicted: _Predicted, valid: Array | None = None, anchors: Anchors | None = None
-    ) -> UncertainPrediction:
+    ) -> UncertaintyOutput:
         with self._anchored(predicted, anchors) as (found, p):
             out = self.update(p, predicted.pose, p.K, valid, features=predicted.features, anchors=found)
-        self._undo(out.ufm.statistics)
+        self._undo(out.statistics)
         return replace(out, member=predicted.member)
 
     @contextmanager
@@ -548,78 +489,60 @@ class UncertainDepth(NetworksInTurn):
         if self.landmarks is not None:
             self.landmarks.reset(chosen)
         if chosen is None:
-            self._count(0)
+            self._next = 0
         self._image_check.reset(chosen)
         if chosen is None or 0 in chosen:
             self._pose_check.reset()
 
-    def _count(self, images: int) -> None:
-        """Set the number of processed images, as a number for the alternation and as a buffer for ``state_dict``."""
-        self._next = images
-        with outliving():  # the buffer must outlive the caller's inference mode
-            self.image_index = torch.full_like(self.image_index, images)
+    @property
+    def image_index(self) -> int:
+        """The number of processed images, i of the next one."""
+        return self._next
 
-    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
-        super()._save_to_state_dict(destination, prefix, keep_vars)
+    def stream_state(self) -> dict[str, Tensor]:
+        """Everything of a video on which the next results depend, but the networks' weights: the state of UfM*, the
+        anchors' memory, and the number of processed images. The last image is no part of it: the next one cannot be
+        recognised as the same. For :meth:`load_stream_state`; ``torch.save`` stores it."""
+        state = {f"{_UFM}{name}": value.clone() for name, value in self.ufm.state_dict().items()}
         if self.landmarks is not None:
-            destination.update({f"{prefix}landmarks.{n}": value for n, value in self.landmarks.state().items()})
+            state |= {f"{_LANDMARKS}{name}": value for name, value in self.landmarks.state().items()}
+        return state | {_INDEX: torch.tensor(self._next), _MARK: torch.tensor(weights_mark(self.networks))}
 
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
-        landmark_prefix = f"{prefix}landmarks."
-        mark = self._with_own_weights(state_dict, prefix)
-        try:
-            if mark is not None:
-                _require_count(mark, _MARK)
-            if f"{prefix}image_index" in state_dict:
-                _require_count(state_dict[f"{prefix}image_index"], "image_index")
-            self.ufm.accepted(state_dict, f"{prefix}ufm.")
-            if self.landmarks is not None:
-                self.landmarks.load_state(
-                    {
-                        key[len(landmark_prefix) :]: state_dict.pop(key)
-                        for key in list(state_dict)
-                        if key.startswith(landmark_prefix)
-                    }
-                )
-        except ValueError as error:
-            args[-1].append(str(error))
-            return
-        if mark is not None and int(mark) != weights_mark(self.networks):
-            LOGGER.warning("the state was saved with other networks: it holds their disagreement; reset() begins anew")
-        super()._load_from_state_dict(state_dict, prefix, *args)
-        self._next = int(self.image_index)
-
-    def _with_own_weights(self, state_dict: dict[str, Tensor], prefix: str) -> Tensor | None:
-        """Replace the checksum in a state, or weights, by the module's own weights; the checksum, or None."""
-        for key in [key for key in state_dict if key.startswith(f"{prefix}networks.")]:
-            del state_dict[key]
-        state_dict.update({f"{prefix}networks.{name}": value for name, value in self.networks.state_dict().items()})
-        return state_dict.pop(f"{prefix}{_MARK}", None)
-
-    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """Restore the state of a video, of :meth:`state_dict`. The networks' weights are no part of it; if they differ
-        from those at saving, a warning is logged. Nor is the last image: the next one cannot be recognised as the same.
-        Atomic: if it raises, state and landmarks are unchanged.
+    def load_stream_state(self, state: Mapping[str, Tensor]) -> None:
+        """Continue from a :meth:`stream_state`, bit for bit. If the networks' weights differ from those at saving, a
+        warning is logged. All or nothing: if it raises, the module is unchanged.
 
         Raises:
-            RuntimeError: the state is incomplete, of other sources of anchors, or invalid.
+            ValueError: the state is incomplete, of other sources of anchors, or invalid.
         """
-        before = {name: value.clone() for name, value in self.state_dict().items()}
+        before = self.stream_state()
         try:
-            result = super().load_state_dict(state_dict, strict, assign)
-            self._image_check.reset()
-            return result
+            self._load(require_kind("state", state, Mapping, "a mapping of names to tensors"))
         except BaseException:
-            super().load_state_dict(before)
+            self._load(before)
             raise
 
-
-def _without_weights(module: nn.Module, state_dict: dict[str, Any], prefix: str, _: object) -> None:
-    """Replace the networks' weights in a state, which is saved often, by their checksum."""
-    assert isinstance(module, UncertainDepth)
-    for key in [key for key in state_dict if key.startswith(f"{prefix}networks.")]:
-        del state_dict[key]
-    state_dict[f"{prefix}{_MARK}"] = torch.tensor(weights_mark(module.networks))
+    def _load(self, state: Mapping[str, Tensor]) -> None:
+        parts: dict[str, dict[str, Tensor]] = {_UFM: {}, _LANDMARKS: {}, "": {}}
+        for key, value in state.items():
+            prefix = next(prefix for prefix in parts if str(key).startswith(prefix))
+            parts[prefix][str(key).removeprefix(prefix)] = value
+        counts, ufm, landmarks = parts[""], parts[_UFM], parts[_LANDMARKS]
+        for expected, present in ((self.ufm.state_dict().keys(), ufm.keys()), ({_INDEX, _MARK}, counts.keys())):
+            if wrong := sorted(expected ^ present):
+                raise ValueError(f"the state must hold {', '.join(sorted(expected))}; missing or unknown: {wrong}")
+        for name, value in counts.items():
+            _require_count(value, name)
+        self.ufm.accepted(ufm)
+        if self.landmarks is not None:
+            self.landmarks.load_state(landmarks)
+        elif landmarks:
+            raise ValueError(f"state holds landmarks, for which the module has no source: {', '.join(landmarks)}")
+        self.ufm.load_state_dict(ufm)
+        if int(counts[_MARK]) != weights_mark(self.networks):
+            LOGGER.warning("the state was saved with other networks: it holds their disagreement; reset() begins anew")
+        self._next = int(counts[_INDEX])
+        self._image_check.reset()
 
 
 def maps_of(prediction: DepthPrediction, ufm: UfMStar) -> dict[str, Any]:
@@ -632,7 +555,7 @@ def maps_of(prediction: DepthPrediction, ufm: UfMStar) -> dict[str, Any]:
         "member": prediction.member,
         "informative": prediction.informative,
     }
-    return maps | ({"confidence": prediction.confidence} if ufm.takes("confidence") else {})
+    return maps | ({"confidence": prediction.confidence} if ufm.uses_confidence else {})
 
 
 def _missed(networks: object) -> str:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,6 +12,7 @@ from torch import Tensor, nn
 from ufmstar_torch.eval.bench.measure import Plan, measure
 from ufmstar_torch.eval.bench.networks import ONCE, TimedNetwork
 from ufmstar_torch.eval.bench.parts import MULTIVIEW
+from ufmstar_torch.eval.bench.settings import ARCHITECTURES, TOUR, BenchSettings
 from ufmstar_torch.eval.bench.streams import time_streams
 from ufmstar_torch.eval.bench.timing import most_threads
 from ufmstar_torch.eval.engine.load import NetworkChoice
@@ -28,59 +27,8 @@ from ufmstar_torch.models import FastDepth, FastDepthWidths, MonodepthResNet, Pr
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.models.network import DepthNetwork
 
-TOUR = "tour:1"
-ARCHITECTURES = ("fastdepth", "monodepth2")  # can be timed with random weights
 _ERROR, _GRID = 0.03, 4  # [1] standard deviation of a network's smooth relative error, and its nodes per side
 Progress = Callable[[str], object]
-
-
-@dataclass(frozen=True, kw_only=True)
-class BenchSettings:
-    """Measure the time of UfM* (plain, anchored, with the posterior) and of a depth network on the same frames.
-
-    With --weights, the network predicts the depth. Without, it has random weights, and UfM* gets the rendered depth
-    with smooth errors of 3 %. Times depend on the machine and on its other load: compare ratios.
-    docs/results/speed.md explains each figure.
-
-    Attributes:
-        sequence: folder of a recording, or tour:SEED
-        model: kind of network, as in `ufmstar run`; without --weights fastdepth or monodepth2
-        weights: file or directory of the network's weights
-        spec: JSON file that declares what the weights do not contain, as in `ufmstar run`
-        trust_code: exported, torchscript: let the file run its code; only for files whose origin you trust
-        runtime: auto: ONNX Runtime for weights in ONNX files, torch for the rest; or one of the two
-        sizes: sides of the square images without --weights [px], multiples of 32
-        backends: implementations of the step that are timed
-        frames: number of timed frames
-        history: number of frames before them
-        threads: number of CPU threads; default: the cores of this process
-        device: cpu, cuda or cuda:N, for network and UfM*
-        streams: numbers of simultaneous streams on which UfM* alone is also timed
-        json: file for the report
-    """
-
-    sequence: str = TOUR
-    model: str = "fastdepth"
-    weights: Path | None = None
-    spec: Path | None = None
-    trust_code: bool = field(default=False, metadata={"typed": True})
-    runtime: str = field(default="auto", metadata={"choices": ("auto", "torch", "onnx")})
-    sizes: tuple[int, ...] = (224, 512)
-    backends: tuple[str, ...] = field(default=("auto",), metadata={"choices": ("auto", "numba", "triton", "torch")})
-    frames: int = field(default=40, metadata={"least": 1})
-    history: int = field(default=60, metadata={"least": 1})
-    threads: int | None = None
-    device: str = "cpu"
-    streams: tuple[int, ...] = ()
-    json: Path | None = None
-
-    def __post_init__(self) -> None:
-        if self.weights is None and self.model not in ARCHITECTURES:
-            raise ValueError(f"--model {self.model} needs --weights; without, it is one of {', '.join(ARCHITECTURES)}")
-        if any(count < 1 for count in self.streams):
-            raise ValueError(f"--streams must be positive, got {list(self.streams)}")
-        if not self.sizes or any(size < 64 or size % 32 for size in self.sizes):
-            raise ValueError(f"--sizes must be multiples of 32 from 64 on [px], got {list(self.sizes)}")
 
 
 def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None) -> dict[str, Any]:
@@ -92,7 +40,9 @@ def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None
     """
     device = torch.device(require_device(options.device))
     threads = options.threads or most_threads()
-    plan = Plan(frames=options.frames, warm_up=options.history, threads=threads, windows=1)
+    plan = Plan(
+        frames=options.frames, warm_up=options.history, threads=threads, windows=1, clock=options.clock, samples=True
+    )
     networks = (
         [_loaded(options, threads, device)] if options.weights else (_random(options, s, device) for s in options.sizes)
     )
@@ -189,6 +139,11 @@ def _lines(result: Mapping[str, Any]) -> list[str]:
         if row["stages"] is not None:
             stages = row["stages"]["stages"].items()
             lines.append(f"stages of {row['row']}: " + ", ".join(f"{n} {t['median_ms']:.2f}" for n, t in stages))
+        if (sample := row["sample"]) is not None:
+            times, ratio = sample["latency"], sample["ratio_to_step"]["median"]
+            further = row["stages"]["beside_the_paper"]["median"]
+            lines.append(f"mean over 1,000 pixels {times['median_ms']:.2f} ms, x step {ratio:.3f}; ")
+            lines[-1] += f"check and average, which the paper does not have, x step {further:.3f}"
     for line in result["streams"]:
         forms = (f"{name} {line[name]['median_ms']:.2f} ms" for name in ("step", "graph") if name in line)
         lines.append(f"{line['streams']} streams at once: {', '.join(forms)}")

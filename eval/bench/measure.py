@@ -18,8 +18,8 @@ import torch
 
 from ufmstar_torch.eval.bench.energy import CPU, GPU, Energy, EnergyMeter, difference, measure_energy, summary
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, timed_networks
-from ufmstar_torch.eval.bench.parts import ANCHORS, MULTIVIEW, Part, TimedParts, inference_of, time_parts
-from ufmstar_torch.eval.bench.timing import most_threads, paired_ratio, pinned_threads, spread
+from ufmstar_torch.eval.bench.parts import ANCHORS, MULTIVIEW, SAMPLE, Part, TimedParts, inference_of, time_parts
+from ufmstar_torch.eval.bench.timing import CLOCKS, most_threads, paired_ratio, pinned_threads, spread
 from ufmstar_torch.eval.engine.evaluate import require_usable
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.methods.method import ALONE
@@ -45,6 +45,8 @@ class Plan:
     threads: int | None = None  # of torch and numba on the CPU; None = all cores that this process may use
     seconds: float = 3.0  # shortest energy window [s]
     windows: int = 3  # energy windows per part
+    clock: str = "wall"  # of ``timing.CLOCKS``
+    samples: bool = False  # time means over a sample of pixels, too
 
 
 def measure(
@@ -85,9 +87,13 @@ def measure(
     on_gpu = next((d for d in (device, multiview_device) if d.type == "cuda"), None)
     meter = meter or EnergyMeter(None if on_gpu is None else on_gpu.index or 0)
     with pinned_threads(plan.threads or 1):
-        units = {DEPTH: _unit(device), NETWORK: _unit(device), MULTIVIEW: _unit(multiview_device)}
-        how: dict[str, Any] = {"device": device, "multiview_device": multiview_device}
-        how["metered"] = {part for part in (DEPTH, ONCE, EVERY, MULTIVIEW) if _metered(units, part, meter)}
+        units = dict.fromkeys((DEPTH, NETWORK), _unit(device)) | dict.fromkeys(
+            (MULTIVIEW, SAMPLE), _unit(multiview_device)
+        )
+        how: dict[str, Any] = {"device": device, "multiview_device": multiview_device, "samples": plan.samples}
+        parts_measured = (DEPTH, ONCE, EVERY, MULTIVIEW, SAMPLE)
+        how["metered"] = {part for part in parts_measured if _metered(units, part, meter)}
+        how["clock"] = CLOCKS[plan.clock]
         parts = _timed(chosen, networks, sequence, range(len(sequence))[selected], plan, how)
         work = {part: (units.get(part[1], units[NETWORK]), calls) for part, calls in parts.calls.items()}
         energy = measure_energy(meter, work, seconds=plan.seconds, windows=plan.windows)
@@ -271,10 +277,16 @@ def _row_line(row: Row, network: TimedNetwork, parts: TimedParts, energy: Energi
         "latency": {part: spread(ms) for part, ms in ({DEPTH: depth} | times).items()} | words,
         "ratios_to_depth": {part: paired_ratio(ms, depth) for part, ms in times.items()},
         "stages": parts.staged[name].summary(warm_up=parts.warm_up) if name in parts.staged else None,
+        "sample": _sample(parts.ms(name, SAMPLE), parts.ms(name, MULTIVIEW)),
         "energy": {part: summary(value) for part, value in energies.items()} | words,
         "energy_overhead_percent": None if "not_separable" in (unknown or {}) else _energy_overhead(energies),
         "memory": _memory(network.memory(), parts.memory.get(name)),
     }
+
+
+def _sample(sample: Sequence[float], step: Sequence[float]) -> dict[str, Any] | None:
+    """The time of a mean over a sample of pixels, and its ratio to a step's; None if it was not measured."""
+    return {"latency": spread(sample), "ratio_to_step": paired_ratio(sample, step)} if sample else None
 
 
 def overhead_percent(uncertainty: float, depth: float) -> float:

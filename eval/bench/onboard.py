@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.bench.cumulative import CounterLog, EnergyReadings, cumulative_costs, read_power
 from ufmstar_torch.eval.bench.energy import CPU, EnergyMeter
+from ufmstar_torch.eval.bench.quantise import quantise
 from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.engine.realtime import RealTime
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
@@ -33,7 +34,6 @@ from ufmstar_torch.eval.tour import tour_sequence
 from ufmstar_torch.live import LiveDepth
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.models.quantise import quantise
 from ufmstar_torch.models.trained import load_trained
 from ufmstar_torch.uncertain_depth import UncertainDepth
 
@@ -77,7 +77,7 @@ def run_onboard(
 
     Args:
         out: folder for the quantised graph and the picture.
-        weights: file of ``ufmstar train``, whose first network is quantised; or a FastDepth (.onnx, .tflite).
+        weights: file of ``ufmstar train``, whose first network is quantised; or a FastDepth (.onnx).
         seconds: duration of the live run [s].
         seed: of the rooms.
         progress: receives the progress.
@@ -110,7 +110,7 @@ def run_onboard(
 def _network(weights: Path, out: Path, seed: int) -> tuple[DepthNetwork, dict[str, Any]]:
     """The network, and its description with the depth shift of quantisation."""
     threads = torch.get_num_threads()
-    if weights.suffix in (".onnx", ".tflite"):
+    if weights.suffix == ".onnx":
         return load_network("fastdepth", weights, threads=threads), {"file": weights.name, "threads": threads}
     network = load_trained(weights)[0]
     size = network.preprocess.size or _HALF_VGA
@@ -175,7 +175,7 @@ def _contrasts(model: UncertainDepth, sequence: FrameSequence) -> list[Contrast]
     found = []
     for n, frame in enumerate(sequence):
         out = model(image_tensor(frame), frame.T_world_cam, frame.intrinsics)
-        aleatoric = out.prediction.aleatoric_variance
+        aleatoric = out.aleatoric
         if aleatoric is None:
             return []
         if n % 5 or n < 30:
@@ -183,7 +183,7 @@ def _contrasts(model: UncertainDepth, sequence: FrameSequence) -> list[Contrast]
         depth = out.depth[0].numpy()
         truth = truth_at(frame, out.intrinsics[0].numpy(), depth.shape)
         assert truth is not None
-        usable = (truth > 0) & (out.ufm.measured[0].numpy() > 0.5) & np.isfinite(out.variance[0].numpy())
+        usable = (truth > 0) & (out.measured[0].numpy() > 0.5) & np.isfinite(out.variance[0].numpy())
         image = image_tensor(frame)[0].permute(1, 2, 0).numpy()
         roots = (aleatoric[0].sqrt().numpy(), np.nan_to_num(out.disagreement[0].sqrt().numpy()))
         found.append(Contrast(image, *roots, np.abs(depth - truth), usable))

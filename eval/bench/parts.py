@@ -19,17 +19,18 @@ from ufmstar_torch.anchors.sources import landmark_source
 from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork
-from ufmstar_torch.eval.bench.timing import StagedStep
+from ufmstar_torch.eval.bench.timing import Clock, StagedStep
 from ufmstar_torch.eval.engine.clock import synchronize
-from ufmstar_torch.eval.engine.estimators import Answer, Gaussians, Pointwise, make_estimator
+from ufmstar_torch.eval.engine.estimators import Gaussians, Pointwise, make_estimator
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.frames.image_check import reduced, shows_something
 from ufmstar_torch.frames.prediction import DepthPrediction
+from ufmstar_torch.uncertain_depth import maps_of
 
-MULTIVIEW = "multiview"
+MULTIVIEW, SAMPLE = "multiview", "sample"
 # ``Setting.anchors`` that are measured: the name of their source of landmarks.
 ANCHORS = {"": None, "corners": "corners", "dense": "dense"}
 _INFERENCES = 40  # number of inferences that the meter repeats
@@ -44,22 +45,33 @@ class MultiviewStep:
         anchors = ANCHORS[row.setting.anchors]
         self._landmarks = None if anchors is None else StreamLandmarks(landmark_source(anchors))
 
-    def __call__(
-        self, image: Tensor | None, frame: Frame, prediction: DepthPrediction, *, first: bool = False
-    ) -> Answer:
+    def __call__(self, image: Tensor | None, frame: Frame, prediction: DepthPrediction, *, first: bool = False) -> None:
         """Move a frame's maps to the device, track landmarks in its ``image`` [1, 3, H, W], and run the step.
         ``first`` resets the state before."""
         if first:
-            assert isinstance(self.estimator, Pointwise | Gaussians)
-            self.estimator.ufm.reset()
-            if self._landmarks is not None:
-                self._landmarks.reset()
+            self.reset()
         anchors, T = None, torch.from_numpy(frame.T_world_cam)
         if self._landmarks is not None:
             K = torch.from_numpy(frame.intrinsics)
             anchors = self._landmarks.update(image, T, K, UfMStarConfig.rotation_tolerance)
             anchors = anchors.moved(K, prediction.K).to(self._device)
-        return self.estimator.update(prediction.to(self._device), T, anchors)
+        self.estimator.update(prediction.to(self._device), T, anchors)
+
+    def sample(self, frame: Frame, prediction: DepthPrediction, *, first: bool = False) -> None:
+        """Average the uncertainty of a frame's map over 1,000 pixels; ``first`` resets the state before."""
+        if first:
+            self.reset()
+        assert isinstance(self.estimator, Gaussians)
+        prediction, T = prediction.to(self._device), torch.from_numpy(frame.T_world_cam)
+        maps = maps_of(self.estimator.used(prediction), self.estimator.ufm)
+        self.estimator.ufm.mean_uncertainty(pose=T, intrinsics=prediction.K, **maps)
+
+    def reset(self) -> None:
+        """Reset the state."""
+        assert isinstance(self.estimator, Pointwise | Gaussians)
+        self.estimator.ufm.reset()
+        if self._landmarks is not None:
+            self._landmarks.reset()
 
     def memory(self) -> dict[str, float]:
         """Bytes of the state, that of anchors included; number of points or components; bytes of the smoothing map."""
@@ -87,8 +99,8 @@ class TimedParts:
         size: of the depth maps, "224 x 224" [px].
     """
 
-    def __init__(self, warm_up: int) -> None:
-        self.warm_up, self.size = warm_up, ""
+    def __init__(self, warm_up: int, clock: Clock) -> None:
+        self.warm_up, self.size, self._clock = warm_up, "", clock
         self.calls: dict[Part, list[Callable[[], Any]]] = {}
         self.staged: dict[str, StagedStep] = {}
         self.memory: dict[str, dict[str, float]] = {}
@@ -112,9 +124,9 @@ class TimedParts:
             call = partial(_finish, calls[part], device)
             self.calls.setdefault(part, []).extend([call] if keep else [])
             synchronize(device)
-            started = time.perf_counter()
+            started = self._clock()
             results[part] = call()
-            self._ms.setdefault(part, []).append(1e3 * (time.perf_counter() - started))
+            self._ms.setdefault(part, []).append(1e3 * (self._clock() - started))
         return results
 
 
@@ -139,7 +151,9 @@ def time_parts(
     device: torch.device,
     multiview_device: torch.device,
     restart: bool = False,
-    metered: Collection[str] = (DEPTH, ONCE, EVERY, MULTIVIEW),
+    metered: Collection[str] = (DEPTH, ONCE, EVERY, MULTIVIEW, SAMPLE),
+    samples: bool = False,
+    clock: Clock = time.perf_counter,
 ) -> TimedParts:
     """Run every part of every row on every frame.
 
@@ -150,18 +164,22 @@ def time_parts(
         restart: True if the sequence begins again after them; the rows then forget them.
         metered: parts whose calls are kept for the meter: of multiview steps those on every frame, of networks, whose
             cost does not depend on the image, those on the first ``_INFERENCES`` frames.
+        samples: True to run the part ``SAMPLE`` of UfM* without anchors, too.
+        clock: returns seconds.
 
     Raises:
         FrameError: a frame has no image.
     """
-    parts, steps = TimedParts(warm_up), dict[str, MultiviewStep]()
+    parts, steps, sampled = TimedParts(warm_up, clock), dict[str, MultiviewStep](), dict[str, MultiviewStep]()
     forms = {row.method.base: {DEPTH} for row in rows}
     for row in rows:
         forms[row.method.base].add(inference_of(row))
         if row.method.fusion != ALONE:
             steps[row.label], twin = (MultiviewStep(row, multiview_device) for _ in range(2))
             if isinstance(twin.estimator, Gaussians) and not row.setting.anchors:
-                parts.staged[row.label] = StagedStep(twin.estimator.ufm, twin, multiview_device)
+                parts.staged[row.label] = StagedStep(twin.estimator.ufm, twin, multiview_device, clock)
+                if samples:
+                    sampled[row.label] = MultiviewStep(row, multiview_device)
     sizes: dict[str, list[float]] = {label: [] for label in steps}
     for number, frame in enumerate(frames):
         turn = number - warm_up if restart and number >= warm_up else number
@@ -184,6 +202,10 @@ def time_parts(
             inputs[row.label] = image if row.setting.anchors else None, bare, prediction
         multiview: dict[Part, Callable[[], Any]] = {
             (label, MULTIVIEW): partial(step, *inputs[label], first=turn == 0) for label, step in steps.items()
+        }
+        multiview |= {
+            (label, SAMPLE): partial(step.sample, *inputs[label][1:], first=turn == 0)
+            for label, step in sampled.items()
         }
         parts.run(number, multiview, multiview_device, keep=repeated and MULTIVIEW in metered)
         for label, staged in parts.staged.items():

@@ -15,11 +15,15 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.engine.clock import synchronize
 from ufmstar_torch.eval.run.machine import available_cores
 
+# Seconds since an arbitrary moment: wall-clock time, or the processor's time for this process.
+Clock = Callable[[], float]
+CLOCKS: dict[str, Clock] = {"wall": time.perf_counter, "cpu": time.process_time}
 # The stages of a step, without gaps between them; see ``ufmstar_torch.steps.step_parts.StepObserver``.
 STAGES = ("check", "segment", "correspond", "fuse", "append", "regress", "average")
 _CPU = torch.device("cpu")
@@ -71,26 +75,33 @@ class StagedStep:
     """Times the stages of UfM*'s steps, as the observer (``ufmstar_torch.steps.step_parts.StepObserver``) of a module
     on a device. ``step`` runs the module once. The assembly of the output, after the last stage, is not timed."""
 
-    def __init__(self, module: UfMStar, step: Callable[..., Any], device: torch.device = _CPU) -> None:
-        self.module, self._step, self._device = module, step, device
+    def __init__(
+        self, module: UfMStar, step: Callable[..., Any], device: torch.device = _CPU, clock: Clock = time.perf_counter
+    ) -> None:
+        self.module, self._step, self._device, self._clock = module, step, device, clock
         self.stages: dict[str, list[float]] = {name: [] for name in STAGES}
         module.observer = self
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Run one step."""
-        self._before = time.perf_counter()
+        self._before = self._clock()
         return self._step(*args, **kwargs)
 
     def stage(self, name: str) -> None:
         """Record the time of the stage that has ended."""
         synchronize(self._device)
-        end = time.perf_counter()
+        end = self._clock()
         self.stages[name].append(1000 * (end - self._before))
         self._before = end
+
+    def _shares(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Times of the stages that are not the paper's (check and average), and of all stages, by step [ms]."""
+        return np.add(self.stages["check"], self.stages["average"]), np.sum(list(self.stages.values()), axis=0)
 
     def summary(self, *, warm_up: int) -> dict[str, Any]:
         """Spread of every stage's times and of their sums per step, without the first ``warm_up`` steps."""
         return {
             "stages": {name: spread(times[warm_up:]) for name, times in self.stages.items()},
             "stages_total": spread(np.sum(list(self.stages.values()), axis=0)[warm_up:]),
+            "beside_the_paper": paired_ratio(*(times[warm_up:].tolist() for times in self._shares())),
         }

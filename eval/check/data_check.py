@@ -84,7 +84,7 @@ def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **opti
     remedies: list[str] = []
     if len(sequence) < _FEW * len(sequence.names_on_disk):
         problems.append(f"only {len(sequence)} of {len(sequence.names_on_disk)} frames are usable")
-        remedies.append("see why frames are skipped above; if it is poses: --time-offset, --fps, --max-pose-gap")
+        remedies.append("see why frames are skipped above; if it is poses: --time-offset, --fps, --reader max_pose_gap")
     read, broken, depths = _read_frames(sequence)
     if broken:
         problems.append(f"{len(broken)} of the {read} frames read cannot be decoded, first {broken[0]}")
@@ -139,8 +139,8 @@ def _remedies(check: SequenceCheck, sequence: FrameSequence, path: str | Path, o
         remedies.append(_scale_remedy(check.scale, sequence, path, options))
     if any("not registered" in problem for problem in check.problems):
         remedies.append(
-            "if the depth camera is another one, say so: --depth-intrinsics; if it stands beside the colour camera, "
-            "warp its maps into that first (7-Scenes: --T-color-depth)"
+            "if the depth camera is another one, say so: --reader depth_intrinsics; if it stands beside the colour "
+            "camera, warp its maps into that first (7-Scenes: --reader T_color_depth)"
         )
     return remedies
 
@@ -263,7 +263,11 @@ def _end(report: DataReport) -> str:
         return _count(len(report.problems), "problem")
     if report.compared:
         return "fine"
-    return f"not checked: {'no depth, no metric scale' if report.depth_range is None else 'nothing was compared'}"
+    if report.depth_range is not None:
+        return "not checked: nothing was compared"
+    if (report.checked.get("images") or {}).get("pairs"):
+        return "poses and images agree; scale cannot be checked without depth"
+    return "not checked: without depth, neither poses nor scale can be compared"
 
 
 def _size(size: tuple[int, int] | None) -> str:

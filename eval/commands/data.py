@@ -5,13 +5,10 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Literal
 
-from ufmstar_torch.eval.check.data_check import check_data, lines, page
-from ufmstar_torch.eval.commands.options import option, positional, reader, usage_errors
-from ufmstar_torch.eval.run.files import to_json
-from ufmstar_torch.eval.sequences.layout import find_sequences, layouts_of, parts_of, require_layout
-from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.commands.opening import OpeningOptions
+from ufmstar_torch.eval.commands.options import Flag, Positional, reader, usage_errors
 
 # With one of these options the path is one sequence, whatever is below its folder.
 _OF_ONE = ("trajectory", "images", "drive")
@@ -26,19 +23,19 @@ class CheckOptions:
     usage.
 
     Attributes:
-        command: check
-        path: a sequence, or a folder below which there are sequences
-        pairs: number of pairs of frames that are compared
-        json: print JSON instead of text
+        command: The check is the only command.
+        path: A sequence, or a folder below which there are sequences.
+        pairs: Compare this many pairs of frames.
+        json: Print JSON instead of text.
     """
 
     USAGE: ClassVar[str] = "ufmstar data check PATH [options]"
 
-    command: str = option(choices=("check",), positional=True)
-    path: str = positional()
+    command: Positional[Literal["check"]]
+    path: Positional[str]
     pairs: int = 8
-    json: bool = False
-    opening: Options
+    json: Flag = False
+    opening: OpeningOptions
 
 
 read = reader(CheckOptions, "ufmstar data")
@@ -46,6 +43,9 @@ read = reader(CheckOptions, "ufmstar data")
 
 def main(options: CheckOptions) -> int:
     """Check, and print the reports. Returns the exit code."""
+    from ufmstar_torch.eval.check.data_check import lines, page
+    from ufmstar_torch.eval.run.files import to_json
+
     with usage_errors(OSError, ValueError):
         reports, several = _check(options)
     if options.json:
@@ -63,6 +63,9 @@ def _check(options: CheckOptions) -> tuple[list, bool]:
         OSError: no such path.
         ValueError: an option out of range, or nothing below the folder has a known layout.
     """
+    from ufmstar_torch.eval.check.data_check import check_data
+    from ufmstar_torch.eval.sequences.layout import find_sequences, layouts_of, parts_of, require_layout
+
     path, opening = options.path, options.opening.changed()
     require_layout(options.opening.layout, options.opening.plugin)
     one = path.startswith("tour:") or any(name in opening for name in _OF_ONE)

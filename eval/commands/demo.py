@@ -11,18 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from ufmstar_torch import models
-from ufmstar_torch.eval.bench.onboard import GRAPH, PICTURE, run_onboard
 from ufmstar_torch.eval.commands import evaluate
-from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, option, reader, usage_errors
+from ufmstar_torch.eval.commands.options import File, Flag, MachineOptions, as_dict, reader, require_least, usage_errors
 from ufmstar_torch.eval.commands.terminal import Bars
-from ufmstar_torch.eval.run.files import to_json, write_json_atomic
-from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
-from ufmstar_torch.eval.run.machine import hardware, share_threads, versions
 
 _WEIGHTS = ("weights", "demo.safetensors")
 _COSTS = "onboard_costs.png"
 _WALK = 150  # frames of a whole walk; the first --frames of them are used, so that consecutive frames overlap
-_ROOMS = {"familiar": "home", "unfamiliar": "hall"}  # style by data set
+_ROOMS = {"unfamiliar": "hall", "familiar": "home"}  # style by data set
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,30 +29,31 @@ class DemoOptions(MachineOptions):
     UfM's and UfM*'s, and makes the report of an evaluation. Nothing else is needed; one to two minutes on two cores.
 
     Attributes:
-        out: folder for the results
-        overwrite: replace an earlier demo there
-        frames: number of frames of each of the two walks
-        seed: of the rooms; the networks were trained on others
-        weights: another ensemble (.safetensors of `ufmstar train`); with --onboard any of its networks, or a FastDepth
-            (.onnx, .tflite)
-        onboard: live instead, as on a small robot: one network, quantised, at 30 images/s among things of many sizes
-        seconds: of --onboard
-        power: log of an external power meter during --onboard: CSV with the columns time (seconds since 1970) and power
-            (W); default: the computer's own counters, if there are any
-        device: cpu, cuda or cuda:N
-        threads: number of CPU threads; default: all cores, with --onboard but one
+        out: Write the results to this folder.
+        overwrite: Replace an earlier demo there.
+        frames: Each of the two walks has this many frames.
+        seed: The rooms are drawn with this seed; the networks were trained on others.
+        weights: Use another ensemble (.safetensors of `ufmstar train`); with --onboard any of its networks, or a
+            FastDepth (.onnx).
+        onboard: Run live, as on a small robot: one quantised network, 30 images/s, things of many sizes.
+        seconds: With --onboard, walk this long [s].
+        power: With --onboard, take the energy from this log of an external power meter, a CSV file with the columns
+            time (seconds since 1970) and power (W) (default: the computer's own counters, if there are any).
+        device: Run on cpu, cuda or cuda:N.
+        threads: Use this many CPU threads (default: all cores, with --onboard all but one).
     """
 
     out: Path = Path("ufmstar_demo")
-    overwrite: bool = False
+    overwrite: Flag = False
     frames: int = 36
-    seed: int = option(100_003, least=0)
-    weights: Path | None = None
-    onboard: bool = False
+    seed: int = 100_003
+    weights: File = None
+    onboard: Flag = False
     seconds: float = 120.0
-    power: Path | None = None
+    power: File = None
 
     def __post_init__(self) -> None:
+        require_least(self, seed=0)
         if not 2 <= self.frames <= _WALK:
             raise ValueError(f"--frames must be 2 to {_WALK}, got {self.frames}")
         if not 1 <= self.seconds < float("inf"):
@@ -72,12 +69,20 @@ read = reader(DemoOptions, "ufmstar demo")
 
 def main(options: DemoOptions) -> int:
     """Run the demo, and print its table; the exit code."""
+    from ufmstar_torch.eval.report.page import PAGE
+    from ufmstar_torch.eval.run.folder import FolderError
+
     with usage_errors(FileNotFoundError, FolderError):
         file = options.weights or Path(models.__file__).parent.joinpath(*_WEIGHTS)
         if not file.is_file():
             missing = f"the package was installed without {'/'.join(_WEIGHTS)}; --weights FILE names another"
             raise FileNotFoundError(f"--weights: no such file: {file}" if options.weights else missing)
-        return _onboard(options, file) if options.onboard else evaluate.main(evaluate.read(_words(options, file)))
+        if options.onboard:
+            return _onboard(options, file)
+        code = evaluate.main(evaluate.read(_words(options, file)))
+    if (page := options.out / PAGE).is_file():
+        print(f"open {page} in a browser")
+    return code
 
 
 def _words(options: DemoOptions, weights: Path) -> list[str]:
@@ -94,9 +99,13 @@ def _words(options: DemoOptions, weights: Path) -> list[str]:
 
 def _onboard(options: DemoOptions, weights: Path) -> int:
     """Run ``--onboard``, write its folder, and print its table. Returns the exit code."""
+    from ufmstar_torch.eval.bench.onboard import GRAPH, PICTURE, run_onboard
     from ufmstar_torch.eval.report.figures_cost import draw_cumulative
     from ufmstar_torch.eval.report.style import save_figure
     from ufmstar_torch.eval.report.text import onboard_table
+    from ufmstar_torch.eval.run.files import to_json, write_json_atomic
+    from ufmstar_torch.eval.run.folder import FolderKind, output_folder
+    from ufmstar_torch.eval.run.machine import hardware, share_threads, versions
 
     if options.threads is None:
         share_threads()

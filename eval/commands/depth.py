@@ -4,25 +4,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import torch
+from typing import TYPE_CHECKING, Any, Literal
 
 from ufmstar_torch.config import SPGFConfig, UfMStarConfig
-from ufmstar_torch.eval.commands.options import MachineOptions, fields_of, option
-from ufmstar_torch.eval.engine.load import NetworkChoice
-from ufmstar_torch.eval.engine.maps import MapSource, folder_source, own_depth
-from ufmstar_torch.eval.engine.predictions import DepthSource
-from ufmstar_torch.eval.methods.setting import DEFAULTS, PAPER, started
+from ufmstar_torch.eval.commands.options import (
+    Count,
+    Flag,
+    MachineOptions,
+    Number,
+    Repeated,
+    Text,
+    Texts,
+    assigned,
+    require_least,
+)
+from ufmstar_torch.eval.methods.setting import started
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_size
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
-from ufmstar_torch.frames.warnings import LOGGER
-from ufmstar_torch.models.any_network import PROGRAMS
-from ufmstar_torch.models.inference import Inference
-from ufmstar_torch.posterior.recalibrate import Recalibration, recalibration_path
-from ufmstar_torch.runtime.stateful import flat
 
-PRESETS = ("tum", "tartanair_indoor", "tartanair_outdoor")
+if TYPE_CHECKING:
+    from ufmstar_torch.eval.engine.maps import MapSource
+    from ufmstar_torch.eval.engine.predictions import DepthSource
+    from ufmstar_torch.posterior.recalibrate import Recalibration
+
 OWN_DEPTH = ("self", "ground-truth")
 # Sections that are off in ``UfMStarConfig()``.
 SECTIONS = ("anchors", "confidence", "posterior", "merge")
@@ -33,29 +37,30 @@ class NetworkOptions:
     """Depth from networks.
 
     Attributes:
-        model: kind of network: fastdepth, monodepth2, trained, depth_anything, huggingface, onnx, litert, torchscript
-            or exported
-        weights: file (depth_anything, huggingface: directory); several are the members of an ensemble
-        mode: of an ensemble: one member per image in turn, or all on every image
-        samples: passes per image of an mc_dropout network in mode full; default: 10
-        offload: trained: keep the weights in host memory, only the member in turn on the device
-        spec: JSON file that declares what the weights do not say: inputs, outputs, an alignment
-        trust_code: exported, torchscript: let the file run its code; only for files whose origin you trust
-        runtime: auto: ONNX Runtime for weights in ONNX files, torch for the rest; or one of the two
-        precision: of the networks; bf16: torch's autocast
+        model: The network is a fastdepth, monodepth2, trained, depth_anything, huggingface, onnx, torchscript or
+            exported.
+        weights: The file of its weights (depth_anything, huggingface: directory); several are an ensemble's members.
+        mode: Run one member of an ensemble per image in turn, or all on every image.
+        samples: Run an mc_dropout network this many times per image in mode full (default: 10).
+        offload: Keep the weights of a trained ensemble in host memory, only the member in turn on the device.
+        spec: This JSON file declares what the weights do not say: inputs, outputs, an alignment.
+        trust_code: Let an exported or torchscript file run its code; only for files whose origin you trust.
+        runtime: Use torch or ONNX Runtime (auto: ONNX Runtime for weights in ONNX files).
+        precision: Run the networks in this precision; bf16 is torch's autocast.
     """
 
-    model: str | None = None
-    weights: tuple[str, ...] = ()
-    mode: str = option("alternate", choices=("alternate", "full"))
-    samples: int | None = option(None, least=2)
-    offload: bool = False
-    spec: str | None = None
-    trust_code: bool = option(False, typed=True)
-    runtime: str = option("auto", choices=("auto", "torch", "onnx"))
-    precision: str = option("float32", choices=("float32", "bf16"))
+    model: Text = None
+    weights: Texts = ()
+    mode: Literal["alternate", "full"] = "alternate"
+    samples: Count = None
+    offload: Flag = False
+    spec: Text = None
+    trust_code: Flag = False
+    runtime: Literal["auto", "torch", "onnx"] = "auto"
+    precision: Literal["float32", "bf16"] = "float32"
 
     def __post_init__(self) -> None:
+        require_least(self, samples=2)
         if self.model is not None and not self.weights:
             raise ValueError(f"--model {self.model} needs --weights FILE")
         for name in ("weights", "spec", "samples", "offload"):
@@ -64,15 +69,27 @@ class NetworkOptions:
         for name in ("samples", "offload"):
             if getattr(self, name) and self.model != "trained":
                 raise ValueError(f"--{name} goes with --model trained only")
-        if self.trust_code and self.model not in PROGRAMS:
-            raise ValueError(f"--trust-code goes with --model {' or '.join(PROGRAMS)} only")
+        if self.trust_code:
+            self._require_program()
         if self.mode == "full" and len(self.weights) < 2 and self.model != "trained":
             raise ValueError("--mode full needs several --weights")
         if self.samples is not None and self.mode != "full":
             raise ValueError("--samples goes with --mode full only")
 
+    def _require_program(self) -> None:
+        """Raises ValueError: the kind of network is no program."""
+        from ufmstar_torch.models.any_network import PROGRAMS
+
+        if self.model not in PROGRAMS:
+            raise ValueError(f"--trust-code goes with --model {' or '.join(PROGRAMS)} only")
+
     def load(self, machine: MachineOptions) -> DepthSource:
         """Load the networks onto a device; errors as ``NetworkChoice.load``."""
+        import torch
+
+        from ufmstar_torch.eval.engine.load import NetworkChoice
+        from ufmstar_torch.models.inference import Inference
+
         choice = NetworkChoice("", str(self.model), self.weights, self.spec, self.trust_code)
         inference = Inference(self.runtime, self.precision, machine.threads)
         how: dict[str, Any] = {"mode": self.mode, "samples": self.samples, "offload": self.offload}
@@ -84,19 +101,19 @@ class MapOptions:
     """Depth from files, instead of a network.
 
     Attributes:
-        depth: folder of predicted maps (16-bit PNG, EXR, npy), or an earlier run's output; 'self': the sequence's own
-            depth
-        variance: folder of variance maps [m^2] that belong to them
-        depth_scale: metres per unit of the maps in the folder
-        map_intrinsics: of the maps, if they do not show the whole image: a file, or fx fy cx cy [px]
-        size: HxW [px], to which the maps are brought
+        depth: Read predicted maps from this folder (16-bit PNG, EXR, npy, an earlier run's output), or the sequence's
+            own depth (self).
+        variance: Read their variances [m^2] from this folder.
+        depth_scale: One unit of the maps is this many metres.
+        map_intrinsics: Maps that do not show the whole image have this camera: a file, or fx fy cx cy [px].
+        size: Bring the maps to this size, HxW [px].
     """
 
-    depth: str | None = None
-    variance: str | None = None
-    depth_scale: float | None = None
-    map_intrinsics: tuple[str, ...] = ()
-    size: str | None = None
+    depth: Text = None
+    variance: Text = None
+    depth_scale: Number = None
+    map_intrinsics: Texts = ()
+    size: Text = None
 
     def __post_init__(self) -> None:
         for name in ("variance", "depth_scale", "map_intrinsics", "size"):
@@ -111,6 +128,8 @@ class MapOptions:
     def source(self, sequence: FrameSequence, indices: range) -> MapSource:
         """The maps of the frames ``indices``. Raises NotADirectoryError, ValueError: the folder does not exist, or maps
         are missing or do not fit."""
+        from ufmstar_torch.eval.engine.maps import folder_source, own_depth
+
         size = parse_size(self.size)
         if self.depth in OWN_DEPTH:
             if len(sequence.without_depth) == len(sequence):
@@ -126,24 +145,22 @@ class UfMOptions:
     """UfM*.
 
     Attributes:
-        preset: segmentation thresholds of the authors' code for a kind of recording; single --ufm.segment.* take
-            precedence
-        ufm_preset: paper: the paper's own settings (UfMStarConfig.paper; with --plain, its method), default: ours;
-            --preset and single --ufm.* take precedence
-        anchors: depths that show the error on which all views agree (docs/anchors.md): dense, a depth in every cell of
-            the image, searched in earlier images; corners, tracked in the images; FILE, landmarks, a line x y z
-            sigma [m] each, in the world of the poses; sensor (or sensor:stereo, sensor:tof), the recording's own
-            depth, dense where it has none
-        scale_from: network: its scale for COLMAP poses without one; anchors then show shape only
-        recalibration: file of `ufmstar recalibrate`, or none; default: WEIGHTS.recalibration.json beside the weights
+        preset: Segment with the thresholds of the authors' code for a kind of recording.
+        ufm_preset: Start from the paper's own settings (UfMStarConfig.paper; with --plain, its method), or ours.
+        set: Set a value of UfMStarConfig as NAME=VALUE, as segment.min_pixels=100; it wins over presets; repeatable.
+        anchors: Measure the error on which all views agree (docs/anchors.md) with depths searched in earlier images
+            (dense), corners tracked in the images (corners), landmarks from a FILE with a line x y z sigma [m] each,
+            or the recording's own depth (sensor, sensor:stereo, sensor:tof).
+        scale_from: Poses of COLMAP without a scale get the network's; anchors then show shape only.
+        recalibration: Use this file of `ufmstar recalibrate`, or none (default: WEIGHTS.recalibration.json).
     """
 
-    preset: str | None = option(None, choices=PRESETS)
-    ufm_preset: str | None = option(None, choices=(PAPER, DEFAULTS))
-    anchors: str | None = None
-    scale_from: str | None = option(None, choices=("network",))
-    recalibration: str | None = None
-    ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", unset=True, shown=True)
+    preset: Literal["tum", "tartanair_indoor", "tartanair_outdoor"] | None = None
+    ufm_preset: Literal["paper", "default"] = "default"
+    set: Repeated = ()
+    anchors: Text = None
+    scale_from: Literal["network"] | None = None
+    recalibration: Text = None
 
     def __post_init__(self) -> None:
         self.config()  # checks the settings
@@ -156,13 +173,14 @@ class UfMOptions:
     def config(self, **first: Any) -> UfMStarConfig:
         """The configuration; ``first`` replaces values of the presets. Raises ValueError: an impossible value, or
         settings of anchors or posterior while these are off."""
+        values = assigned(self.set)
         used = {"anchors": self.anchors is not None or self.posterior, "posterior": self.posterior}
         for name, needed in (("anchors", "--anchors"), ("posterior", "the posterior, as run and live without --plain")):
-            if name in self.ufm and not used[name]:
-                raise ValueError(f"--ufm.{name}.* needs {needed}")
-        start = started(self.ufm_preset or DEFAULTS, **used).replace(on_bad_frame="skip")
+            if not used[name] and any(key.startswith(f"{name}.") for key in values):
+                raise ValueError(f"--set {name}.* needs {needed}")
+        start = started(self.ufm_preset, **used).replace(on_bad_frame="skip")
         start = start if self.preset is None else start.replace(segment=SPGFConfig.preset(self.preset))
-        return start.with_values(first | flat(self.ufm))
+        return start.with_values(first | values)
 
     def load_recalibration(
         self, config: UfMStarConfig, weights: tuple[str, ...], source: DepthSource
@@ -174,6 +192,9 @@ class UfMOptions:
             FileNotFoundError: the named file does not exist.
             ValueError: the file is no recalibration, or was fitted with other settings or to another network.
         """
+        from ufmstar_torch.frames.warnings import LOGGER
+        from ufmstar_torch.posterior.recalibrate import Recalibration, recalibration_path
+
         name = self.recalibration
         if name == "none" or (name is None and not (weights and recalibration_path(weights[0]).is_file())):
             return None
@@ -195,14 +216,13 @@ class PosteriorOptions(UfMOptions):
     """UfM*, and the posterior that corrects its depth and variance with anchors.
 
     Attributes:
-        anchors: from which the depth is corrected (docs/anchors.md): dense (default), a depth in every cell of the
-            image, searched in earlier images; corners, tracked in the images; FILE, landmarks, a line x y z sigma
-            [m] each, in the world of the poses; with run, sensor (or sensor:stereo, sensor:tof), the recording's own
-            depth, dense where it has none
-        plain: UfM* alone: the network's depth with the variance of UfM*; with --anchors, the variance has B
+        anchors: Correct the depth (docs/anchors.md) with depths searched in earlier images (dense, the default),
+            corners tracked in the images (corners), landmarks from a FILE with a line x y z sigma [m] each, or, with
+            run, the recording's own depth (sensor, sensor:stereo, sensor:tof).
+        plain: Leave the network's depth as it is, with the variance of UfM* alone; with --anchors, it includes B.
     """
 
-    plain: bool = False
+    plain: Flag = False
 
     @property
     def posterior(self) -> bool:

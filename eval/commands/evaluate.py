@@ -5,24 +5,30 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
-import torch
-
-from ufmstar_torch.eval.bench.measure import EFFICIENCY, Plan, measure_job
-from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, option, reader, usage_errors
+from ufmstar_torch.eval.commands.opening import OpeningOptions
+from ufmstar_torch.eval.commands.options import (
+    Count,
+    Flag,
+    MachineOptions,
+    Text,
+    Words,
+    as_dict,
+    joined,
+    reader,
+    require_least,
+    usage_errors,
+)
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-from ufmstar_torch.eval.engine.load import NetworkChoice
-from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.methods.method import NETWORKS, UFM_STAR
-from ufmstar_torch.eval.methods.setting import DEFAULTS, PAPER, started
+from ufmstar_torch.eval.methods.setting import DEFAULTS, started
 from ufmstar_torch.eval.methods.suite import listing, suite_named
 from ufmstar_torch.eval.sequences.frame import parse_slice
-from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.suite.job import EvalJob, require_methods, with_recalibrations
 from ufmstar_torch.eval.suite.record import ResultsError
-from ufmstar_torch.eval.suite.shards import EvalOutcome, evaluate_suite
-from ufmstar_torch.eval.suite.work_items import ALL, Shard, find_work, read_names
+from ufmstar_torch.eval.suite.tasks import EvalOutcome
+from ufmstar_torch.eval.suite.work_items import find_work, read_names
 
 # Options that are fields of a job with the same name.
 _OF_JOB = ("device", "bins", "examples", "samples", "runtime", "precision")
@@ -33,33 +39,36 @@ class SuiteOptions:
     """Evaluate the rows of a suite on sequences.
 
     Attributes:
-        suite: name of a suite (see --list), or a TOML file of your own
-        base: the network that a figure or ablation is about, instead of the paper's: depth_only, ...
-        ufm_preset: settings of UfM* in all its rows, instead of the suite's: paper (UfMStarConfig.paper) or default
-        network: BASE=MODEL:FILE[,FILE...], one for every base; rows without one are left out; repeatable. A FILE.json
-            is its spec. With paper-table-1, -2 and -4 a base may have a second one, whose time, energy and memory are
-            measured as well
-        spec: JSON file that declares what the weights of the networks without one do not say, as of ufmstar run
-        trust_code: let files of exported and torchscript run their code; only for files whose origin you trust
-        samples: passes of MC-Dropout of a row that needs all of them; default: 10
-        runtime: auto: ONNX Runtime for weights in ONNX files, torch for the rest; or one of the two
-        precision: of the networks; bf16: torch's autocast
-        recalibration: file of `ufmstar recalibrate`: its row is judged under it as well, as a row of its own, on
-            sequences other than those that it was fitted to; repeatable
-        list: show the suites and stop
+        suite: Evaluate the suite of this name (see --list), or of your own TOML file.
+        base: A figure or ablation is about this network instead of the paper's: depth_only, ...
+        ufm_preset: All rows of UfM* start from the paper's settings (UfMStarConfig.paper) or ours, not the suite's.
+        network: Name a network for every base as BASE=MODEL:FILE[,FILE...]; rows without one are left out; repeatable.
+            A FILE.json is its spec. With paper-table-1, -2 and -4 a base may have a second one, whose time, energy and
+            memory are measured as well.
+        spec: This JSON file declares what the weights of networks without a spec do not say, as for ufmstar run.
+        trust_code: Let exported and torchscript files run their code; only for files whose origin you trust.
+        samples: Run MC-Dropout this many times in a row that needs all passes (default: 10).
+        runtime: Use torch or ONNX Runtime (auto: ONNX Runtime for weights in ONNX files).
+        precision: Run the networks in this precision; bf16 is torch's autocast.
+        recalibration: Judge the row of this file of `ufmstar recalibrate` also under it, as a row of its own, on
+            sequences other than those that it was fitted to; repeatable.
+        list: Show the suites and stop.
     """
 
-    suite: str | None = None
-    base: str | None = None
-    ufm_preset: str | None = option(None, choices=(PAPER, DEFAULTS))
-    network: tuple[str, ...] = option((), repeat=True)
-    spec: str | None = None
-    trust_code: bool = option(False, typed=True)
-    samples: int | None = option(None, least=2)
-    runtime: str = option("auto", choices=("auto", "torch", "onnx"))
-    precision: str = option("float32", choices=("float32", "bf16"))
-    recalibration: tuple[str, ...] = option((), repeat=True)
-    list: bool = False
+    suite: Text = None
+    base: Text = None
+    ufm_preset: Literal["paper", "default"] | None = None
+    network: Words = ()
+    spec: Text = None
+    trust_code: Flag = False
+    samples: Count = None
+    runtime: Literal["auto", "torch", "onnx"] = "auto"
+    precision: Literal["float32", "bf16"] = "float32"
+    recalibration: Words = ()
+    list: Flag = False
+
+    def __post_init__(self) -> None:
+        require_least(self, samples=2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,18 +76,22 @@ class DataOptions:
     """The sequences.
 
     Attributes:
-        root: [DATASET=]DIR with sequences at or below it, or tour:SEED; without DATASET, the layout's name; repeatable
-        sequences: number of sequences of each data set that are drawn at random (the paper: 100); default: all
-        seed: of the draw
-        sequence_list: file with the names of the sequences to take, one a line
-        frames: START:STOP:STEP, which frames of a sequence, counted from 0 as Python does
+        root: Take the sequences at or below [DATASET=]DIR, or tour:SEED; DATASET is the layout's name by default;
+            repeatable.
+        sequences: Draw this many sequences of each data set at random (the paper: 100; default: all).
+        seed: Draw them with this seed.
+        sequence_list: Take the sequences that this file names, one a line.
+        frames: Take the frames START:STOP:STEP of each sequence, counted from 0 as Python does.
     """
 
-    root: tuple[str, ...] = option((), repeat=True)
-    sequences: int | None = option(None, least=1)
-    seed: int = option(0, least=0)
-    sequence_list: str | None = None
-    frames: str | None = None
+    root: Words = ()
+    sequences: Count = None
+    seed: int = 0
+    sequence_list: Text = None
+    frames: Text = None
+
+    def __post_init__(self) -> None:
+        require_least(self, sequences=1, seed=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,22 +99,25 @@ class EvalOutputOptions:
     """Output.
 
     Attributes:
-        out: folder for everything that is written
-        resume: continue the evaluation in --out: compute what is missing, rows and sequences added since
-        overwrite: replace the evaluation in --out; predictions in its cache are kept
-        cache: folder of the networks' predictions; default: OUT/cache
-        examples: number of sequences of each data set of which some frames are kept for pictures
-        bins: of the calibration errors: ours (10 bins, 10 levels) or authors (100 bins, 101 levels); default: ours
-        no_report: no tables and figures at the end; ufmstar report OUT makes them
+        out: Write everything to this folder.
+        resume: Continue the evaluation in --out: compute what is missing, also rows and sequences added since.
+        overwrite: Replace the evaluation in --out, but for the predictions in its cache.
+        cache: Keep the networks' predictions in this folder (default: OUT/cache).
+        examples: Keep some frames of this many sequences of each data set for pictures.
+        bins: Calibration errors have 10 bins and 10 levels (ours), or 100 bins and 101 levels (authors).
+        no_report: Make no tables and figures at the end; ufmstar report OUT makes them.
     """
 
-    out: str | None = None
-    resume: bool = False
-    overwrite: bool = False
-    cache: str | None = None
-    examples: int = option(3, least=0)
-    bins: str = option("ours", choices=("ours", "authors"))
-    no_report: bool = False
+    out: Text = None
+    resume: Flag = False
+    overwrite: Flag = False
+    cache: Text = None
+    examples: int = 3
+    bins: Literal["ours", "authors"] = "ours"
+    no_report: Flag = False
+
+    def __post_init__(self) -> None:
+        require_least(self, examples=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,29 +125,30 @@ class EvalOptions(MachineOptions):
     """The rows of a table or figure of the paper, on sequences of your own.
 
     A sequence's rows are written when its last frame is done: whatever ends the program, --resume computes what is
-    missing. The work can be divided: --processes on one computer, --shard in a cluster's job array.
+    missing. The sequences can be divided: --processes on one computer, --scheduler on a Dask cluster.
 
     Attributes:
-        device: cpu or cuda; of several --processes, each takes the next GPU in turn
-        threads: number of CPU threads of each process; default: all cores, divided among --processes
-        processes: number of processes on this computer
-        shard: i/n, only the i-th of n parts of the sequences, 1/n to n/n
-        dry_run: show rows and sequences, and what is missing, and stop; needs --suite alone
+        device: Run on cpu or cuda; each of several --processes takes the next GPU in turn.
+        threads: Each process uses this many CPU threads (default: all cores, divided among --processes).
+        processes: Run this many processes on this computer.
+        scheduler: Run on the Dask cluster of this scheduler, tcp://HOST:8786, whose workers see the same files.
+        dry_run: Show rows, sequences and what is missing, and stop; needs --suite alone.
     """
 
     USAGE: ClassVar[str] = (
         "ufmstar eval --suite NAME --root [DATASET=]DIR ... --network BASE=MODEL:FILE[,FILE...] ... --out OUT [options]"
     )
 
-    processes: int = option(1, least=1)
-    shard: str | None = None
-    dry_run: bool = False
+    processes: int = 1
+    scheduler: Text = None
+    dry_run: Flag = False
     what: SuiteOptions
     data: DataOptions
-    opening: Options
+    opening: OpeningOptions
     output: EvalOutputOptions
 
     def __post_init__(self) -> None:
+        require_least(self, processes=1)
         if self.what.list:
             return
         values = as_dict(self)
@@ -139,16 +156,10 @@ class EvalOptions(MachineOptions):
             if not values[name]:
                 raise ValueError(f"--{name} is missing; ufmstar eval --help, and --list for the suites")
         parse_slice(self.data.frames)
-        _ = self.part
         if self.output.resume and self.output.overwrite:
             raise ValueError("--resume and --overwrite contradict each other")
-        if self.shard and self.output.overwrite:
-            raise ValueError("--overwrite goes without shards: another one may have begun")
-
-    @property
-    def part(self) -> Shard:
-        """The shard. Raises ValueError: no such part."""
-        return ALL if self.shard is None else Shard.parse(self.shard)
+        if self.scheduler is not None and self.processes > 1:
+            raise ValueError("--processes are of this computer, --scheduler has its own: give one of them")
 
 
 read = reader(EvalOptions, "ufmstar eval")
@@ -166,21 +177,26 @@ def main(options: EvalOptions) -> int:
 def job_from(options: EvalOptions) -> EvalJob:
     """The job of the options. Opens no sequence. Raises FileNotFoundError, ValueError: a file does not exist, options
     contradict each other, a base is named twice, no row has a network, or there is no sequence."""
+    from ufmstar_torch.eval.engine.load import NetworkChoice
+    from ufmstar_torch.eval.suite.job import EvalJob
+
     what, data, output, values = options.what, options.data, options.output, as_dict(options)
-    suite = with_recalibrations(suite_named(str(what.suite), what.base, what.ufm_preset), what.recalibration)
+    suite = with_recalibrations(suite_named(str(what.suite), what.base, what.ufm_preset), joined(what.recalibration))
     require_methods(suite, options.opening.plugin)
     architectures: list[dict[str, NetworkChoice]] = [{}]
-    for text in what.network:  # a base's n-th network belongs to the n-th architecture
+    for text in joined(what.network):  # a base's n-th network belongs to the n-th architecture
         choice = replace(NetworkChoice.parse(text).with_spec(what.spec), trust_code=what.trust_code)
         number = sum(choice.base in architecture for architecture in architectures)
         architectures += [{}] if number == len(architectures) else []
         architectures[number][choice.base] = choice
     networks, *further = architectures
     if further and not suite.efficiency:
-        bases = ", ".join(text.partition("=")[0] for text in what.network)
+        bases = ", ".join(text.partition("=")[0] for text in joined(what.network))
         raise ValueError(f"--network: every base once, but in a suite that measures time and energy, got {bases}")
     only = None if data.sequence_list is None else read_names(Path(data.sequence_list))
-    items = find_work(data.root, sample=data.sequences, seed=data.seed, only=only, opening=options.opening)
+    items = find_work(
+        joined(data.root), sample=data.sequences, seed=data.seed, only=only, opening=options.opening.of_reader
+    )
     return EvalJob(
         suite=suite.with_bases(networks) if networks else suite,
         networks=networks,
@@ -196,8 +212,11 @@ def job_from(options: EvalOptions) -> EvalJob:
 
 
 def _evaluate(options: EvalOptions) -> int:
+    from ufmstar_torch.eval.engine.warm_up import warm_up_command
+    from ufmstar_torch.eval.suite.tasks import evaluate_suite
+
     how: dict[str, Any] = {"resume": options.output.resume, "overwrite": options.output.overwrite}
-    how |= {"processes": options.processes, "threads": options.threads}
+    how |= {"processes": options.processes, "scheduler": options.scheduler, "threads": options.threads}
     with Bars() as bars, stop_signals(bars.say) as stop:
         job = job_from(options)
         for base in job.unused:
@@ -209,7 +228,7 @@ def _evaluate(options: EvalOptions) -> int:
             warm_up_command(config, bars.show, anchors)
         if sys.stderr.isatty():
             how["progress"] = bars.show
-        outcome = evaluate_suite(job, shard=options.part, **how, stop=stop, report=bars.say)
+        outcome = evaluate_suite(job, **how, stop=stop, report=bars.say)
     return _report(job, outcome, options)
 
 
@@ -226,9 +245,9 @@ def _report(job: EvalJob, outcome: EvalOutcome, options: EvalOptions) -> int:
     if job.missing_bases:
         print(f"left out, without a --network: the rows of {', '.join(job.missing_bases)}")
     print(f"{job.out}: eval.json, records/DATASET/SEQUENCE/ with a record for every row", flush=True)
-    if outcome.complete and job.suite.efficiency:
+    if outcome.finished and job.suite.efficiency:
         _measure(job, options.threads)
-    if outcome.complete and not options.output.no_report:
+    if outcome.finished and not options.output.no_report:
         try:
             print(written(job.out, write_report(job.out)))
         except (ImportError, ResultsError) as error:
@@ -241,13 +260,13 @@ def _report(job: EvalJob, outcome: EvalOutcome, options: EvalOptions) -> int:
     if outcome.failed or not outcome.finished:
         print("ufmstar eval: not all sequences are complete; --resume tries the rest again", file=sys.stderr)
         return 1
-    if not outcome.complete:
-        print("ufmstar eval: this shard is complete, others are not: the last one makes the report", file=sys.stderr)
     return 0
 
 
 def _measure(job: EvalJob, threads: int | None) -> None:
     """Measure time, energy and memory, unless their file exists. If that fails, print the reason."""
+    from ufmstar_torch.eval.bench.measure import EFFICIENCY, Plan, measure_job
+
     if (job.out / EFFICIENCY).exists():
         return
     print("ufmstar eval: measuring time, energy and memory ...", file=sys.stderr)
@@ -266,10 +285,12 @@ _MISSING = {
 
 def _dry_run(options: EvalOptions) -> int:
     """Print the rows with their networks and needs, and the sequences with their number of frames."""
+    import torch
+
     job, suite = job_from(options), suite_named(str(options.what.suite), options.what.base, options.what.ufm_preset)
     for base in job.unused:
         print(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")
-    networks, items = job.load(torch.device("cpu")), options.part.of(job.items)
+    networks = job.load(torch.device("cpu"))
     rows = [*job.suite.rows, *(row for row in suite.rows if row not in job.suite.rows)]
     print(f"{job.suite.name}: {job.suite.title}\n{len(rows)} rows:")
     for row in rows:
@@ -285,9 +306,9 @@ def _dry_run(options: EvalOptions) -> int:
     for name, words in _MISSING.items():
         if not values[name]:
             print(f"no --{name}: {words}")
-    print(f"{len(items)} of {len(job.items)} sequences:")
+    print(f"{len(job.items)} sequences:")
     total = 0
-    for item in items:
+    for item in job.items:
         try:
             frames = len(range(len(item.open()))[job.frames])
         except (OSError, ValueError) as error:
@@ -295,5 +316,5 @@ def _dry_run(options: EvalOptions) -> int:
             continue
         print(f"  {item.label}: {frames} frames")
         total += frames
-    print(f"{total} frames, {len(items) * len(job.suite.rows)} records")
+    print(f"{total} frames, {len(job.items) * len(job.suite.rows)} records")
     return 0

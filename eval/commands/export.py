@@ -6,20 +6,10 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
-from ufmstar_torch.eval.commands.options import option, positional, reader, usage_errors
-from ufmstar_torch.eval.report.text import supported
-from ufmstar_torch.eval.run import export
-from ufmstar_torch.eval.run.export_bag import export_bag
-from ufmstar_torch.eval.run.rerun_log import export_rerun
-from ufmstar_torch.eval.sequences.open import open_sequence
-from ufmstar_torch.eval.sequences.options import Options
-
-_EXPORTERS: dict[str, Callable[..., str]] = {
-    "depth": export.export_depth, "cloud": export.export_cloud, "tum": export.export_trajectory,
-    "transforms": export.export_transforms, "mcap": export_bag, "rrd": export_rerun,
-}  # fmt: skip
+from ufmstar_torch.eval.commands.opening import OpeningOptions
+from ufmstar_torch.eval.commands.options import Positional, Text, reader, require_positive, usage_errors
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,27 +21,28 @@ class ExportOptions:
     the recording that --sequence names, opened with the same options as for `ufmstar run`.
 
     Attributes:
-        out: folder of `ufmstar run`
-        sequence: the run's recording, for the colours of cloud, mcap and rrd, and the images of transforms
-        to: depth: depth and sigma as 16-bit PNGs, 0 = left out; cloud: cloud.ply with sigma and colour; tum:
-            trajectory.txt; transforms: images, depth, sigma and poses for nerfstudio; mcap: a ROS 2 bag; rrd: a rerun
-            recording
-        max_sigma: largest standard deviation of a pixel [m]
-        max_relative_sigma: largest standard deviation of a pixel, as a share of its depth
-        voxel: side of the cloud's voxels [m], each of which has one point
+        out: The folder of `ufmstar run`.
+        to: Write depth and sigma as 16-bit PNGs (depth; 0 = left out), cloud.ply with sigma and colour (cloud),
+            trajectory.txt (tum), images, depth, sigma and poses for nerfstudio (transforms), a ROS 2 bag (mcap), or a
+            rerun recording (rrd).
+        sequence: Take colours and images from this recording, that of the run.
+        max_sigma: Leave pixels with a larger standard deviation out [m].
+        max_relative_sigma: Leave pixels with a larger standard deviation out, as a share of the depth.
+        voxel: The cloud has one point in each voxel of this side [m].
     """
 
     USAGE: ClassVar[str] = "ufmstar export OUT --to depth|cloud|tum|transforms|mcap|rrd [--sequence SEQUENCE] [options]"
 
-    out: Path = positional()
-    sequence: str | None = None
-    to: str = option(choices=tuple(_EXPORTERS))
-    max_sigma: float = option(float("inf"), positive=True)
-    max_relative_sigma: float = option(float("inf"), positive=True)
-    voxel: float = option(0.02, positive=True)
-    opening: Options
+    out: Positional[Path]
+    to: Literal["depth", "cloud", "tum", "transforms", "mcap", "rrd"]
+    sequence: Text = None
+    max_sigma: float = float("inf")
+    max_relative_sigma: float = float("inf")
+    voxel: float = 0.02
+    opening: OpeningOptions
 
     def __post_init__(self) -> None:
+        require_positive(self, "max_sigma", "max_relative_sigma", "voxel")
         if self.sequence is None and self.to == "transforms":
             raise ValueError("--to transforms needs the images: --sequence SEQUENCE, the recording of the run")
         if self.sequence is None and (names := self.opening.changed()):
@@ -63,26 +54,44 @@ read = reader(ExportOptions, "ufmstar export")
 
 def main(options: ExportOptions) -> int:
     """Export, and print what was written; the exit code."""
+    from ufmstar_torch.eval.run.export import GateCount, gated_frames, run_summary, with_images
+    from ufmstar_torch.eval.sequences.open import open_sequence
+
     out, to = options.out, options.to
     with usage_errors(FileNotFoundError, ValueError):
-        counts = export.GateCount()
-        frames = counts.of(export.gated_frames(out, options.max_sigma, options.max_relative_sigma))
+        counts = GateCount()
+        frames = counts.of(gated_frames(out, options.max_sigma, options.max_relative_sigma))
         if to not in ("depth", "tum") and options.sequence is not None:
-            frames = export.with_images(frames, open_sequence(options.sequence, **options.opening.changed()))
+            frames = with_images(frames, open_sequence(options.sequence, **options.opening.changed()))
         elif to not in ("depth", "tum"):
             print("no colours: --sequence SEQUENCE names the recording with the images")
         how = {"voxel": options.voxel} if to == "cloud" else {}
-        print(_EXPORTERS[to](frames, out, **how))
+        print(_exporter(to)(frames, out, **how))
         if min(options.max_sigma, options.max_relative_sigma) < math.inf and to != "tum":
             print(f"the limits of sigma keep {counts.share:.1%} of the pixels with a depth")
-            if reason := _unsupported(export.run_summary(out)):
+            if reason := _unsupported(run_summary(out)):
                 remedy = "`ufmstar run` without --plain makes a sigma that anchors test (docs/thresholds.md)"
                 print(f"warning: nothing supports this sigma, {reason}: the pixels that are left may be bad; {remedy}")
     return 0
 
 
+def _exporter(to: str) -> Callable[..., str]:
+    """The function that writes frames in the form ``to`` into a folder, and returns a line about it."""
+    from ufmstar_torch.eval.run.export import export_cloud, export_depth, export_trajectory, export_transforms
+    from ufmstar_torch.eval.run.export_bag import export_bag
+    from ufmstar_torch.eval.run.rerun_log import export_rerun
+
+    exporters: dict[str, Callable[..., str]] = {
+        "depth": export_depth, "cloud": export_cloud, "tum": export_trajectory,
+        "transforms": export_transforms, "mcap": export_bag, "rrd": export_rerun,
+    }  # fmt: skip
+    return exporters[to]
+
+
 def _unsupported(summary: Mapping[str, Any]) -> str:
     """Why nothing supports the sigma of a run; "" if held-out anchors or a recalibration do."""
+    from ufmstar_torch.eval.report.text import supported
+
     if supported(summary) if "posterior" in summary else summary.get("recalibrated"):
         return ""
     calibration = (summary.get("posterior") or {}).get("calibration")

@@ -11,34 +11,33 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from time import monotonic
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
-
-from ufmstar_torch.anchors.sources import DENSE
-from ufmstar_torch.eval.check.image_fit import image_fit, track_corners
 from ufmstar_torch.eval.commands.depth import NetworkOptions, PosteriorOptions
-from ufmstar_torch.eval.commands.options import MachineOptions, option, positional, reader, usage_errors
+from ufmstar_torch.eval.commands.opening import OpeningOptions
+from ufmstar_torch.eval.commands.options import (
+    File,
+    Flag,
+    MachineOptions,
+    Positional,
+    reader,
+    require_least,
+    require_positive,
+    usage_errors,
+)
 from ufmstar_torch.eval.commands.terminal import Bars
-from ufmstar_torch.eval.engine.anchors import landmarks_of
-from ufmstar_torch.eval.engine.realtime import RealTime
-from ufmstar_torch.eval.engine.warm_up import warm_up_command
-from ufmstar_torch.eval.run.export import RunFrame
-from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
-from ufmstar_torch.eval.run.folder import FolderKind, output_folder
-from ufmstar_torch.eval.run.machine import share_threads
-from ufmstar_torch.eval.run.rerun_log import RerunLog, open_viewer
-from ufmstar_torch.eval.run.writers import is_frame
-from ufmstar_torch.eval.sequences import live as sources
 from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
-from ufmstar_torch.eval.sequences.live import LiveEvent
-from ufmstar_torch.eval.sequences.open import open_sequence
-from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.frames.warnings import LOGGER
-from ufmstar_torch.live import LiveDepth, LiveResult, LiveStatistics
-from ufmstar_torch.uncertain_depth import UncertainDepth
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from ufmstar_torch.eval.engine.realtime import RealTime
+    from ufmstar_torch.eval.run.export import RunFrame
+    from ufmstar_torch.eval.run.rerun_log import RerunLog
+    from ufmstar_torch.eval.sequences.live import LiveEvent
+    from ufmstar_torch.live import LiveDepth, LiveResult, LiveStatistics
+    from ufmstar_torch.uncertain_depth import UncertainDepth
 
 _STANDARD_INPUT, _SUMMARY = "-", "realtime.json"
 _ARRAYS = ("depth", "variance", "disagreement", "T_world_cam", "intrinsics")  # of an image's file
@@ -58,40 +57,42 @@ class LiveOptions(MachineOptions):
     Ends with its source, or with Ctrl-C.
 
     Attributes:
-        source: a recording (folder, video, bag, tour:SEED), the number of a camera, or - for lines of JSON
-        follow: the source is a folder to which another program adds images, which are named by their time
-        speed: replays a recording this many times as fast
-        seconds: ends the command so many seconds after the first image
-        idle: ends --follow after so many seconds without a new image
-        max_wait: longest time that an image waits for a pose after it [s]
-        state: file to which the state is saved, and from which the next command continues
-        save_every: time between two savings of the state [s]
-        out: folder for realtime.json and, for each image, a .npz with depth and variance (corrected unless --plain),
-            network_depth and ufm_variance before the correction, disagreement, pose and intrinsics
-        overwrite: replace the results in --out
-        view: show the images, depth and plots in rerun, on this computer alone
-        json: print a line of JSON per image instead of the status
+        source: A recording (folder, video, bag, tour:SEED), the number of a camera, or - for lines of JSON.
+        follow: The source is a folder to which another program adds images, which are named by their time.
+        speed: Replay a recording this many times as fast.
+        seconds: Stop this many seconds after the first image.
+        idle: With --follow, stop after this many seconds without a new image.
+        max_wait: An image waits at most this long for a pose after it [s].
+        state: Save the state to this file, from which the next command continues.
+        save_every: Save the state at this interval [s].
+        out: Write realtime.json to this folder and, for each image, a .npz with depth and variance (corrected unless
+            --plain), those before the correction, disagreement, pose and intrinsics.
+        overwrite: Replace the results in --out.
+        view: Show the images, depth and plots in rerun, on this computer alone.
+        json: Print a line of JSON per image instead of the status.
     """
 
     USAGE: ClassVar[str] = "ufmstar live SOURCE --model NAME --weights FILE... [options]"
 
-    source: str = positional()
-    follow: bool = False
-    speed: float = option(1.0, positive=True)
-    seconds: float = option(float("inf"), positive=True)
-    idle: float = option(float("inf"), positive=True)
-    max_wait: float = option(0.2, least=0)
-    state: Path | None = None
-    save_every: float = option(10.0, least=0)
-    out: Path | None = None
-    overwrite: bool = False
-    view: bool = False
-    json: bool = False
-    opening: Options
+    source: Positional[str]
+    follow: Flag = False
+    speed: float = 1.0
+    seconds: float = float("inf")
+    idle: float = float("inf")
+    max_wait: float = 0.2
+    state: File = None
+    save_every: float = 10.0
+    out: File = None
+    overwrite: Flag = False
+    view: Flag = False
+    json: Flag = False
+    opening: OpeningOptions
     network: NetworkOptions
     uncertainty: PosteriorOptions
 
     def __post_init__(self) -> None:
+        require_least(self, max_wait=0, save_every=0)
+        require_positive(self, "speed", "seconds", "idle")
         if self.network.model is None:
             raise ValueError("live needs a network: --model NAME --weights FILE")
         if self.overwrite and self.out is None:
@@ -118,7 +119,14 @@ read = reader(LiveOptions, "ufmstar live")
 
 def main(options: LiveOptions) -> int:
     """Run until the source ends, and print the real-time table; the exit code."""
+    from ufmstar_torch.eval.engine.realtime import RealTime
     from ufmstar_torch.eval.report.text import realtime_table
+    from ufmstar_torch.eval.run.files import write_json_atomic
+    from ufmstar_torch.eval.run.folder import FolderKind, output_folder
+    from ufmstar_torch.eval.run.machine import share_threads
+    from ufmstar_torch.eval.run.rerun_log import RerunLog, open_viewer
+    from ufmstar_torch.eval.run.writers import is_frame
+    from ufmstar_torch.live import LiveDepth, LiveResult
 
     if options.threads is None:
         share_threads()
@@ -129,12 +137,12 @@ def main(options: LiveOptions) -> int:
         with usage_errors(ImportError, OSError, ValueError):
             if options.out is not None:
                 kind.earlier(options.out, resume=False, overwrite=options.overwrite)
-            K = None if (intrinsics := options.opening.intrinsics) is None else read_intrinsics(intrinsics)
+            K = None if (intrinsics := options.opening.of_reader.intrinsics) is None else read_intrinsics(intrinsics)
             events = _events(options, K)
             model = _model(options)
             view = RerunLog(open_viewer()[0]) if options.view else None
             times, shown = RealTime(model), list[Callable[[LiveResult], None]]()
-            how: dict[str, Any] = {"max_wait": options.max_wait, "max_gap": options.opening.max_pose_gap}
+            how: dict[str, Any] = {"max_wait": options.max_wait, "max_gap": options.opening.of_reader.max_pose_gap}
             how |= {"state": options.state, "save_every": options.save_every}
             # Reads and locks the state, before --out is replaced.
             live = stack.enter_context(LiveDepth(model, lambda result: shown[0](result), K, **how))
@@ -197,6 +205,11 @@ def _run(options: LiveOptions, live: LiveDepth, events: Iterator[LiveEvent]) -> 
 
 def _events(options: LiveOptions, K: NDArray[np.float64] | None) -> Iterator[LiveEvent]:
     """The source's images and poses; errors as ``open_sequence``. ``K``: intrinsics of the option."""
+    from ufmstar_torch.eval.check.image_fit import image_fit, track_corners
+    from ufmstar_torch.eval.sequences import live as sources
+    from ufmstar_torch.eval.sequences.open import open_sequence
+    from ufmstar_torch.frames.warnings import LOGGER
+
     opening = options.opening
     if options.recorded:
         sequence = open_sequence(options.source, **opening.changed())
@@ -216,6 +229,11 @@ def _events(options: LiveOptions, K: NDArray[np.float64] | None) -> Iterator[Liv
 
 def _model(options: LiveOptions) -> UncertainDepth:
     """The networks with UfM*, warmed up; errors as ``NetworkChoice.load``."""
+    from ufmstar_torch.anchors.sources import DENSE
+    from ufmstar_torch.eval.engine.anchors import landmarks_of
+    from ufmstar_torch.eval.engine.warm_up import warm_up_command
+    from ufmstar_torch.uncertain_depth import UncertainDepth
+
     chosen, source = options.network, options.network.load(options)
     config, anchors = options.uncertainty.config(), options.uncertainty.anchors
     model = UncertainDepth(
@@ -236,10 +254,14 @@ def _model(options: LiveOptions) -> UncertainDepth:
 
 def _write(out: Path, result: LiveResult) -> None:
     """Write the maps of an image to OUT/STAMP.npz."""
+    import numpy as np
+
+    from ufmstar_torch.eval.run.files import write_atomic
+
     of = result.out
     maps = {"depth": of.depth, "variance": of.variance, "disagreement": of.disagreement}
-    if of.ufm.posterior_depth is not None:
-        maps |= {"network_depth": of.prediction.depth, "ufm_variance": of.ufm.variance}
+    if of.posterior_outlier is not None:
+        maps |= {"network_depth": of.network_depth, "ufm_variance": of.ufm_variance}
     arrays = {name: value[0].cpu().numpy() for name, value in maps.items()}
     camera = {"T_world_cam": result.T_world_cam, "intrinsics": result.out.intrinsics[0].cpu().numpy()}
     write_atomic(out / f"{result.stamp:.6f}.npz", lambda file: np.savez(file, allow_pickle=False, **arrays, **camera))
@@ -247,7 +269,12 @@ def _write(out: Path, result: LiveResult) -> None:
 
 def _shown(result: LiveResult, number: int, figures: dict[str, float]) -> RunFrame:
     """The result in the viewer's form."""
-    out, valid = result.out, result.out.ufm.valid[0]
+    import numpy as np
+    import torch
+
+    from ufmstar_torch.eval.run.export import RunFrame
+
+    out, valid = result.out, result.out.valid[0]
     depth, sigma = (torch.where(valid, values[0], torch.nan).cpu().float().numpy() for values in (out.depth, out.std))
     about = (f"{result.stamp:.6f}", number, result.stamp, result.T_world_cam)
     K = out.intrinsics[0].cpu().double().numpy()
@@ -262,7 +289,7 @@ def _figures(result: LiveResult, live: LiveDepth) -> dict[str, float]:
         "latency_ms": round(1000 * result.latency, 2),
         "depth_m": round(float(depth.nanmedian()), 3),
         "sigma_m": round(float(std.nanmedian()), 3),
-        "components": int(result.out.ufm.statistics.components[0]),
+        "components": int(result.out.statistics.components[0]),
         "dropped": sum(counts.dropped.values()),
         "skipped": sum(counts.skipped.values()),
     }

@@ -6,29 +6,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
-
-from ufmstar_torch.eval.commands.options import positional, reader, usage_errors
+from ufmstar_torch.eval.commands.options import Count, Flag, Number, Positional, Text, Texts, reader, usage_errors
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-from ufmstar_torch.eval.engine.progress import Progress
-from ufmstar_torch.eval.reconstruct.keyframes import write_keyframes
-from ufmstar_torch.eval.reconstruct.reconstruct import (
-    POSES,
-    gaps,
-    landmarks,
-    reconstruct,
-    require_pycolmap,
-    scale_model,
-)  # fmt: skip
-from ufmstar_torch.eval.run.files import write_atomic, write_bytes_atomic, write_json_atomic
-from ufmstar_torch.eval.run.folder import FolderError, output_folder
-from ufmstar_torch.eval.run.machine import available_cores
 from ufmstar_torch.eval.sequences.frame import parse_slice
-from ufmstar_torch.eval.sequences.generic import INTRINSICS, open_images
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics, read_intrinsics
-from ufmstar_torch.eval.sequences.lens import Lens, parse_distortion
 from ufmstar_torch.eval.sequences.options import Options, resolve
-from ufmstar_torch.eval.sequences.poses import read_trajectory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,40 +21,40 @@ class PosesOptions:
     result with --pose-scale or --scale-from network only.
 
     Attributes:
-        source: video file, or folder of images in the order of their names
-        out: folder for the result, which `ufmstar run` reads; anchors are in OUT/landmarks.npz
-        intrinsics: of the images, kept as they are: a file, or fx fy cx cy [px]; default: K.txt in the folder, or else
-            estimated
-        distortion: of the images' lens, undone in OUT/images: k1 k2 p1 p2 [k3 [k4 k5 k6]], or fisheye k1 k2 k3 k4
-        length: A B METRES, two places and their distance; a place is NAME, where the camera was at that image, or
-            NAME:U,V, what a pixel of OUT/images/NAME.jpg shows
-        trajectory: file with metric positions of the camera (SLAM's, VIO's, GPS's) in TUM or KITTI format
-        images: folder of images or video within the source
-        fps: frames per second of images without timestamps
-        time_offset: added to the images' times [s]
-        max_pose_gap: positions are interpolated between samples at most this far apart [s]
-        frames: START:STOP:STEP, which images, counted from 0 as Python does
-        overwrite: replace the reconstruction in --out
-        threads: number of CPU threads; default: all cores
+        source: A video file, or a folder of images in the order of their names.
+        out: Write the result, which `ufmstar run` reads, to this folder; anchors are in OUT/landmarks.npz.
+        intrinsics: The camera of the images is in this file, or is fx fy cx cy [px], and is not refined (default:
+            K.txt in the folder, or else it is estimated).
+        distortion: Undo this lens distortion in OUT/images: k1 k2 p1 p2 [k3 [k4 k5 k6]], or fisheye k1 k2 k3 k4.
+        length: The distance of two places is A B METRES; a place is NAME, where the camera was at that image, or
+            NAME:U,V, what a pixel of OUT/images/NAME.jpg shows.
+        trajectory: Take the scale from metric positions of the camera (SLAM's, VIO's, GPS's), in TUM or KITTI format.
+        images: The images are in this folder or video within the source.
+        fps: Images without timestamps come at this rate [1/s].
+        time_offset: Add this to the times of the images [s].
+        max_pose_gap: Interpolate positions between samples at most this far apart [s].
+        frames: Take these images, START:STOP:STEP, counted from 0 as Python does.
+        overwrite: Replace the reconstruction in --out.
+        threads: Use this many CPU threads (default: all cores).
     """
 
     USAGE: ClassVar[str] = (
         "ufmstar poses VIDEO|FOLDER --out DIR [--intrinsics FILE] [--length A B METRES | --trajectory FILE] [options]"
     )
 
-    source: str = positional()
+    source: Positional[str]
     out: Path
-    intrinsics: tuple[str, ...] = ()
-    distortion: tuple[str, ...] = ()
-    length: tuple[str, ...] = ()
-    trajectory: str | None = None
-    images: str | None = None
-    fps: float | None = None
+    intrinsics: Texts = ()
+    distortion: Texts = ()
+    length: Texts = ()
+    trajectory: Text = None
+    images: Text = None
+    fps: Number = None
     time_offset: float = 0.0
     max_pose_gap: float = 0.1
-    frames: str | None = None
-    overwrite: bool = False
-    threads: int | None = None
+    frames: Text = None
+    overwrite: Flag = False
+    threads: Count = None
 
     def __post_init__(self) -> None:
         parse_intrinsics(self.intrinsics, "--intrinsics")
@@ -104,6 +86,9 @@ read = reader(PosesOptions, "ufmstar poses")
 
 def main(options: PosesOptions) -> int:
     """Reconstruct, write the folder, and print the result. Returns the exit code."""
+    from ufmstar_torch.eval.reconstruct.reconstruct import POSES, require_pycolmap
+    from ufmstar_torch.eval.run.folder import FolderError, output_folder
+
     require_pycolmap()
     with usage_errors(FolderError, FileNotFoundError, ValueError):
         images, size = _images(options)
@@ -115,6 +100,8 @@ def main(options: PosesOptions) -> int:
 
 def _images(options: PosesOptions) -> tuple[list[Any], tuple[int, int]]:
     """The entries of the images with their times, and their (H, W). Raises ValueError: there are no images."""
+    from ufmstar_torch.eval.sequences.generic import open_images
+
     path = Path(options.source)
     if not path.exists():
         raise FileNotFoundError(f"no such file or folder: {path}")
@@ -134,6 +121,15 @@ def _plain(name: str) -> str:
 
 
 def _reconstruct(options: PosesOptions, images: list[Any], size: tuple[int, int]) -> dict[str, Any]:
+    import numpy as np
+
+    from ufmstar_torch.eval.engine.progress import Progress
+    from ufmstar_torch.eval.reconstruct.keyframes import write_keyframes
+    from ufmstar_torch.eval.reconstruct.reconstruct import POSES, gaps, landmarks, reconstruct, scale_model
+    from ufmstar_torch.eval.run.files import write_atomic, write_bytes_atomic, write_json_atomic
+    from ufmstar_torch.eval.run.machine import available_cores
+    from ufmstar_torch.eval.sequences.poses import read_trajectory
+
     root = Path(options.source) if Path(options.source).is_dir() else Path(options.source).parent
     lens = _lens(options, root, size)
     if lens is not None:  # COLMAP's mapper fails on some lenses; `run` need not undistort again
@@ -180,6 +176,9 @@ def _reconstruct(options: PosesOptions, images: list[Any], size: tuple[int, int]
 
 def _lens(options: PosesOptions, root: Path, size: tuple[int, int]) -> Any:
     """The camera; None = estimate it. Raises ValueError: the intrinsics do not fit the images."""
+    from ufmstar_torch.eval.sequences.generic import INTRINSICS
+    from ufmstar_torch.eval.sequences.lens import Lens, parse_distortion
+
     source = parse_intrinsics(options.intrinsics, "--intrinsics")
     if source is None:
         source = next((str(root / name) for name in INTRINSICS if (root / name).is_file()), None)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.depth import OWN_DEPTH
-from ufmstar_torch.eval.commands.options import option, positional, reader, usage_errors
+from ufmstar_torch.eval.commands.options import Count, Flag, Positional, Texts, reader, require_least, usage_errors
 from ufmstar_torch.eval.commands.run import StreamOptions, job_from
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-from ufmstar_torch.eval.engine.progress import ProgressSink
-from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
+from ufmstar_torch.eval.engine.progress import frame_progress
+from ufmstar_torch.eval.engine.stream import Stopped, frame_results
 from ufmstar_torch.eval.run.depth_check import DepthCheck
 from ufmstar_torch.eval.run.files import write_bytes_atomic, write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
@@ -21,7 +22,6 @@ from ufmstar_torch.eval.run.panels import contact_sheet
 from ufmstar_torch.eval.run.pictures import SHEET
 from ufmstar_torch.eval.run.rank import ImageScores, require_part
 from ufmstar_torch.eval.run.run import warm_up_job
-from ufmstar_torch.eval.run.run_folder import Checkpoint
 from ufmstar_torch.frames.warnings import LOGGER
 
 SCORES, SETTINGS = "scores.csv", "rank.json"
@@ -33,30 +33,33 @@ class RankOptions(StreamOptions):
     """Rank the images of sequences by their uncertainty: the most uncertain ones are to be labelled first.
 
     Writes scores.csv, a line per image, and a contact sheet of the least and the most certain images. Each sequence
-    starts with an empty state. M is the frame's alone, at measured pixels (--ufm.ema_alpha 1, --ufm.unmeasured nan).
+    starts with an empty state. M is the frame's alone, at measured pixels (--set ema_alpha=1, unmeasured=nan).
 
     Attributes:
-        sequences: folders of sequences, video files, or tour:SEED, as for `ufmstar run`
-        out: folder for everything that is written
-        by: rank by the mean of V, M, A, E or B (docs/active_learning.md)
-        diverse: rank only one of several images that show the same place from nearly the same side
-        count: number of images to rank; default: all
-        measured: smallest share of pixels seen from two places; images below it get no rank by total or disagreement
-        overwrite: replace the ranking in --out
+        sequences: Folders of sequences, video files, or tour:SEED, as for `ufmstar run`.
+        out: Write everything to this folder.
+        by: Rank by the mean of V, M, A, E or B (docs/active_learning.md).
+        diverse: Rank only one of several images that show the same place from nearly the same side.
+        count: Rank this many images (default: all).
+        measured: Rank by total or disagreement only images measured at this share of their pixels.
+        overwrite: Replace the ranking in --out.
     """
 
     USAGE: ClassVar[str] = "ufmstar rank SEQUENCE... (--model NAME --weights FILE... | --depth DIR) --out OUT [options]"
 
-    sequences: tuple[str, ...] = positional()
+    sequences: Positional[Texts]
     out: str
-    by: str = option("total", choices=("total", "disagreement", "aleatoric", "epistemic", "anchored"))
-    diverse: bool = False
-    count: int | None = option(None, least=1)
+    by: Literal["total", "disagreement", "aleatoric", "epistemic", "anchored"] = "total"
+    diverse: Flag = False
+    count: Count = None
     measured: float = 0.5
-    overwrite: bool = False
+    overwrite: Flag = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        require_least(self, count=1)
+        if not self.sequences:
+            raise ValueError("a SEQUENCE is missing; ufmstar rank --help")
         if not 0 <= self.measured <= 1:
             raise ValueError(f"--measured must be a share from 0 to 1, got {self.measured}")
         if self.maps.depth not in (None, *OWN_DEPTH) and len(self.sequences) > 1:
@@ -75,6 +78,7 @@ read = reader(RankOptions, "ufmstar rank")
 
 def main(options: RankOptions) -> int:
     """Score the sequences, and write table and pictures; the exit code."""
+
     if options.threads is None:
         share_threads()
     kind = FolderKind("ufmstar rank", "ranking", SETTINGS, (SCORES, SHEET))
@@ -87,6 +91,8 @@ def main(options: RankOptions) -> int:
 
 def _scores(options: RankOptions) -> ImageScores:
     """Stream the sequences."""
+    from ufmstar_torch.eval.run.rank import ImageScores
+
     scores, source = ImageScores(options.by, options.measured), None
     with Bars() as bars, stop_signals(bars.say) as stop:
         for path in options.sequences:
@@ -99,9 +105,13 @@ def _scores(options: RankOptions) -> ImageScores:
             source, scores.sequence = job.source, path
             if job.image_fit is not None and job.image_fit.problem:
                 LOGGER.warning("%s: %s", path, job.image_fit.problem)
-            stream, check = FrameStream(job.sequence, job.indices, [job.row(Checkpoint())]), DepthCheck(job)
+            check, shown = DepthCheck(job), frame_progress(bars.show, len(job.indices))
             try:
-                stream.drive([scores, check, ProgressSink(bars.show)], stop=stop)
+                with closing(frame_results(job.sequence, job.indices, [job.row()[0]], stop=stop)) as results:
+                    for result in results:
+                        scores.add(result)
+                        check.add(result)
+                        shown(result)
             except Stopped:
                 raise KeyboardInterrupt from None
             if (fit := check.fit()) is not None and fit.problem:

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from numpy.typing import NDArray
-
-from ufmstar_torch.eval.commands.options import option, positional, reader, usage_errors
-from ufmstar_torch.eval.engine.estimators import ufm_star_config
-from ufmstar_torch.eval.engine.judge import CONFIDENCE, METRICS
+from ufmstar_torch.eval.commands.options import Positional, reader, usage_errors
 from ufmstar_torch.eval.methods.method import UFM_STAR
-from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.report.data import Results, load_results
-from ufmstar_torch.posterior.recalibrate import Recalibration
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from ufmstar_torch.eval.methods.row import Row
+    from ufmstar_torch.eval.report.data import Results
+    from ufmstar_torch.posterior.recalibrate import Recalibration
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,16 +27,16 @@ class RecalibrateOptions:
     are of each sequence under the map that was fitted to the others.
 
     Attributes:
-        out: folder of `ufmstar eval`
-        row: the row, as the table names it: UfM*-DepthOnly, say
-        to: file of the map; WEIGHTS.recalibration.json beside the weights is used without being named
-        covariate: input of the map: the variance, or the network's confidence, from which it gives a factor of it
+        out: The folder of `ufmstar eval`.
+        row: Fit to this row, as the table names it: UfM*-DepthOnly, say.
+        to: Write the map to this file; `ufmstar run` finds WEIGHTS.recalibration.json beside the weights.
+        covariate: Map the variance, or the network's confidence to a factor of the variance.
     """
 
-    out: Path = positional()
+    out: Positional[Path]
     row: str
     to: Path
-    covariate: str = option("variance", choices=("variance", CONFIDENCE))
+    covariate: Literal["variance", "confidence"] = "variance"
 
 
 read = reader(RecalibrateOptions, "ufmstar recalibrate")
@@ -44,6 +44,7 @@ read = reader(RecalibrateOptions, "ufmstar recalibrate")
 
 def main(options: RecalibrateOptions) -> int:
     """Fit, write the file, and print the figures on held-out sequences. Returns the exit code."""
+    from ufmstar_torch.eval.report.data import load_results
     from ufmstar_torch.eval.report.text import aligned
 
     with usage_errors(ValueError):
@@ -64,6 +65,7 @@ def main(options: RecalibrateOptions) -> int:
 
 
 def _fit(counts: Sequence[NDArray[Any]], covariate: str) -> Recalibration:
+    from ufmstar_torch.eval.engine.judge import CONFIDENCE
     from ufmstar_torch.eval.metrics.recalibration import fit, fit_confidence
 
     return fit_confidence(counts) if covariate == CONFIDENCE else fit(counts)
@@ -72,6 +74,8 @@ def _fit(counts: Sequence[NDArray[Any]], covariate: str) -> Recalibration:
 def _counts(results: Results, row: Row, covariate: str) -> dict[str, NDArray[Any]]:
     """By "DATASET/SEQUENCE", the histogram [V, e] of pixels over variance and squared error; for the covariate
     confidence, samples [n, 3]. Raises ValueError: the network states no confidence."""
+    from ufmstar_torch.eval.engine.judge import CONFIDENCE, METRICS
+
     counts = {}
     for record in results.of(row):
         sums = record.sums()
@@ -84,6 +88,7 @@ def _counts(results: Results, row: Row, covariate: str) -> dict[str, NDArray[Any
 
 def _table(counts: Mapping[str, NDArray[Any]], covariate: str) -> list[list[str]]:
     """Figures of every sequence without a map, and with the map fitted to the other sequences."""
+    from ufmstar_torch.eval.engine.judge import CONFIDENCE
     from ufmstar_torch.eval.metrics.recalibration import figures, figures_of_samples
     from ufmstar_torch.eval.report.text import number
 
@@ -99,6 +104,8 @@ def _table(counts: Mapping[str, NDArray[Any]], covariate: str) -> list[list[str]
 
 def _about(fitted: Recalibration, results: Results, row: Row) -> Recalibration:
     """The map with the row, settings, network and sequences of its fit."""
+    from ufmstar_torch.eval.engine.estimators import ufm_star_config
+
     records = results.of(row)
     network: Mapping[str, object] = results.about["networks"][row.method.base]
     files = network.get("files")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from ufmstar_torch.eval.commands.options import positional, reader, usage_errors
+from ufmstar_torch.eval.commands.options import Flag, Positional, reader, usage_errors
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,12 +16,12 @@ class ReportOptions:
     `ufmstar eval` has left in a folder, finished or not, and prints the main table.
 
     Attributes:
-        out: folder of `ufmstar eval`
-        no_figures: tables and results alone (needs no matplotlib)
+        out: The folder of `ufmstar eval`.
+        no_figures: Make tables and results alone, which needs no matplotlib.
     """
 
-    out: Path = positional()
-    no_figures: bool = False
+    out: Positional[Path]
+    no_figures: Flag = False
 
 
 read = reader(ReportOptions, "ufmstar report")

@@ -5,28 +5,19 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
-import torch
-
-from ufmstar_torch.anchors.landmarks import LandmarkSource
-from ufmstar_torch.anchors.sources import DENSE
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.depth import SECTIONS, MapOptions, NetworkOptions, PosteriorOptions, UfMOptions
-from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, positional, reader, usage_errors
+from ufmstar_torch.eval.commands.opening import OpeningOptions
+from ufmstar_torch.eval.commands.options import Flag, MachineOptions, Positional, Text, as_dict, reader, usage_errors
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-from ufmstar_torch.eval.engine.anchors import landmarks_of, sensor_of
-from ufmstar_torch.eval.engine.predictions import DepthSource
-from ufmstar_torch.eval.run.folder import FolderError
-from ufmstar_torch.eval.run.job import RunJob
-from ufmstar_torch.eval.run.machine import share_threads
-from ufmstar_torch.eval.run.run import run
-from ufmstar_torch.eval.run.scale import network_scale, require_metric
-from ufmstar_torch.eval.run.summary import FINISHED, INTERRUPTED
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_slice
-from ufmstar_torch.eval.sequences.open import open_sequence, scale_poses
-from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.frames.warnings import LOGGER
+
+if TYPE_CHECKING:
+    from ufmstar_torch.anchors.landmarks import LandmarkSource
+    from ufmstar_torch.eval.engine.predictions import DepthSource
+    from ufmstar_torch.eval.run.job import RunJob
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,12 +25,12 @@ class StreamOptions(MachineOptions):
     """Depth and UfM* on recordings.
 
     Attributes:
-        frames: START:STOP:STEP, which frames of a sequence, counted from 0 as Python does
-        threads: number of CPU threads of network and step; default: all cores but one, which reads and writes
+        frames: Take the frames START:STOP:STEP, counted from 0 as Python does.
+        threads: Network and step use this many CPU threads (default: all cores but one).
     """
 
-    frames: str | None = None
-    opening: Options
+    frames: Text = None
+    opening: OpeningOptions
     network: NetworkOptions
     maps: MapOptions
     uncertainty: UfMOptions
@@ -59,9 +50,10 @@ class StreamOptions(MachineOptions):
 
     def settings(self) -> dict[str, Any]:
         """Return the options that define the result, as plain values of a configuration file."""
-        plain = {name: value for name, value in as_dict(self).items() if name not in ("resume", "overwrite")}
+        left_out = ("overwrite", "sequence", "sequences")
+        plain = {name: value for name, value in as_dict(self).items() if name not in left_out}
         ufm = {name: value for name, value in self.config.to_dict().items() if value or name not in SECTIONS}
-        return plain | {"ufm": ufm}
+        return plain | {"set": ufm}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,28 +65,21 @@ class RunOptions(StreamOptions):
     or from the sequence itself (--depth self).
 
     Attributes:
-        sequence: folder of the sequence, or a video file, or tour:SEED for rendered rooms
-        out: folder for everything that is written
-        resume: continue the run in --out
-        overwrite: replace the run in --out
-        no_video: leave preview.mp4 out
-        no_sheet: leave contact_sheet.png out
+        sequence: The folder of the sequence, or a video file, or tour:SEED for rendered rooms.
+        out: Write everything to this folder.
+        overwrite: Replace another run in --out; the predictions in its cache are kept.
+        no_video: Leave preview.mp4 out.
+        no_sheet: Leave contact_sheet.png out.
     """
 
     USAGE: ClassVar[str] = "ufmstar run SEQUENCE (--model NAME --weights FILE... | --depth DIR) --out OUT [options]"
 
-    sequence: str = positional()
+    sequence: Positional[str]
     out: str
-    resume: bool = False
-    overwrite: bool = False
-    no_video: bool = False
-    no_sheet: bool = False
+    overwrite: Flag = False
+    no_video: Flag = False
+    no_sheet: Flag = False
     uncertainty: PosteriorOptions
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.resume and self.overwrite:
-            raise ValueError("--resume and --overwrite contradict each other")
 
 
 read = reader(RunOptions, "ufmstar run")
@@ -103,13 +88,17 @@ Stream = TypeVar("Stream", bound=StreamOptions)
 
 def main(options: RunOptions) -> int:
     """Run, and print the results' table; the exit code."""
+    from ufmstar_torch.eval.engine.predictions import CacheError
+    from ufmstar_torch.eval.run.folder import FolderError
+    from ufmstar_torch.eval.run.machine import share_threads
+    from ufmstar_torch.eval.run.run import run
+
     if options.threads is None:
         share_threads()
     with usage_errors(ImportError, OSError, ValueError):
         job = replace(job_from(options, options.sequence), video=not options.no_video, sheet=not options.no_sheet)
-    how = {"resume": options.resume, "overwrite": options.overwrite}
-    with usage_errors(FolderError), Bars() as bars, stop_signals(bars.say) as stop:
-        summary = run(job, options.out, **how, progress=bars.show, stop=stop)
+    with usage_errors(CacheError, FolderError), Bars() as bars, stop_signals(bars.say) as stop:
+        summary = run(job, options.out, overwrite=options.overwrite, progress=bars.show, stop=stop)
     return _report(summary, options.out)
 
 
@@ -121,6 +110,14 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
         FileNotFoundError, NotADirectoryError: no such file or folder.
         ModuleNotFoundError: an optional package is missing.
     """
+    import torch
+
+    from ufmstar_torch.anchors.sources import DENSE
+    from ufmstar_torch.eval.engine.anchors import sensor_of
+    from ufmstar_torch.eval.run.job import RunJob
+    from ufmstar_torch.eval.run.scale import network_scale, require_metric
+    from ufmstar_torch.eval.sequences.open import open_sequence, scale_poses
+
     sequence = open_sequence(path, **options.opening.changed())
     options = _without_images(options, sequence)
     ufm = options.uncertainty
@@ -141,7 +138,7 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
         raise ValueError("--anchors sensor goes with the depth of a network: with --depth self, nothing is to correct")
     scale = None
     if ufm.scale_from is not None:
-        scale = network_scale(sequence, source, indices, options.opening.model_index)
+        scale = network_scale(sequence, source, indices, options.opening.of_reader.model_index)
         sequence = scale_poses(sequence, scale.metres)
     return RunJob(
         sequence=sequence,
@@ -160,6 +157,8 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
 
 def _without_images(options: Stream, sequence: FrameSequence) -> Stream:
     """The options, plain if the default anchors are searched in images that the sequence lacks."""
+    from ufmstar_torch.frames.warnings import LOGGER
+
     ufm = options.uncertainty
     if not isinstance(ufm, PosteriorOptions) or ufm.plain or ufm.anchors is not None or _has_images(sequence):
         return options
@@ -175,6 +174,9 @@ def _has_images(sequence: FrameSequence) -> bool:
 def _landmarks(value: str, sequence: FrameSequence) -> str | LandmarkSource:
     """The source of anchors of ``--anchors``. Raises ValueError: the images to search are missing; others as
     ``landmarks_of``."""
+    from ufmstar_torch.anchors.sources import DENSE
+    from ufmstar_torch.eval.engine.anchors import landmarks_of, sensor_of
+
     if sensor_of(value, sequence) is not None:
         return DENSE
     source = landmarks_of(value, sequence.folder, sequence.pose_scale)
@@ -188,6 +190,7 @@ def _landmarks(value: str, sequence: FrameSequence) -> str | LandmarkSource:
 def _report(summary: Mapping[str, Any], out: str) -> int:
     """Print the table and where the outputs are; the exit code."""
     from ufmstar_torch.eval.report.text import run_table
+    from ufmstar_torch.eval.run.summary import FINISHED, INTERRUPTED
 
     if summary["frames"]["done"]:
         print(run_table(summary))

@@ -6,9 +6,10 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ufmstar_torch.eval.engine.progress import Progress
+if TYPE_CHECKING:
+    from ufmstar_torch.eval.engine.progress import Progress
 
 
 class Bars:
@@ -41,7 +42,7 @@ class Bars:
         bar.total = progress.total
         if progress.components is not None:
             skipped = {"skipped": progress.skipped} if progress.skipped else {}
-            bar.set_postfix(K=progress.components, refresh=False, **skipped)
+            bar.set_postfix(components=progress.components, refresh=False, **skipped)
         bar.update(progress.done - bar.n)
         if bar.disable and progress.done == progress.total:
             self.say(f"{stage}: done, {progress.total} of {progress.total}")

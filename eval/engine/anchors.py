@@ -4,7 +4,7 @@ truth as the upper bound.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -12,7 +12,6 @@ from time import perf_counter
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.landmarks import Landmarks, LandmarkSource
@@ -67,14 +66,10 @@ class Tracks:
         """Remove the last frame, which UfM* skipped."""
         self._streams.undo()
 
-    def state(self) -> dict[str, Tensor]:
-        """All tensors on which the next frame's landmarks depend."""
-        return self._streams.state()
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue from ``state``. Raises ValueError: it belongs to another source."""
-        self._streams.load_state(state)
-        self._last = None
+    @property
+    def bytes(self) -> int:
+        """Size of the state."""
+        return sum(value.nbytes for value in self._streams.state().values())
 
 
 class AnchorSource:

@@ -1,45 +1,33 @@
-"""Estimators of a row's variance: the network alone, UfM, and UfM*."""
+"""Estimators of a row's variance: the network alone, UfM, UfM*, and a share of the depth."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import MISSING, fields, replace
 from types import MappingProxyType
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.predictions import DepthSource
-from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
+from ufmstar_torch.eval.methods.method import ALONE, RELATIVE, RHO, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import configured
 from ufmstar_torch.eval.methods.ufm import UfM
+from ufmstar_torch.frames.output import FrameStatistics, UncertaintyOutput
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.posterior.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar
 from ufmstar_torch.uncertain_depth import maps_of
 
-# Maps [1, h, w] on the estimator's device, by their names in ``RowResult``; UfM* adds "statistics".
-Answer = dict[str, Any]
-_OF_OUTPUT = (
-    "depth", "variance", "valid", "aleatoric", "epistemic", "disagreement", "measured", "anchored", "bias",
-    "posterior_depth", "posterior_variance", "posterior_inlier_variance", "posterior_outlier", "statistics",
-)  # fmt: skip
-
 
 class Estimator(ABC):
-    """Computes variances from the predictions of a sequence, frame by frame.
-
-    Attributes:
-        module: its buffers are the state; without buffers by default.
-    """
-
-    module: nn.Module = nn.Identity()
+    """Computes variances from the predictions of a sequence, frame by frame."""
 
     def __init__(self, *, uses_variances: bool = True) -> None:
         self._uses_variances = uses_variances
@@ -50,9 +38,15 @@ class Estimator(ABC):
             return prediction
         return replace(prediction, aleatoric_variance=None, epistemic_variance=None)
 
+    def states_variance(self, prediction: DepthPrediction) -> bool:
+        """False if the variance is NaN because the method states none for such a prediction."""
+        return True
+
     @abstractmethod
-    def update(self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
-        """Process the next frame: "depth", "variance", "valid" and others of ``RowResult``.
+    def update(
+        self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None
+    ) -> UncertaintyOutput:
+        """Process the next frame.
 
         Args:
             prediction: maps [1, h, w] on the estimator's device, with intrinsics.
@@ -64,14 +58,6 @@ class Estimator(ABC):
         """Size of the state: "bytes", "count" of points or components, "smoothing_bytes" of the smoothing map [B]; with
         anchors also "anchors", the number used in the frame. {} without a state."""
         return {}
-
-    def state(self) -> dict[str, Tensor]:
-        """All tensors on which the next frame depends."""
-        return dict(self.module.state_dict())
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue from ``state``. Raises RuntimeError: it belongs to another kind of estimator."""
-        self.module.load_state_dict(dict(state))
 
 
 def make_estimator(
@@ -93,13 +79,15 @@ def make_estimator(
         return Alone(uses_variances=uses)
     if method.fusion == UFM:
         return Pointwise(method.max_points, uses_variances=uses)
+    if method.fusion == RELATIVE:
+        return Relative(uses_variances=False)
     if method.fusion != UFM_STAR:
         estimator: Estimator = plugins[method.fusion](row, device)
         return estimator
     recalibration = Recalibration.from_json(setting.recalibration) if setting.recalibration else None
     config = ufm_star_config(row)
     config = config if source is None else config.within(source.max_depth, source.states_confidence)
-    return Gaussians(config, device, posterior=setting.posterior, uses_variances=uses, recalibration=recalibration)
+    return Gaussians(config, device, uses_variances=uses, recalibration=recalibration)
 
 
 def ufm_star_config(row: Row) -> UfMStarConfig:
@@ -113,17 +101,43 @@ def ufm_star_config(row: Row) -> UfMStarConfig:
     return config.replace(segment=replace(config.segment, scale_with_image=False)) if row.method.fixed_param else config
 
 
+def output_of(depth: Tensor, variance: Tensor | None, valid: Tensor, **maps: Tensor | None) -> UncertaintyOutput:
+    """The output of a method other than UfM*, from maps [1, h, w]: NaN where not valid; all counts but that of the
+    valid pixels are 0. ``variance``: None = the method states none."""
+    variance = torch.full_like(depth, torch.nan) if variance is None else variance
+    none = torch.zeros(len(depth), dtype=torch.int64)
+    counts = {f.name: none for f in fields(FrameStatistics) if f.default is MISSING}
+    statistics = FrameStatistics(**{**counts, "valid_pixels": valid.sum((1, 2)).cpu()})
+    named = {name: value for name, value in maps.items() if value is not None}
+    return UncertaintyOutput(depth, torch.where(valid, variance, torch.nan), valid, named, statistics)
+
+
 class Alone(Estimator):
     """The network's variance, A + E as far as it predicts them; none without ``uses_variances``."""
 
-    def update(self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
+    def states_variance(self, prediction: DepthPrediction) -> bool:
+        """See :class:`Estimator`."""
+        return self.used(prediction).variance is not None
+
+    def update(
+        self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None
+    ) -> UncertaintyOutput:
         used = self.used(prediction)
-        a, e, variance = used.aleatoric_variance, used.epistemic_variance, used.variance
+        a, e = used.aleatoric_variance, used.epistemic_variance
         valid = (used.depth > 0) & used.depth.isfinite()
         for part in (a, e):
             valid = valid if part is None else valid & part.isfinite() & (part >= 0)
-        variance = None if variance is None else torch.where(valid, variance, torch.nan)
-        return {"depth": used.depth, "variance": variance, "valid": valid, "aleatoric": a, "epistemic": e}
+        return output_of(used.depth, used.variance, valid, aleatoric=a, epistemic=e)
+
+
+class Relative(Estimator):
+    """The baseline V = (RHO d)^2, which compares no views."""
+
+    def update(
+        self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None
+    ) -> UncertaintyOutput:
+        depth = prediction.depth
+        return output_of(depth, (RHO * depth) ** 2, (depth > 0) & depth.isfinite())
 
 
 class Pointwise(Estimator):
@@ -133,15 +147,13 @@ class Pointwise(Estimator):
         super().__init__(uses_variances=uses_variances)
         self.ufm = UfM(max_points)
 
-    def update(self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
+    def update(
+        self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None
+    ) -> UncertaintyOutput:
         used = self.used(prediction)
         a, e = used.aleatoric_variance, used.epistemic_variance
         out = self.ufm(used.depth, T_world_cam, prediction.K, a, e)
-        return {"depth": used.depth, "variance": out.variance, "valid": out.valid, "aleatoric": a, "epistemic": e}
-
-    def state(self) -> dict[str, Tensor]:
-        """Raises TypeError: the state of UfM cannot be saved."""
-        raise TypeError("a row of UfM cannot be continued within a sequence: only UfM* has a state that can be saved")
+        return output_of(used.depth, out.variance, out.valid, aleatoric=a, epistemic=e)
 
     def memory(self) -> dict[str, float]:
         """Bytes and number of the points."""
@@ -151,32 +163,28 @@ class Pointwise(Estimator):
 
 
 class Gaussians(Estimator):
-    """UfM*; with ``posterior``, depth and variance are the posterior's."""
+    """UfM*, with the posterior that its configuration has."""
 
     def __init__(
         self,
         config: UfMStarConfig,
         device: torch.device,
         *,
-        posterior: bool = False,
         uses_variances: bool = True,
         recalibration: Recalibration | None = None,
     ) -> None:
         super().__init__(uses_variances=uses_variances)
-        extensions = () if recalibration is None else (recalibration,)
-        self.module = self.ufm = UfMStar(config, extensions=extensions, device=device)
-        self._posterior, self._anchors = posterior, 0
+        self.ufm = UfMStar(config, recalibration=recalibration, device=device)
+        self._anchors = 0
 
-    def update(self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
-        used = self.used(prediction)
-        out = self.ufm(pose=T_world_cam, intrinsics=prediction.K, anchors=anchors, **maps_of(used, self.ufm))
-        anchors_used = out.statistics.anchors_used
-        self._anchors = 0 if anchors_used is None else int(anchors_used[0])
-        answer = {name: getattr(out, name) for name in _OF_OUTPUT} | {"confidence": used.confidence}
-        answer["distribution"] = out.distribution() if out.has_intervals else None
-        if self._posterior:
-            answer["depth"], answer["variance"] = out.posterior()
-        return answer
+    def update(
+        self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None
+    ) -> UncertaintyOutput:
+        maps = maps_of(self.used(prediction), self.ufm)
+        out = self.ufm(pose=T_world_cam, intrinsics=prediction.K, anchors=anchors, **maps)
+        used = out.statistics.anchors_used
+        self._anchors = 0 if used is None else int(used[0])
+        return out
 
     def mixture_world(self) -> GaussianMixture:
         """[1, K] M_i in the world's frame, float64; after a frame."""

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 
 import torch
 
@@ -17,11 +19,12 @@ from ufmstar_torch.anchors.sources import DENSE
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.anchors import anchor_sources
 from ufmstar_torch.eval.engine.estimators import make_estimator
+from ufmstar_torch.eval.engine.examples import ExampleWriter
 from ufmstar_torch.eval.engine.judge import RowFigures, RowJudge, SequenceError, references
 from ufmstar_torch.eval.engine.predictions import DepthSource, PredictionCache
-from ufmstar_torch.eval.engine.progress import Progress, ProgressSink
+from ufmstar_torch.eval.engine.progress import Progress, frame_progress
 from ufmstar_torch.eval.engine.rows import RowRunner
-from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream
+from ufmstar_torch.eval.engine.stream import frame_results
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import CORNERS
@@ -53,7 +56,7 @@ def evaluate_sequence(
     rows: Sequence[Row],
     judge: Judge,
     *,
-    sinks: Sequence[FrameSink] = (),
+    examples: Path | None = None,
     progress: Callable[[Progress], object] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> list[RowFigures]:
@@ -63,7 +66,7 @@ def evaluate_sequence(
         sequence: with poses and ground truth.
         rows: to evaluate.
         judge: networks and metrics.
-        sinks: receive the frames after the metrics; a row's key is its slug.
+        examples: folder for maps and mixtures of a few frames (``ExampleWriter``); None = none.
         progress: called at the start and after every frame.
         stop: called before every frame.
 
@@ -84,11 +87,21 @@ def evaluate_sequence(
         every, setting = row.method.every_member, row.setting
         runners.append(RowRunner(row.slug, source, estimator, every=every, setting=setting, anchors=anchors.get(row)))
         named = {other.slug: other.method.name for other in references(row, rows)}
-        judges.append(RowJudge(row, named, judge.bins, judge.plugins.metrics))
+        judges.append(RowJudge(row, runners[-1], named, judge.bins, judge.plugins.metrics))
     tracked = any(row.setting.anchors in (CORNERS, DENSE) for row in rows)
     check = partial(require_usable, sources=sources.values(), tracked=tracked)
-    stream = FrameStream(sequence, indices, runners, store=judge.store, device=judge.device, check=check)
-    stream.drive([*judges, *sinks, ProgressSink(progress)], stop=stop)
+    shown = frame_progress(progress, len(indices))
+    writer = None if examples is None else ExampleWriter(examples, len(indices), runners)
+    stream = frame_results(sequence, indices, runners, cache=judge.store, device=judge.device, check=check, stop=stop)
+    with closing(stream) as results:
+        for result in results:
+            for one in judges:
+                one.add(result)
+            if writer is not None:
+                writer.add(result)
+            shown(result)
+    if writer is not None:
+        writer.end()
     opened = dict(sorted(Counter(skipped.reason for skipped in sequence.skipped).items()))
     figures = [one.figures() for one in judges]
     return [replace(one, frames={**one.frames, "left_out_on_opening": opened}) for one in figures]

@@ -1,4 +1,4 @@
-"""Sinks that compute figures against ground truth: of a run, and of the rows of an evaluation.
+"""Figures against ground truth: of a run, and of the rows of an evaluation.
 
 The paper's figure of NLL by error uses the pixels where the ensemble (left panel) or UfM-Ensemble (right) is confident,
 without a definition. Here they are the half of the reference's pixels with the smallest variance in every frame
@@ -12,15 +12,14 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
-from time import perf_counter
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.engine.rows import RowResult
-from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
+from ufmstar_torch.eval.engine.rows import RowResult, RowRunner
+from ufmstar_torch.eval.engine.stream import FrameResult
 from ufmstar_torch.eval.methods import method
 from ufmstar_torch.eval.methods.row import Row
 
@@ -50,38 +49,29 @@ def metrics_of(metrics: dict[str, SequenceMetrics], key: str, **how: Any) -> Seq
     return metrics[key]
 
 
-class RunMetrics(FrameSink):
+class RunMetrics:
     """The figures of a run's row, ``UFM``, of its network ``ALONE``, and of its ``POSTERIOR``, on the row's valid
-    pixels, and as "ufm.moving", "ufm.still", ... on its ``RowResult.parts``. ``sums`` are those of an earlier part of
-    the run. ``FrameResult.ms`` gets "metrics", the time [ms]."""
+    pixels, and as "ufm.moving", "ufm.still", ... on its ``RowResult.parts``."""
 
-    def __init__(self, key: str, sums: Mapping[str, Mapping[str, Tensor]], plugins: PluginMetrics = NO_PLUGINS) -> None:
-        self._key, self._plugins = key, plugins
+    def __init__(self, plugins: PluginMetrics = NO_PLUGINS) -> None:
+        self._plugins = plugins
         self._metrics: dict[str, SequenceMetrics] = {}
-        for name, state in sums.items():
-            metrics_of(self._metrics, name, plugins=plugins).load_state_dict(dict(state))
-
-    def sums(self) -> dict[str, dict[str, Tensor]]:
-        """The sums by name. Updates replace them instead of changing them in place."""
-        return {name: metrics.sums() for name, metrics in self._metrics.items()}
 
     def figures(self) -> dict[str, dict[str, float]]:
         """delta1, nll, ece_delta, ece_q, spearman, ... by name; {} without ground truth."""
         return {name: metrics.compute() for name, metrics in self._metrics.items()}
 
-    def take(self, result: FrameResult) -> None:
-        """Add a frame."""
-        started, row = perf_counter(), result.rows.get(self._key)
-        if row is not None and row.truth is not None:
-            self._add(row, torch.from_numpy(row.truth))
-        result.ms["metrics"] = 1000 * (perf_counter() - started)
-
-    def _add(self, row: RowResult, target: Tensor) -> None:
-        maps: dict[str, tuple[Tensor, Tensor | None]] = {UFM: (row.depth, row.variance)}
-        maps |= {} if row.network_variance is None else {ALONE: (row.depth, row.network_variance)}
-        if row.posterior_depth is not None:
-            maps[POSTERIOR] = row.posterior_depth, row.posterior_variance
-        corrected = POSTERIOR if POSTERIOR in maps else UFM
+    def add(self, row: RowResult) -> None:
+        """Add a frame; ignored without ground truth."""
+        if row.truth is None:
+            return
+        target = torch.from_numpy(row.truth)
+        depth = row.prediction.depth[0]
+        maps: dict[str, tuple[Tensor, Tensor | None]] = {UFM: (depth, row.map("ufm_variance"))}
+        maps |= {} if row.network_variance is None else {ALONE: (depth, row.network_variance)}
+        if row.corrected:
+            maps[POSTERIOR] = row.depth, row.variance
+        corrected = POSTERIOR if row.corrected else UFM
         for name, (depth, variance) in maps.items():
             mixture, level = row.mixture if name == POSTERIOR else None, row.level if name == corrected else None
             masks = {name: row.valid, **{f"{name}.{part}": row.valid & mask for part, mask in row.parts.items()}}
@@ -106,14 +96,20 @@ class RowFigures:
     sums: dict[str, dict[str, Tensor]]
 
 
-class RowJudge(FrameSink):
+class RowJudge:
     """Collects counts, metrics, times and memory of one row over a sequence. ``reference_names`` has, by key, the names
     of the rows on whose confident pixels the NLL by error is computed."""
 
     def __init__(
-        self, row: Row, reference_names: Mapping[str, str], bins: str, plugins: PluginMetrics = NO_PLUGINS
+        self,
+        row: Row,
+        runner: RowRunner,
+        reference_names: Mapping[str, str],
+        bins: str,
+        plugins: PluginMetrics = NO_PLUGINS,
     ) -> None:
-        self.row, self._references, self._bins, self._plugins = row, reference_names, bins, plugins
+        self.row, self._runner = row, runner
+        self._references, self._bins, self._plugins = reference_names, bins, plugins
         self._metrics: dict[str, SequenceMetrics] = {}
         self._by_error: dict[str, NLLByError] = {}
         self._samples: list[Tensor] = []
@@ -121,10 +117,7 @@ class RowJudge(FrameSink):
         self._ms: list[Mapping[str, float]] = []
         self._memory: list[Mapping[str, float]] = []
 
-    def begin(self, stream: FrameStream) -> None:
-        self._runner = next(row for row in stream.rows if row.key == self.row.slug)
-
-    def take(self, result: FrameResult) -> None:
+    def add(self, result: FrameResult) -> None:
         """Add a frame. Invalid pixels are NaN, not masked, so that the metrics count them."""
         if self.row.slug in result.skipped:
             self._reasons[result.skipped[self.row.slug]] += 1
@@ -132,8 +125,9 @@ class RowJudge(FrameSink):
             self._add(result.rows[self.row.slug], result.rows)
 
     def _add(self, result: RowResult, rows: Mapping[str, RowResult]) -> None:
-        if result.statistics is not None:
-            segments, matched = (int(count[0]) for count in (result.statistics.segments, result.statistics.matched))
+        statistics, multiview = result.out.statistics, self.row.method.fusion == method.UFM_STAR
+        if multiview:
+            segments, matched = (int(count[0]) for count in (statistics.segments, statistics.matched))
             # In the first frame there is no component to match.
             self._idle.update(without_segment=int(not segments), without_match=int(bool(self._ms) and not matched))
         self._ms.append(result.ms)
@@ -147,15 +141,15 @@ class RowJudge(FrameSink):
             torch.where(result.valid, result.depth, torch.nan), result.variance, torch.from_numpy(result.truth)
         )  # fmt: skip
         how = {"with_variance": variance is not None, "bins": self._bins, "plugins": self._plugins}
-        mixture = result.mixture if self.row.setting.posterior else None
+        mixture = result.mixture
         level = None if variance is None else result.level
         metrics_of(self._metrics, METRICS, **how).update(depth, variance, target, mixture=mixture, level=level)
         for part, mask in result.parts.items():
             metrics_of(self._metrics, part, **how).update(depth, variance, target, mask, mixture, level)
         if variance is None:
             return
-        if result.confidence is not None:
-            self._samples.append(_samples(result.confidence, depth, variance, target))
+        if multiview and (confidence := result.prediction.confidence) is not None:
+            self._samples.append(_samples(confidence[0], depth, variance, target))
         for other, name in self._references.items():
             by_error = self._by_error.setdefault(f"{BY_ERROR}:{name}", NLLByError(sync_on_compute=False))
             by_error.update(depth, variance, target, rows[other].confident)

@@ -106,7 +106,7 @@ class NetworkChoice:
         Args:
             device: of the networks.
             mode: without a base, "alternate" for one member per image, "full" for all members, or all samples of a
-                single network. With a base, the row decides, and predictions may be stored.
+                single network. With a base, the row decides.
             samples: of MC-Dropout; None = as many as in the paper's baseline.
             offload: see :meth:`members`.
             inference: runtime, precision and threads.
@@ -139,7 +139,7 @@ class NetworkChoice:
             raise ValueError(f"weights: the members of an ensemble must differ, two of {names} are the same network")
         nameless = {"label": None, "files": [file | {"name": None} for file in identity["files"]]}
         content = json.dumps({**identity, **nameless, "device": device.type, "version": _VERSION}, sort_keys=True)
-        digest = hashlib.sha256(content.encode()).hexdigest() if self.base else ""
+        digest = hashlib.sha256(content.encode()).hexdigest()
         turns = NetworksInTurn(members, samples=passes, preprocess=members[0].preprocess)
         how: dict[str, Any] = {"precision": inference.precision, "label": identity["label"], "digest": digest}
         return NetworkSource(turns, device, identity, **how)

@@ -103,6 +103,11 @@ class PredictionCache:
         self.folder = folder
         # A test file, because permissions do not show that a file system is mounted read-only.
         self._write(Path(".writable"), lambda opened: opened.write(b""))
+        (folder / ".writable").unlink(missing_ok=True)  # several processes may test the folder
+
+    def has(self, path: Path) -> bool:
+        """True if the file exists."""
+        return (self.folder / path).is_file()
 
     def load(self, path: Path, content: str, device: torch.device) -> DepthPrediction | None:
         """The prediction as it was stored, bit for bit. None if the file does not exist, belongs to another image of
@@ -155,7 +160,7 @@ class FramePredictions:
         if key in self._cached:
             return self._cached[key]
         store = self._store if source.cacheable else None
-        path = Path(source.digest[:_SHOWN], self._sequence[:_SHOWN], f"{self.frame.name}@{member}.npz")
+        path = self._path(source, member)
         prediction = None if store is None else store.load(path, self._content, self._device)
         if prediction is None:
             members = range(source.passes) if combined else [int(member)]
@@ -174,6 +179,15 @@ class FramePredictions:
         if self.frame.image is None:
             return None
         return shows_something(reduced(image_tensor(self.frame))).to(self._device)
+
+    def prepare(self, source: DepthSource) -> None:
+        """Compute the networks' input in the thread that reads ahead, unless the store has a prediction."""
+        members = "all", *map(str, range(source.passes))
+        if self._store is None or not any(self._store.has(self._path(source, member)) for member in members):
+            source.prepare(self.frame)
+
+    def _path(self, source: DepthSource, member: str) -> Path:
+        return Path(source.digest[:_SHOWN], self._sequence[:_SHOWN], f"{self.frame.name}@{member}.npz")
 
     def _inference(self, source: DepthSource, n: int) -> DepthPrediction:
         """Member (or sample) n, computed once for all rows."""

@@ -1,21 +1,22 @@
-"""The loop over frames: predict, update every row, hand the result to the sinks.
+"""The loop over frames: read, predict, update every row.
 
-``ufmstar run`` is one row with writers, ``ufmstar eval`` the rows of a suite with metrics.
+``ufmstar run`` writes the results of one row, ``ufmstar eval`` judges those of a suite's rows, ``ufmstar rank`` scores
+those of one row on many sequences.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
+from time import perf_counter
+from typing import TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from ufmstar_torch.eval.engine.clock import timed
 from ufmstar_torch.eval.engine.predictions import FramePredictions, PredictionCache, sequence_digest
@@ -24,6 +25,10 @@ from ufmstar_torch.eval.methods.perturb import selects
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.frames.prediction import DepthPrediction
+
+_AHEAD = 2  # frames; decoding releases Python's lock
+_CPU = torch.device("cpu")
+Read = TypeVar("Read")
 
 
 class Stopped(Exception):
@@ -40,122 +45,73 @@ class FrameResult:
     frame: Frame | None = None  # None if no row selects it, or it cannot be used
     rows: Mapping[str, RowResult] = field(default_factory=dict)  # by key, of the rows that used the frame
     skipped: Mapping[str, str] = field(default_factory=dict)  # by key, why a row that selects the frame cannot use it
-    # "read" (the wait for the prefetch), "predict" and "truth" [ms]; sinks may add others.
-    ms: dict[str, float] = field(default_factory=dict)
-    # The stream's state after the frame, for sinks in a ``WriterThread``.
-    state: Mapping[str, Mapping[str, Tensor]] = field(default_factory=dict)
+    # [ms]: "read" (the wait for the thread that reads ahead), "predict", "truth", "cycle" (since the previous result).
+    ms: Mapping[str, float] = field(default_factory=dict)
 
 
-class FrameSink(ABC):
-    """Receives the result of every frame: metrics, writers, progress."""
-
-    def begin(self, stream: FrameStream) -> None:
-        """Called before the first frame, also after a resume."""
-
-    @abstractmethod
-    def take(self, result: FrameResult) -> None:
-        """Called after every frame, skipped ones included, when the stream's state includes the frame."""
-
-    def end(self) -> None:
-        """Called after the last frame, but not after a stop or an error."""
-
-
-class FrameStream:
-    """The frames of a sequence, processed by rows. A frame that no row selects is not decoded. If a frame cannot be
-    read or predicted from, all rows skip it.
+def frame_results(
+    sequence: FrameSequence,
+    indices: Sequence[int],
+    rows: Sequence[RowRunner],
+    *,
+    cache: PredictionCache | None = None,
+    device: torch.device = _CPU,
+    check: Callable[[Frame], None] = lambda _: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> Generator[FrameResult]:
+    """Yield the result of every frame, in order. A frame that no row selects is not decoded. If a frame cannot be read
+    or predicted from, all rows skip it. Close the generator to end the thread that reads ahead.
 
     Args:
         sequence: posed frames.
         indices: of the frames, in order.
-        rows: with different keys.
-        store: of predictions; None = compute all.
+        rows: with different keys, in their initial state.
+        cache: of predictions; None = compute all.
         device: of the rows' estimators and their maps.
         check: raises ``FrameError`` for a frame that all rows must skip.
-        start: number of finished frames, skipped ones included (``position``); the rows are in that state.
+        stop: called before every frame.
+
+    Raises:
+        Stopped: ``stop`` returned True.
     """
+    names, digest = sequence.names, "" if cache is None else sequence_digest(sequence)
 
-    def __init__(
-        self,
-        sequence: FrameSequence,
-        indices: Sequence[int],
-        rows: Sequence[RowRunner],
-        *,
-        store: PredictionCache | None = None,
-        device: torch.device | None = None,
-        check: Callable[[Frame], None] | None = None,
-        start: int = 0,
-    ) -> None:
-        self.sequence, self.indices, self.rows = sequence, indices, tuple(rows)
-        self._store, self._device, self._check = store, device or torch.device("cpu"), check
-        self._names = sequence.names
-        self._digest = "" if store is None else sequence_digest(sequence)
-        self.position = start
+    def read(index: int) -> FramePredictions:
+        predictions = FramePredictions(sequence[index], device, cache, digest)
+        if torch.get_num_threads() == 1:  # a second team of OpenMP threads makes networks three times slower
+            for row in rows:
+                predictions.prepare(row.source)
+        return predictions
 
-    def drive(self, sinks: Sequence[FrameSink], *, stop: Callable[[], bool] = lambda: False) -> None:
-        """Process the remaining frames, and pass each result to the sinks in order. ``stop`` is called before every
-        frame.
-
-        Raises:
-            Stopped: ``stop`` returned True.
-        """
-        with closing(prefetch(self.sequence, self._selected(), self._prepare)) as frames:
-            for sink in sinks:
-                sink.begin(self)
-            while self.position < len(self.indices):
-                if stop():
-                    raise Stopped
-                result = self._next(frames)
-                for sink in sinks:
-                    sink.take(result)
-        for sink in sinks:
-            sink.end()
-
-    def state(self) -> dict[str, dict[str, Tensor]]:
-        """All tensors on which the next frame depends, by row."""
-        return {row.key: row.state() for row in self.rows}
-
-    def _next(self, frames: Iterator[Future[Frame]]) -> FrameResult:
-        """Process the next frame."""
-        number, index = self.position, self.indices[self.position]
-        name = self._names[index]
-        active = [row for row in self.rows if selects(row.setting, number)]
-        self.position += 1
-        if not active:
-            return FrameResult(number, index, name)
-        ms: dict[str, float] = {}
-        try:
-            with timed(ms, "read", self._device):
-                frame = next(frames).result()
-                if self._check is not None:
-                    self._check(frame)
-            cached = FramePredictions(frame, self._device, self._store, self._digest)
-            with timed(ms, "predict", self._device):
-                predictions = {row.key: cached.of(row.source, row.images, row.every) for row in active}
-            with timed(ms, "truth", self._device):
-                truths = _truths(frame, predictions)
-        except FrameError as error:
-            return FrameResult(number, index, name, skipped={row.key: error.reason for row in active})
-        results: dict[str, RowResult] = {}
-        skipped: dict[str, str] = {}
-        for row in active:
+    selected = [index for n, index in enumerate(indices) if any(selects(row.setting, n) for row in rows)]
+    last = perf_counter()
+    with closing(read_ahead(read, selected)) as frames:
+        for number, index in enumerate(indices):
+            if stop():
+                raise Stopped
+            active, ms = [row for row in rows if selects(row.setting, number)], dict[str, float]()
+            results, skipped, frame = dict[str, RowResult](), dict[str, str](), None
             try:
-                results[row.key] = row.update(frame, predictions[row.key], truths[row.key])
+                if active:
+                    with timed(ms, "read", device):
+                        predictions = next(frames).result()
+                        check(predictions.frame)
+                    with timed(ms, "predict", device):
+                        predicted = {row.key: predictions.of(row.source, row.images, row.every) for row in active}
+                    with timed(ms, "truth", device):
+                        truths = _truths(predictions.frame, predicted)
+                    frame = predictions.frame
             except FrameError as error:
-                skipped[row.key] = error.reason
-        return FrameResult(number, index, name, frame, results, skipped, ms)
-
-    def _selected(self) -> list[int]:
-        """Indices of the remaining frames that a row selects."""
-        remaining = range(self.position, len(self.indices))
-        return [self.indices[n] for n in remaining if any(selects(row.setting, n) for row in self.rows)]
-
-    def _prepare(self, frame: Frame) -> None:
-        """Compute the networks' input in the prefetch thread, unless a store may have all predictions. Only if torch
-        uses one thread: a second team of OpenMP threads would stop the first one's spinning, which made networks three
-        times slower."""
-        if self._store is None and torch.get_num_threads() == 1:
-            for row in self.rows:
-                row.source.prepare(frame)
+                skipped, active = {row.key: error.reason for row in active}, []
+            for row in active:
+                assert frame is not None
+                try:
+                    results[row.key] = row.update(frame, predicted[row.key], truths[row.key])
+                except FrameError as error:
+                    skipped[row.key] = error.reason
+            now = perf_counter()
+            ms["cycle"], last = 1000 * (now - last), now
+            yield FrameResult(number, index, names[index], frame, results, skipped, ms)
 
 
 def _truths(frame: Frame, predictions: Mapping[str, DepthPrediction]) -> dict[str, NDArray[np.float32] | None]:
@@ -172,21 +128,10 @@ def _truths(frame: Frame, predictions: Mapping[str, DepthPrediction]) -> dict[st
     return truths
 
 
-_AHEAD = 2  # frames; decoding releases Python's lock
-
-
-def prefetch(
-    sequence: FrameSequence, indices: Iterable[int], prepare: Callable[[Frame], None] = lambda _: None
-) -> Generator[Future[Frame]]:
-    """Yield the frames at some indices, in order, read by one thread at most two frames ahead, which calls ``prepare``
-    with each. A frame's ``result()`` raises FrameError if it cannot be read. Closing the generator ends the thread."""
-
-    def read(index: int) -> Frame:
-        frame = sequence[index]
-        prepare(frame)
-        return frame
-
-    thread, reading = ThreadPoolExecutor(1), deque[Future[Frame]]()
+def read_ahead(read: Callable[[int], Read], indices: Iterable[int]) -> Generator[Future[Read]]:
+    """Yield what ``read`` returns for some indices, in order, read by one thread at most two ahead. Its error is raised
+    by ``result()``. Closing the generator ends the thread."""
+    thread, reading = ThreadPoolExecutor(1), deque[Future[Read]]()
     try:
         for index in indices:
             reading.append(thread.submit(read, index))

@@ -29,12 +29,15 @@ NETWORKS = {
 }
 # Bases with several different passes on an image.
 MANY = ("ensemble", "mc_dropout", "batch_ensemble")
-ALONE, UFM, UFM_STAR = "alone", "ufm", "ufm_star"
-FUSIONS = (ALONE, UFM, UFM_STAR)
+# RELATIVE is a baseline that compares no views: sigma is the share RHO of the depth.
+ALONE, UFM, UFM_STAR, RELATIVE = "alone", "ufm", "ufm_star", "relative"
+FUSIONS = (ALONE, UFM, UFM_STAR, RELATIVE)
+RHO = 0.2
+_PREFIXES = {UFM: "UfM", UFM_STAR: "UfM*", RELATIVE: "Relative"}
 # Name of a user's method (``sequences.plugins``).
 _OWN = r"[a-z][a-z0-9_]*"
 _NAME = re.compile(
-    rf"(?P<fusion>UfM\*?|{_OWN})-(?P<full>Full)?(?P<base>[A-Za-z]+)(-(?P<cap>\d+)K)?(?P<fixed>-fixed-param)?"
+    rf"(?P<fusion>UfM\*?|Relative|{_OWN})-(?P<full>Full)?(?P<base>[A-Za-z]+)(-(?P<cap>\d+)K)?(?P<fixed>-fixed-param)?"
 )
 
 
@@ -47,7 +50,7 @@ class Method:
     """
 
     base: str  # a key of ``BASES``
-    fusion: str = ALONE  # "alone" (the network's variance), "ufm", "ufm_star", or the name of a user's method
+    fusion: str = ALONE  # "alone" (the network's variance), "ufm", "ufm_star", "relative", or a user's method
     # With UfM or UfM*: run all members (or samples) on every image instead of alternating.
     full: bool = False
     max_points: int | None = None  # of UfM; None = unpruned
@@ -75,7 +78,7 @@ class Method:
         if self.fusion == ALONE:
             return alone
         cap = "" if self.max_points is None else f"-{self.max_points // 1000}K"
-        prefix = {UFM: "UfM", UFM_STAR: "UfM*"}.get(self.fusion, self.fusion)
+        prefix = _PREFIXES.get(self.fusion, self.fusion)
         return f"{prefix}-{'Full' if self.full else ''}{behind}{cap}{'-fixed-param' if self.fixed_param else ''}"
 
     @property
@@ -97,14 +100,14 @@ class Method:
         by_behind = {behind: base for base, (_, behind) in BASES.items()}
         match = _NAME.fullmatch(name)
         if match is None or match["base"] not in by_behind or match["fusion"] in FUSIONS:
-            names = f"{', '.join(by_alone)}, or UfM-, UfM*-, UfM*-Full with {', '.join(by_behind)}"
+            names = f"{', '.join(by_alone)}, or UfM-, UfM*-, UfM*-Full, Relative- with {', '.join(by_behind)}"
             raise ValueError(
                 f"no method is called {name!r}; there are {names}, UfM's with -100K, UfM*'s with -fixed-param, "
                 "and NAME- of a plug-in's"
             )
         return cls(
             base=by_behind[match["base"]],
-            fusion={"UfM": UFM, "UfM*": UFM_STAR}.get(match["fusion"], match["fusion"]),
+            fusion={prefix: fusion for fusion, prefix in _PREFIXES.items()}.get(match["fusion"], match["fusion"]),
             full=match["full"] is not None,
             max_points=None if match["cap"] is None else 1000 * int(match["cap"]),
             fixed_param=match["fixed"] is not None,

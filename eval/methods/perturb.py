@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.eval.methods.setting import Setting
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
 # Third number of the seed of drift. Anchors use 1 and 2; the seed of noise has two numbers.
 _DRIFT = 3
-# Names of the tensors of a drift's state.
-_STATE = ("index", "T_world_cam", "drifted")
 
 
 def selects(setting: Setting, number: int) -> bool:
@@ -87,21 +80,6 @@ class Drift:
             drifted = drifted_before @ np.linalg.solve(T_before, T_world_cam) @ step
         self._last = index, T_world_cam, drifted
         return drifted
-
-    def state(self) -> dict[str, Tensor]:
-        """The last frame's index, pose and pose with drift; {} before the first frame or without drift."""
-        import torch
-
-        if self._last is None:
-            return {}
-        return {name: torch.tensor(value) for name, value in zip(_STATE, self._last, strict=True)}
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue from ``state``, with the same poses to the last bit."""
-        self._last = None
-        if state:
-            index, T_world_cam, drifted = (state[name].numpy() for name in _STATE)
-            self._last = int(index), T_world_cam, drifted
 
     def _increment(self, index: int) -> NDArray[np.float64]:
         return np.random.default_rng([self._setting.seed, index, _DRIFT]).standard_normal(6)

@@ -5,6 +5,7 @@ title = "Smoothing"                        # ``name`` is the file's by default
 base = "ensemble"                          # the suite's network, unless --base names another one; or
 bases = ["ensemble", "aleatoric"]          # several: the rows of each in turn
 efficiency = true                          # also measure time, energy and memory
+separate = true                            # no means over data sets, which differ on purpose
 include = ["ablation-eta"]                 # also the rows of other suites
 
 [[rows]]
@@ -40,6 +41,7 @@ _NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 _SHIPPED = files("ufmstar_torch.eval.methods") / "suites"
 _KEYS = {
     "name": str, "title": str, "base": str, "bases": list, "include": list, "rows": list, "efficiency": bool,
+    "separate": bool,
 }  # fmt: skip
 _WORDS = ("bases", "include", "methods")
 _ROW_KEYS = {"methods": list, "bases": list, "setting": dict, "each": dict, "label": str}
@@ -57,6 +59,7 @@ class Suite:
     title: str  # one line
     rows: tuple[Row, ...]  # without duplicates
     efficiency: bool = False  # True if time, energy and memory are measured
+    separate: bool = False  # True if the report has no means over data sets
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
@@ -124,7 +127,8 @@ def suite_named(name: str, base: str | None = None, preset: str | None = None) -
         stem = Path(name).stem
         if base is not None and not rows:
             raise ValueError(f"the suite has no rows of {base}")
-        return Suite(values.get("name", stem), values.get("title", stem), rows, values.get("efficiency", False))
+        flags = {name: values.get(name, False) for name in ("efficiency", "separate")}
+        return Suite(values.get("name", stem), values.get("title", stem), rows, **flags)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{name}: {error}") from error
 

@@ -92,11 +92,6 @@ class SequenceMetrics(nn.Module):
         """The curves and histograms by name, for plots and JSON."""
         return {name: value.tolist() for name, value in self._results().items() if value.dim() > 0}
 
-    def sums(self) -> dict[str, Tensor]:
-        """``state_dict`` without copies: updates replace the sums instead of changing them in place."""
-        kinds = zip(self.metrics, self._all(), strict=True)
-        return {f"metrics.{kind}.{name}": getattr(metric, name) for kind, metric in kinds for name, *_ in metric.STATES}
-
     def merge_state(self, other: SequenceMetrics) -> None:
         """Add the sums of another part of the same sequence. Raises ValueError: the other part has other metrics."""
         if other.metrics.keys() != self.metrics.keys():

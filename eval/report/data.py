@@ -31,7 +31,7 @@ class Results:
 
     out: Path
     about: Mapping[str, Any]  # eval.json
-    records: tuple[Record, ...]  # ordered by data set, sequence and row (in the suite's order)
+    records: tuple[Record, ...]  # ordered by data set and row (in the evaluation's order) and sequence
     # ``SequenceMetrics.curves()`` and "nll_by_error:REFERENCE" over all pixels of a data set, by (dataset, row); only
     # if the sums of all sequences exist.
     merged: Mapping[tuple[str, Row], Curves] = field(default_factory=dict)
@@ -63,8 +63,14 @@ class Results:
 
     @cached_property
     def datasets(self) -> tuple[str, ...]:
-        """Names of the data sets, sorted."""
-        return tuple(sorted({record.dataset for record in self.records}))
+        """Names of the data sets in the order of the evaluation."""
+        return tuple(dict.fromkeys(record.dataset for record in self.records))
+
+    @property
+    def tabulated(self) -> tuple[str | None, ...]:
+        """The data sets of the tables; None = the mean over all."""
+        each = self.datasets if len(self.datasets) > 1 else ()
+        return each if each and self.about.get("separate") is True else (None, *each)
 
     def of(self, row: Row, dataset: str | None = None, sequence: str | None = None) -> tuple[Record, ...]:
         """The records of a row, ordered by data set and sequence; of one data set or sequence, or (None) of all."""
@@ -75,9 +81,17 @@ class Results:
         """The first row of each method without ablated settings, of one base or (None) of all."""
         return [row for row in plain_rows(self.rows) if base in (None, row.method.base)]
 
+    def posterior_rows(self) -> list[Row]:
+        """The first row of each base with a posterior."""
+        first: dict[str, Row] = {}
+        for row in self.rows:
+            if row.setting.posterior:
+                first.setdefault(row.method.base, row)
+        return list(first.values())
+
     def sequences(self, dataset: str | None = None) -> tuple[tuple[str, str], ...]:
-        """(dataset, sequence) with a record, sorted."""
-        return tuple(sorted({(r.dataset, r.sequence) for r in self.records if dataset in (None, r.dataset)}))
+        """(dataset, sequence) with a record, in the order of the data sets, then by name."""
+        return tuple(dict.fromkeys((r.dataset, r.sequence) for r in self.records if dataset in (None, r.dataset)))
 
     def network(self, base: str) -> str | None:
         """The label of the network of a base; None without a record."""
@@ -106,9 +120,13 @@ def load_results(out: Path, *, with_sums: bool = True) -> Results:
     about = _about(out)
     order = {row: number for number, row in enumerate(listed_rows(about))}
     loaded = [Record.load(path) for path in out.glob("records/*/*/*.json") if path.name != FAILED]
-    records = tuple(
-        sorted(loaded, key=lambda r: (r.dataset, r.sequence, order.get(r.row, len(order)), r.row.slug, r.path))
-    )
+    order_of_dataset = {name: number for number, name in enumerate(about.get("datasets", []))}
+
+    def key(r: Record) -> tuple[Any, ...]:
+        dataset = order_of_dataset.get(r.dataset, len(order_of_dataset)), r.dataset
+        return *dataset, r.sequence, order.get(r.row, len(order)), r.row.slug, r.path
+
+    records = tuple(sorted(loaded, key=key))
     _check(out, records)
     failed = tuple(sorted(Failed(*where, reason) for where, reason in EvalFolder(out).failures().items()))
     done = {(r.dataset, r.sequence, r.row) for r in records}
@@ -133,6 +151,9 @@ def _about(out: Path) -> dict[str, Any]:
         raise ResultsError(f"{path} is not the description of an evaluation of format {FORMAT}")
     sequences = about.get("sequences", [])
     named = ("dataset", "sequence")
+    datasets = about.get("datasets", [])
+    if not isinstance(datasets, list) or not all(isinstance(name, str) for name in datasets):
+        raise ResultsError(f"{path} lists data sets that cannot be: each has a name")
     if not isinstance(sequences, list) or not all(
         isinstance(one, dict) and all(isinstance(one.get(name), str) for name in named) for one in sequences
     ):

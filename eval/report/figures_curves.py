@@ -44,7 +44,7 @@ ENVIRONMENTS = {
 def draw_calibration(results: Results, dataset: str) -> Any | None:
     """Both curves over all pixels of a data set, one column per network; None if no row has a variance."""
     panels: dict[str, dict[Row, Curves]] = {}
-    for row in results.default_rows():
+    for row in (*results.default_rows(), *results.posterior_rows()):
         if _has_curves(values := results.merged.get((dataset, row), {})):
             panels.setdefault(row.method.base, {})[row] = values
     title = f"Calibration on {dataset}, {count(len(results.sequences(dataset)), 'sequence')}"
@@ -53,9 +53,11 @@ def draw_calibration(results: Results, dataset: str) -> Any | None:
 
 def draw_sequence_calibration(results: Results, dataset: str, base: str) -> Any | None:
     """Both curves of at most ``MOST_SEQUENCES`` sequences, evenly spaced in the order of the ECE_delta of UfM* (or of
-    the last row), the smallest and the largest included."""
+    the last row), the smallest and the largest included; None for a single sequence."""
     by_row = {row: [r for r in results.of(row, dataset) if _has_curves(r.curves)] for row in results.default_rows(base)}
     rows = [row for row, records in by_row.items() if records]
+    if len(results.sequences(dataset)) < 2:
+        return None  # equal to the data set's
     ordered = sorted(by_row[_ours(rows)] if rows else [], key=lambda r: (value_of(r, "ece_delta"), r.sequence))
     chosen = np.linspace(0, len(ordered) - 1, min(len(ordered), MOST_SEQUENCES)).round().astype(int)
     panels = []
@@ -96,8 +98,8 @@ def _draw_columns(title: str, panels: Sequence[tuple[tuple[str, str], Mapping[Ro
     figure = style.new_figure(max(5.0, 0.4 + 2.6 * columns), 0.7 + 5.2 * lines, title)
     axes = style.hidden_panels(figure, 2 * lines, columns)
     for n, (titles, curves) in enumerate(panels):
-        rows = sorted(curves, key=lambda row: (row.method.fusion == UFM_STAR, row.method.full))
-        drawn = {style.line_style(row.method): curves[row] for row in rows}
+        rows = sorted(curves, key=lambda row: (row.method.fusion == UFM_STAR, row.setting.posterior, row.method.full))
+        drawn = {style.row_style(row): curves[row] for row in rows}
         for below, words in enumerate((DELTA, QUANTILE)):
             panel = axes[2 * (n // columns) + below, n % columns]
             _draw_shares(panel, words, drawn, titles[below], named=n % columns == 0)

@@ -44,9 +44,10 @@ AUSE = Quantity("ause_rmse", "AUSE", 3, LOWER, "m")
 ENERGY = Quantity("energy_mj", "energy", None, LOWER, "mJ")
 MEMORY = Quantity("memory_mb", "memory", None, LOWER, "MB")
 
-# The paper's columns, and further columns that are usual in the field.
+# The paper's columns, those of other suites' tables, and further columns that are usual in the field.
 _STATE = Quantity("state.bytes_end", "state", None, "", "MB", 1e-6)  # after the last frame
-MAIN = (Quantity("delta1", "δ₁", 3, HIGHER), NLL, ECE_DELTA, ECE_Q, _STATE)
+PAPERS = (Quantity("delta1", "δ₁", 3, HIGHER), NLL, ECE_DELTA, ECE_Q, _STATE)
+MAIN = (*PAPERS[:-1], AUSE, _STATE)
 EXTRA = (
     Quantity("delta1_ratio", "δ₁ (ratio)", 3, HIGHER),
     Quantity("abs_rel", "AbsRel", 3, LOWER),
@@ -105,8 +106,6 @@ SETTINGS = {
     "regression": ("regression", ""),
     "unmeasured": ("not measured:", ""),
     "unmeasured_relative": ("ρ", "of the depth"),
-    "near_radius": ("search radius", "m"),
-    "far_radius": ("far search radius", "m"),
     "variance_floor": ("variance floor", "m²"),
     "segment.min_pixels": ("smallest segment", "px"),
     "segment.min_rows": ("smallest segment", "rows"),

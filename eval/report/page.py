@@ -23,8 +23,16 @@ PAGE = "report.html"
 TEMPLATES = Path(__file__).parent / "templates"
 # Quality of WebP; below it, text in pictures has visible rings.
 QUALITY = 84
-# Kinds of figures (the first words of their files' names) in each section of the page.
-CURVES, COST = ("calibration", "intervals", "gates", "error", "entropy", "sweep"), ("latency",)
+# Kinds of figures (the first words of their files' names) in each section of the page, and what they show.
+CURVES = {
+    "calibration": "Calibration: how often is the depth right where a row says so? On the diagonal: as often as stated",
+    "intervals": "Intervals: which share of the true depths lies in the stated intervals?",
+    "gates": "Gates: what remains of an image under a limit on σ, and how wrong is it?",
+    "error": "Errors: is the likelihood bad only where the error is large?",
+    "entropy": "Entropy: how uncertain is each row, by environment?",
+    "sweep": "Settings: how do the figures depend on one setting?",
+}
+COST = {"latency": "Latency: how long does each stage take?"}
 
 
 def write_page(
@@ -85,10 +93,23 @@ def typeset(text: str) -> str:
     return text.replace(" ± ", "\u202f±\u202f").replace(" %", "\u202f%")
 
 
-def _figures(paths: Sequence[Path], kinds: Sequence[str]) -> list[tuple[str, str, bool]]:
-    """Caption, data URI, and True for single sequences (which are collapsed), of the figures of some kinds."""
-    chosen = (path for kind in kinds for path in paths if path.stem.startswith(kind))
-    return [(re.sub("[_-]", " ", path.stem), _embedded(path), "-sequences-" in path.stem) for path in chosen]
+def _figures(paths: Sequence[Path], kinds: Mapping[str, str]) -> list[tuple[str, list[tuple[str, str, bool]]]]:
+    """By heading the figures of some kinds: alternative text, data URI, and True for single sequences, which are
+    collapsed."""
+    sections = []
+    for kind, heading in kinds.items():
+        shown = [(_words(path.stem), _embedded(path), "-sequences-" in path.stem) for path in paths
+                 if path.stem.startswith(kind)]  # fmt: skip
+        sections += [(heading, shown)] if shown else []
+    return sections
+
+
+def _words(stem: str) -> str:
+    """A figure's name as words: "Calibration of each sequence: tum ensemble"."""
+    kind, _, rest = stem.partition("-")
+    single = rest.startswith("sequences-")
+    rest = re.sub("[_-]+", " ", rest.removeprefix("sequences-"))
+    return f"{kind.capitalize()}{' of each sequence' if single else ''}: {rest}"
 
 
 def _embedded(path: Path) -> str:

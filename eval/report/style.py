@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
+from ufmstar_torch.eval.methods.method import ALONE, RELATIVE, RHO, UFM, UFM_STAR, Method
+from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.run.colours import FAINT, INK, plain, require_matplotlib
 from ufmstar_torch.eval.run.files import write_atomic
 
@@ -38,11 +39,18 @@ def line_style(method: Method) -> LineStyle:
         cap = "" if method.max_points is None else f"-{method.max_points // 1000}K"
         style = ("#F0E442", "X") if full else ("#D55E00", "v") if cap else ("#E69F00", "s")
         return LineStyle(f"UfM{full}{cap}", *style)
+    if method.fusion == RELATIVE:
+        return LineStyle(f"σ = {RHO:g} d", "#CC79A7", "x")
     if method.fusion != UFM_STAR:
         return LineStyle(f"{method.fusion}{full}", "#56B4E9", "*")
     fixed = " fixed-param" if method.fixed_param else ""
     style = ("#009E73", "D") if full else ("#CC79A7", "P") if fixed else ("#0072B2", "o")
     return LineStyle(f"UfM*{full}{fixed}", *style)
+
+
+def row_style(row: Row) -> LineStyle:
+    """The style of a row: "posterior" if it has one, else its method's."""
+    return LineStyle("posterior", "#1d1d1f", "P") if row.setting.posterior else line_style(row.method)
 
 
 def new_figure(width: float, height: float, title: str) -> Any:

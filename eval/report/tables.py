@@ -28,6 +28,7 @@ from ufmstar_torch.eval.report.names import (
     MAIN,
     MEMORY,
     MIXTURE,
+    PAPERS,
     Quantity,
     count,
     own_quantities,
@@ -40,7 +41,7 @@ from ufmstar_torch.eval.run.files import write_bytes_atomic
 from ufmstar_torch.eval.suite.record import Record
 
 OURS, PAPER = "Ours", "Paper"
-_PAPER_COLUMNS = {quantity.key: quantity for quantity in (*MAIN, ENERGY, MEMORY)}
+_PAPER_COLUMNS = {quantity.key: quantity for quantity in (*PAPERS, ENERGY, MEMORY)}
 _SEQUENCES = Quantity("", "sequences", 0)
 Records = Mapping[Row, Sequence[Record]]
 # By heading above the column ("" = none) and quantity, the cells by row.
@@ -53,7 +54,8 @@ def main_table(results: Results, dataset: str | None = None) -> Table:
     records, quoted, efficiency = _records(results, dataset), paper_table_of(results.suite), results.efficiency
     group = OURS if quoted else ""
     plugin_columns = own_quantities(key for record in results.records for key in record.figures)
-    columns, notes = _means(records, [*MAIN, *plugin_columns], group), _notes(results, records)
+    columns = _means(records, [*(PAPERS if quoted else MAIN), *plugin_columns], group)
+    notes = _notes(results, records)
     costs = _costs(efficiency, records, group) if efficiency else {}
     if efficiency and any(cell.value for cells in costs.values() for cell in cells.values()):
         columns |= costs
@@ -190,11 +192,11 @@ def _cost_note(efficiency: Mapping[str, Any]) -> str:
 
 def all_tables(results: Results) -> dict[str, list[Table]]:
     """The tables by the name of their file, without empty ones: "main", "differences" and "extra" over all sequences
-    and, with several data sets, over those of each ("main-DATASET"); "sequences-DATASET" of single sequences;
-    "efficiency", if it was measured, with the paper's table 2 below ours."""
+    (unless the suite's data sets are separate) and, with several data sets, over those of each ("main-DATASET");
+    "sequences-DATASET" of single sequences; "efficiency", if it was measured, with the paper's table 2 below ours."""
     files: dict[str, list[Table]] = {}
     for make in (main_table, difference_table, extra_table):
-        for dataset in (None, *(results.datasets if len(results.datasets) > 1 else ())):
+        for dataset in results.tabulated:
             table = make(results, dataset)
             files[table.name if dataset is None else f"{table.name}-{dataset}"] = [table]
     files |= {f"sequences-{dataset}": sequence_tables(results, dataset) for dataset in results.datasets}

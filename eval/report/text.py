@@ -25,7 +25,7 @@ _RUN_COLUMNS = {
 _OFF = 1.1  # ratio of depths from which an error matters
 _TARGET_MS, _TARGET_LOST = 50.0, 0.01  # of the onboard demo
 _CALIBRATED = 4.0  # largest mean z^2 of held-out anchors, and inverse of the smallest: sigma is right within a factor 2
-_UNSUPPORTED = "mean sigma not shown: neither truth nor held-out anchors (which --plain leaves out) support it"
+_UNVERIFIED = "mean sigma not shown: nothing here can verify it"
 # By source of anchors, the names of the count of anchors with a depth and of the total.
 _FOUND = {
     "corners": ("triangulated", "tracked"),
@@ -36,7 +36,8 @@ _FOUND = {
 
 def summary(results: Results) -> str:
     """The main table of an evaluation, failed and missing sequences, and notes."""
-    parts = [markdown(main_table(results))]
+    shown = [None] if None in results.tabulated else results.tabulated
+    parts = [markdown(main_table(results, dataset)) for dataset in shown]
     if results.failed:
         parts.append("failed:\n" + "\n".join(f"  {f.dataset}, {f.sequence}: {f.reason}" for f in results.failed))
     if results.missing:
@@ -62,16 +63,13 @@ def run_table(summary: Mapping[str, Any]) -> str:
     uncertainty, mixture, time = summary["uncertainty"], summary["mixture"], summary["time"]
     lines = _metric_lines(summary)
     if uncertainty["unmeasured_share"]:
-        lines.append(
-            f"not compared: {uncertainty['unmeasured_share']:.0%} of the pixels show what one view alone has seen; "
-            "there M is that of --ufm.unmeasured, and the sigma of UfM* is striped in the pictures"
-        )
+        lines.append(_unmeasured_line(summary))
     if summary["anchors"] is not None:
         lines += _anchor_lines(summary)
     stages = ", ".join(f"{s} {ms:.1f}" for s, ms in time["median_ms"].items() if ms is not None)
     rate = time["frames_per_second"]
     lines += [
-        f"K = {mixture['components']} components in {mixture['bytes_in_use'] / 1000:.1f} kB "
+        f"{mixture['components']} components in {mixture['bytes_in_use'] / 1000:.1f} kB "
         f"({mixture['bytes_allocated'] / 1000:.1f} kB allocated), mean disagreement "
         f"{number(uncertainty['mean_disagreement'])} m^2",
         f"{summary['frames']['done']} frames{f' at {rate:.1f} per second' if rate else ''}; median ms: {stages}",
@@ -83,6 +81,18 @@ def run_table(summary: Mapping[str, Any]) -> str:
     if (depth := summary["depth_fit"]) is not None and not depth["problem"]:
         lines.append(_depth_line(depth, summary))
     return "\n".join([*lines, *(f"warning: {text}" for text in summary["warnings"])])
+
+
+def _unmeasured_line(summary: Mapping[str, Any]) -> str:
+    """The share of pixels without two views to compare, and what UfM* assumes there."""
+    ufm = summary["settings"].get("ufm", {})
+    assumed = {
+        "relative": f"is assumed, {ufm.get('unmeasured_relative', math.nan):.0%} of the depth",
+        "paper": "is assumed to be 0, as in the paper",
+        "nan": "is not known",
+    }.get(ufm.get("unmeasured", ""), "is assumed")
+    of_ufm = "sigma of UfM*" if "ufm" in summary else "sigma"
+    return f"{summary['uncertainty']['unmeasured_share']:.0%} of the pixels were seen once; their {of_ufm} {assumed}"
 
 
 def _depth_line(depth: Mapping[str, Any], summary: Mapping[str, Any]) -> str:
@@ -102,7 +112,8 @@ def _metric_lines(summary: Mapping[str, Any]) -> list[str]:
     """Methods by metrics, or why there are none."""
     uncertainty, metrics, alone = summary["uncertainty"], summary["metrics"], summary["network_alone"]
     if metrics is None:
-        sigma = f"mean sigma {number(uncertainty['mean_sigma'])} m" if supported(summary) else _UNSUPPORTED
+        remedy = "" if "ufm" in summary else "; leave --plain out"
+        sigma = f"mean sigma {number(uncertainty['mean_sigma'])} m" if supported(summary) else _UNVERIFIED + remedy
         return [f"no metrics: {summary['metrics_reason']}; {sigma}"]
     ufm = "UfM*" if summary["anchors"] is None else "UfM*, anchored"
     if "ufm" in summary:
@@ -123,7 +134,7 @@ def _metric_lines(summary: Mapping[str, Any]) -> list[str]:
     if (metrics["nll"] or 0) > NLL_OF_FEW:
         lines.append(
             f"NLL: dominated by the {uncertainty['near_zero_share']:.2%} of the pixels with a sigma between "
-            f"0 and {1000 * NEAR_ZERO:g} mm; --ufm.variance_floor 1e-4 bounds what they cost"
+            f"0 and {1000 * NEAR_ZERO:g} mm; --set variance_floor=1e-4 bounds what they cost"
         )
     return lines
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from ufmstar_torch.eval.run.files import remove_temporaries, to_json, write_json_atomic
 from ufmstar_torch.files.lock import hold as hold
-from ufmstar_torch.runtime.stateful import flat
+from ufmstar_torch.runtime.checked import flat
 
 _SHOWN = 5  # number of differences in a message
 _UNFINISHED = "not finished"
@@ -40,9 +40,8 @@ class FolderKind:
     # Format of the manifest and the other files; None = work cannot be resumed, and a summary replaces the manifest at
     # the end.
     format: int | None = None
+    repeats: bool = False  # True if work with equal values replaces earlier work without ``overwrite``
     lock: str | None = None  # path of the lock file below the folder; None = no lock
-    wait: float = 0.0  # longest time [s] to wait for the lock
-    parts: tuple[str, ...] = ()  # glob patterns of the locks of processes that work on parts
     allowed: tuple[str, ...] = ()  # entries that may exist in a folder before its manifest does
     # Glob patterns below the folder of temporary files of a killed process.
     temporary: tuple[str, ...] = (".*.tmp",)
@@ -61,8 +60,7 @@ class FolderKind:
             return dict(manifest)
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             article = "an" if self.noun[0] in "aeiou" else "a"
-            text = f"--resume: {path} is not {article} {self.noun}'s that can be continued ({error})"
-            raise FolderError(text) from error
+            raise FolderError(f"{path} is not {article} {self.noun}'s ({error}); --overwrite starts again") from error
 
     def earlier(self, out: Path, *, resume: bool, overwrite: bool) -> bool:
         """True if the folder contains earlier work of the program. Raises FolderError: ``out`` is a file, or contains
@@ -81,32 +79,26 @@ class FolderKind:
             if out.is_dir() and any(self._foreign(out)):
                 raise FolderError(f"--out {out} holds files of someone else: choose an empty or a new folder")
             return False
-        if not (resume or overwrite or state == _UNFINISHED):
+        if not (resume or overwrite or self.repeats or state == _UNFINISHED):
             choices = "" if self.format is None else "--resume goes on with it, "
             raise FolderError(f"--out {out} holds an earlier {self.noun}: {choices}--overwrite replaces it")
         return True
 
     def clear(self, out: Path) -> None:
-        """Remove the files of earlier work, and the folders that are empty then. Raises FolderError: a process works on
-        a part of it."""
-        with ExitStack() as locks:
-            for path in [path for pattern in self.parts for path in out.glob(pattern)]:
-                if (lock := hold(path)) is None:
-                    raise FolderError(f"--out {out}: another process is working there now ({path.name})")
-                locks.callback(lock.release)
-            folders = set[Path]()
-            for pattern in self.files:
-                ours = self.recognise.get(pattern, lambda _: True)
-                for path in [path for path in out.glob(pattern) if path.is_file() and ours(path)]:
-                    path.unlink()
-                    folders |= set(path.parents[: len(path.relative_to(out).parents) - 1])
-            for folder in sorted(folders, key=lambda path: -len(path.parts)):
-                with suppress(OSError):  # files of others remain in it
-                    folder.rmdir()
+        """Remove the files of earlier work, and the folders that are empty then."""
+        folders = set[Path]()
+        for pattern in self.files:
+            ours = self.recognise.get(pattern, lambda _: True)
+            for path in [path for path in out.glob(pattern) if path.is_file() and ours(path)]:
+                path.unlink()
+                folders |= set(path.parents[: len(path.relative_to(out).parents) - 1])
+        for folder in sorted(folders, key=lambda path: -len(path.parts)):
+            with suppress(OSError):  # files of others remain in it
+                folder.rmdir()
 
     def require_no_links(self, out: Path) -> None:
         """Raises FolderError: a file or folder below ``out`` to which the program writes is a symbolic link."""
-        for name in (self.manifest, *filter(None, [self.lock]), *self.parts, *self.files):
+        for name in (self.manifest, *filter(None, [self.lock]), *self.files):
             parts = Path(name).parts
             for pattern in (str(Path(*parts[:length])) for length in range(1, len(parts) + 1)):
                 # glob omits links to nothing where a pattern has no wildcard
@@ -150,32 +142,31 @@ def output_folder(
     (out / kind.manifest).parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as locks:
         if kind.lock is not None:
-            lock = hold(out / kind.lock, wait=kind.wait)
+            lock = hold(out / kind.lock)
             if lock is None:
-                for_long = f" for over {kind.wait:g} s" if kind.wait else ""
-                raise FolderError(f"--out {out}: another {kind.noun} is writing there now{for_long}")
+                raise FolderError(f"--out {out}: another {kind.noun} is writing there now")
             locks.callback(lock.release)
         # Check again, because another process may have created the folder while this one waited.
-        resumed = kind.earlier(out, resume=resume, overwrite=overwrite) and resume
+        continued = kind.earlier(out, resume=resume, overwrite=overwrite) and not overwrite and kind.format is not None
         for pattern in kind.temporary:
             remove_temporaries(out.glob(pattern))
         started = {"state": _UNFINISHED} if kind.format is None else {"format": kind.format}
         manifest: dict[str, Any] = to_json({"program": kind.program, **started, **content})
-        if resumed:
+        if continued:
             earlier = kind.read_manifest(out)
             try:
                 changed = differences(kind.identity(earlier, manifest), kind.identity(manifest, earlier))
             except (LookupError, TypeError, AttributeError) as error:
-                text = f"{out / kind.manifest} is damaged ({error!r}); --overwrite starts again"
-                raise FolderError(f"--resume: {text}") from error
+                raise FolderError(f"{out / kind.manifest} is damaged ({error!r}); --overwrite starts again") from error
             if changed:
-                raise FolderError(f"--resume: the {kind.noun} in {out} was started with other input: {changed}")
+                text = f"the {kind.noun} in {out} was started with other input: {changed}"
+                raise FolderError(f"{text}; --overwrite replaces it")
             manifest = dict(kind.merge(earlier, manifest))
-        else:
+        if not (continued and resume):
             kind.clear(out)
-        if not resumed or manifest != earlier:
+        if not continued or manifest != earlier:
             write_json_atomic(out / kind.manifest, manifest)
-        yield resumed
+        yield continued and resume
 
 
 def differences(old: Manifest, new: Manifest) -> str:

@@ -14,8 +14,10 @@ from torch import Tensor
 from ufmstar_torch.eval.engine.rows import RowResult
 from ufmstar_torch.eval.engine.stream import FrameResult
 from ufmstar_torch.eval.sequences.frame import Frame
+from ufmstar_torch.frames.output import MAPS
 
-_MAPS = ("disagreement", "measured", "anchored", "bias", "posterior_inlier_variance", "posterior_outlier")
+_OF_NETWORK = ("aleatoric", "epistemic", "confidence", "features")  # maps that are not stored
+_BEFORE = ("network_depth", "ufm_variance")  # maps that are stored where a posterior corrects them
 _COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels", "unmeasured", "single_view")
 # [m] No depth network is more accurate than this sigma.
 NEAR_ZERO = 1e-3
@@ -23,12 +25,11 @@ NEAR_ZERO = 1e-3
 
 def frame_arrays(frame: Frame | None, row: RowResult) -> dict[str, NDArray[Any]]:
     """The arrays of a frame's file, by name: maps, pose, intrinsics and anchors (``writers``)."""
-    depth, variance = row.best
-    of_network = {} if row.posterior_depth is None else {"network_depth": row.depth, "ufm_variance": row.variance}
-    named = {"depth": depth, "variance": variance, **of_network, **{name: getattr(row, name) for name in _MAPS}}
-    maps = {name: value for name, value in named.items() if value is not None}
-    arrays = {name: value.cpu().numpy().astype(np.float32, copy=False) for name, value in maps.items()}
-    arrays |= {"valid": row.valid.cpu().numpy(), "T_world_cam": row.T_world_cam, "intrinsics": row.intrinsics}
+    left_out = _OF_NETWORK if row.corrected else (*_OF_NETWORK, *_BEFORE)
+    maps = {name: value for name in MAPS if name not in left_out and (value := row.map(name)) is not None}
+    arrays: dict[str, NDArray[Any]]
+    arrays = {name: value.numpy().astype(np.float32, copy=False) for name, value in maps.items()}
+    arrays |= {"valid": row.valid.numpy(), "T_world_cam": row.T_world_cam, "intrinsics": row.intrinsics}
     if row.landmarks is None or frame is None:
         return arrays
     anchors = row.landmarks.anchors(frame.intrinsics, torch.from_numpy(row.intrinsics))
@@ -36,45 +37,31 @@ def frame_arrays(frame: Frame | None, row: RowResult) -> dict[str, NDArray[Any]]
     return arrays | {"anchors": torch.cat(columns, dim=1).float().numpy()}
 
 
-def frame_record(result: FrameResult, key: str, writing: float, saving: float) -> dict[str, Any]:
+def frame_record(result: FrameResult, key: str, ms: Mapping[str, float]) -> dict[str, Any]:
     """The line of frames.jsonl of a frame: state, figures and times [ms] of the row ``key``, or why it was skipped.
-    ``writing`` and ``saving`` are the times to write its files and the previous checkpoint [ms]."""
+    ``ms`` has the times of "metrics" and "write" [ms]."""
     about: dict[str, Any] = {"index": result.index, "name": result.name}
     if result.frame is not None and result.frame.timestamp is not None:
         about["timestamp"] = result.frame.timestamp
     if key not in result.rows:
         return {**about, "state": "skipped", "reason": result.skipped[key]}
     row = result.rows[key]
-    times = {"ms": _times(result, row, writing, saving)}
+    times = {"ms": _times(result, row, ms)}
     return {**about, "state": "done", **_figures(row), **times, **_anchor_figures(row)}
-
-
-def missing_figure(record: Mapping[str, Any]) -> str | None:
-    """The first figure that the record of a finished frame lacks, or that is no number, or None."""
-    means = ("mean_disagreement", "mean_sigma", "mean_network_sigma")
-    for name in (*_COUNTS, "near_zero", *means):
-        value = record.get(name, "none")
-        if not (isinstance(value, int | float) or (value is None and name in means)):
-            return name
-    complete = isinstance(record.get("ground_truth"), bool) and isinstance(record.get("ms"), Mapping)
-    return None if complete and isinstance(record.get("size"), list) else "ground_truth, ms or size"
 
 
 def _figures(row: RowResult) -> dict[str, Any]:
     """Counts and means of a frame."""
-    statistics, network_variance, K = row.statistics, row.network_variance, row.intrinsics.tolist()
-    variance = row.best[1]
-    assert statistics is not None
-    assert variance is not None
-    assert row.disagreement is not None
-    std, valid = variance.sqrt(), row.valid
+    statistics, network_variance, K = row.out.statistics, row.network_variance, row.intrinsics.tolist()
+    std, valid, disagreement = row.out.std[0], row.valid, row.map("disagreement")
+    assert disagreement is not None
     return {
         "size": list(row.size),
         "intrinsics": [K[0][0], K[1][1], K[0][2], K[1][2]],
         "T_world_cam": row.T_world_cam,
-        "member": row.member,
+        "member": row.out.member,
         **{count: int(getattr(statistics, count)[0]) for count in _COUNTS},
-        "mean_disagreement": _mean(row.disagreement, valid),
+        "mean_disagreement": _mean(disagreement, valid),
         "mean_sigma": _mean(std, valid),
         "mean_network_sigma": None if network_variance is None else _mean(network_variance.sqrt(), valid),
         "near_zero": int(((std > 0) & (std < NEAR_ZERO)).sum()),
@@ -82,17 +69,16 @@ def _figures(row: RowResult) -> dict[str, Any]:
     }
 
 
-def _times(result: FrameResult, row: RowResult, writing: float, saving: float) -> dict[str, float]:
-    """Times by stage [ms]; stages overlap. "prepare" is the prediction's time without the network's, "save" the
-    previous frame's, "cycle" the time since the previous frame."""
+def _times(result: FrameResult, row: RowResult, after: Mapping[str, float]) -> dict[str, float]:
+    """Times by stage [ms]; stages overlap. "prepare" is the prediction's time without the network's, "cycle" the time
+    since the previous frame."""
     ms = result.ms
     return {
         "read": ms["read"],
         **{stage: row.ms[stage] for stage in ("network", "anchors") if stage in row.ms},
         "ufm": row.ms["uncertainty"],
-        "metrics": ms["truth"] + ms["metrics"],
-        "write": writing,
-        "save": saving,
+        "metrics": ms["truth"] + after["metrics"],
+        "write": after["write"],
         "prepare": ms["predict"] - row.ms.get("network", 0.0),
         "cycle": ms["cycle"],
     }
@@ -105,8 +91,8 @@ def _anchor_figures(row: RowResult) -> dict[str, Any]:
     triangulated ones (in view); ``usable``: of these, on a pixel with a depth; ``used``: of these, consistent with
     others. ``without``: why no anchor is used; ``confidence``: True if the network's confidence was used.
     """
-    landmarks, statistics = row.landmarks, row.statistics
-    if landmarks is None or statistics is None or row.anchored is None or row.bias is None:
+    landmarks, statistics, anchored, bias = row.landmarks, row.out.statistics, row.map("anchored"), row.map("bias")
+    if landmarks is None or anchored is None or bias is None:
         return {}
     assert statistics.anchors is not None
     assert statistics.anchors_used is not None
@@ -119,23 +105,23 @@ def _anchor_figures(row: RowResult) -> dict[str, Any]:
         counts["confidence"] = bool(statistics.confidence[0] > 0)
     return {
         "anchors": {**counts, "without": None if used else why},
-        "mean_anchored": _mean(row.anchored, row.valid),
-        "mean_bias": _mean(row.bias, row.valid),
+        "mean_anchored": _mean(anchored, row.valid),
+        "mean_bias": _mean(bias, row.valid),
         **_posterior_figures(row),
     }
 
 
 def _posterior_figures(row: RowResult) -> dict[str, Any]:
-    """Figures of held-out anchors (``FrameStatistics``), the quantiles of intervals (``UfMStarOutput``), and the mean
-    of sqrt(V) of UfM* [m], which ``mean_sigma`` is not; {} without a posterior."""
-    variance, statistics = row.variance, row.statistics
-    if variance is None or statistics is None or statistics.calibration is None or statistics.unseen is None:
+    """Figures of held-out anchors (``FrameStatistics``), the quantiles of intervals, and the mean of sqrt(V) of UfM*
+    [m], which ``mean_sigma`` is not; {} without a posterior."""
+    variance, statistics, quantiles = row.map("ufm_variance"), row.out.statistics, row.out.quantiles
+    if variance is None or quantiles is None or statistics.calibration is None or statistics.unseen is None:
         return {}
     calibration = float(statistics.calibration[0])
     figures = {
         "calibration": calibration if math.isfinite(calibration) else None,
         "unseen": float(statistics.unseen[0]),
-        "quantiles": None if row.distribution is None else row.distribution.quantiles[0].tolist(),
+        "quantiles": quantiles[0].tolist() if row.out.has_intervals else None,
     }
     return {"posterior": figures, "mean_ufm_sigma": _mean(variance.sqrt(), row.valid)}
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ufmstar_torch.anchors.landmarks import LandmarkSource
 from ufmstar_torch.anchors.pose_fit import FollowedCorners, ImageFit
@@ -19,27 +18,14 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.check.image_fit import image_fit, track_corners
 from ufmstar_torch.eval.engine.anchors import AnchorSource, Tracks
 from ufmstar_torch.eval.engine.estimators import Gaussians
-from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
+from ufmstar_torch.eval.engine.judge import UFM
 from ufmstar_torch.eval.engine.predictions import DepthSource, content_digest
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.methods.setting import CORNERS, Setting
 from ufmstar_torch.eval.run.scale import NetworkScale
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
-from ufmstar_torch.eval.sequences.plugins import load_plugins
 from ufmstar_torch.posterior.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """The state of a run after a frame."""
-
-    position: int = 0  # number of processed frames, skipped ones included
-    unit: float | None = None  # of the depth PNGs [m per count]; None before the first frame
-    state: dict[str, Tensor] = field(default_factory=dict)  # of the run's row: UfM*, alternation, tracks
-    metrics: dict[str, dict[str, Tensor]] = field(default_factory=dict)  # sums of the metrics, by name
-    # {"first", "frames", "seconds"} of every start of the program.
-    sessions: list[dict[str, float]] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,26 +56,14 @@ class RunJob:
         """The fit of poses and intrinsics to the images; None if no corner could be tracked."""
         return image_fit(self.sequence, self.corners)
 
-    def metrics(self, checkpoint: Checkpoint) -> RunMetrics:
-        """The metrics, those of plug-ins included, with the sums of a checkpoint."""
-        return RunMetrics(UFM, checkpoint.metrics, load_plugins(self.settings.get("plugin", ())).metrics)
-
-    def row(self, checkpoint: Checkpoint) -> RowRunner:
-        """UfM* on the source, in the state of a checkpoint."""
+    def row(self) -> tuple[RowRunner, UfMStar]:
+        """UfM* on the source, in its initial state: as a row, and the module in it."""
         estimator = Gaussians(self.config, torch.device("cpu"), recalibration=self.recalibration)
         anchors = None
         if self.config.anchors is not None:
             anchors = AnchorSource(Setting(anchors=CORNERS), Tracks(landmark_source(self.landmarks)), self.sensor)
         row = RowRunner(UFM, self.source, estimator, every=self.every, anchors=anchors, skips_faults=True)
-        if checkpoint.state:
-            row.load_state(checkpoint.state)
-        return row
-
-    def ufm(self, checkpoint: Checkpoint) -> UfMStar:
-        """UfM* in the state of a checkpoint; the running one may be some frames ahead."""
-        estimator = self.row(checkpoint).estimator
-        assert isinstance(estimator, Gaussians)
-        return estimator.ufm
+        return row, estimator.ufm
 
     @property
     def source_identity(self) -> dict[str, Any]:
@@ -99,7 +73,7 @@ class RunJob:
         return {**self.source.identity, **anchors, **sensor}
 
     def identity(self) -> dict[str, Any]:
-        """Plain values on which the results depend. A run is only continued with equal values."""
+        """Plain values on which the results depend. A folder takes another run only with equal values."""
         sequence, part = self.sequence, tuple(self.sequence.entries[index] for index in self.indices)
         return {
             "sequence": {

@@ -178,7 +178,7 @@ class FramePanel:
     """One displayed frame: its image [H, W, 3] uint8 RGB of any size, and its maps [h, w] [m], NaN where unknown.
 
     ``maps`` has names of ``MAPS``, "depth" and "sigma" always, and "measured", the share of the disagreement from two
-    views or more, which draws stripes on the sigma of UfM*. ``note`` ("K = 31") is next to the name.
+    views or more, which draws stripes on the sigma of UfM*. ``note`` ("31 components") is next to the name.
     """
 
     name: str

@@ -54,7 +54,7 @@ class FinishedRun:
         except FrameError:  # the recording can no longer be read
             frame = None
         maps = {"depth": stored["depth"], "sigma": np.sqrt(stored["variance"]), "measured": stored["measured"]}
-        note = f"K = {record['components']}"
+        note = f"{record['components']} components"
         if "anchored" in stored:
             note += f", {record['anchors']['used']} anchors"
         if "network_depth" in stored:
@@ -88,12 +88,11 @@ class FinishedRun:
 def panel_of(name: str, note: str, frame: Frame, row: RowResult) -> FramePanel:
     """The image of a frame and a row's maps: depth, sigma and, with ground truth, the absolute error."""
     assert frame.image is not None
-    assert row.variance is not None
-    maps = {"depth": row.depth.float().numpy(), "sigma": row.variance.float().sqrt().numpy()}
+    maps = {"depth": row.depth.float().numpy(), "sigma": row.out.std[0].float().numpy()}
     if row.truth is not None:
         maps["error"] = absolute_error(maps["depth"], row.truth)
-    if row.measured is not None:
-        maps["measured"] = row.measured.float().numpy()
+    if (measured := row.map("measured")) is not None:
+        maps["measured"] = measured.float().numpy()
     image = field_of_view(frame.image, frame.intrinsics, row.intrinsics, row.size)
     shown = {key: known_where(row.valid.numpy(), values) for key, values in maps.items()}
     return FramePanel(name, image, shown, note)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.eval.engine.judge import UFM
 from ufmstar_torch.eval.engine.predictions import FramePredictions
-from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink
+from ufmstar_torch.eval.engine.stream import FrameResult
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.panels import FramePanel
 from ufmstar_torch.eval.run.pictures import panel_of
@@ -22,7 +22,7 @@ from ufmstar_torch.eval.sequences.frame import FrameError
 from ufmstar_torch.frames.choose import choose
 from ufmstar_torch.steps.sample import sample_statistics
 
-# The quantities for ranking, V, M, A, E and B, and their maps in ``RowResult``.
+# The quantities for ranking, V, M, A, E and B, and their maps.
 PARTS = {
     "total": "variance", "disagreement": "disagreement", "aleatoric": "aleatoric", "epistemic": "epistemic",
     "anchored": "anchored",
@@ -44,7 +44,7 @@ class RankedImage:
     depth: float
 
 
-class ImageScores(FrameSink):
+class ImageScores:
     """Scores the ``images`` of sequences, in the order of processing.
 
     Args:
@@ -60,18 +60,19 @@ class ImageScores(FrameSink):
         self.images: list[RankedImage] = []
         self._shown: list[tuple[float, int, FramePanel]] = []  # score, number of the image, picture
 
-    def take(self, result: FrameResult) -> None:
+    def add(self, result: FrameResult) -> None:
         """Score an image."""
         row = result.rows.get(UFM)
         if row is None or result.frame is None:
             return
         parts = {}
         for name, of in PARTS.items():
-            if (values := getattr(row, of)) is not None:
+            if (values := row.map(of)) is not None:
                 masked = torch.where(row.valid, values, torch.nan).flatten()[None]
                 parts[name] = {key: float(value) for key, value in asdict(sample_statistics(masked)).items()}
-        assert row.measured is not None
-        share = float((row.measured >= 0.5)[row.valid].float().mean())
+        measured = row.map("measured")
+        assert measured is not None
+        share = float((measured >= 0.5)[row.valid].float().mean())
         score = parts[self._by]["mean"] if share >= self._measured else float("nan")
         columns = {f"{n}_{key}_{unit}": one[key] for n, one in parts.items() for key, unit in _UNITS.items()}
         line = {"sequence": self.sequence, "frame": result.name, "measured": share, **columns}

@@ -1,35 +1,39 @@
 """``run``: processes a sequence with a depth source and UfM*, and writes the results.
 
-A frame's files are complete or absent. An interrupted run continues with the same results.
+A frame's files are complete or absent. The same command, after an interruption too, computes the same results; it
+reuses the networks' predictions.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.engine.progress import Progress, ProgressSink
-from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
+from ufmstar_torch.eval.engine.predictions import CacheError, PredictionCache
+from ufmstar_torch.eval.engine.progress import Progress, frame_progress
+from ufmstar_torch.eval.engine.stream import Stopped, frame_results
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.engine.writer_thread import WriterThread
 from ufmstar_torch.eval.run.folder import output_folder
 from ufmstar_torch.eval.run.gaussians import write_mixture_npz, write_mixture_ply
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.pictures import FinishedRun, common_columns, draw_sheet, draw_video
-from ufmstar_torch.eval.run.run_folder import RUN, RunFolder
+from ufmstar_torch.eval.run.run_folder import CACHE, RUN, RunFolder
 from ufmstar_torch.eval.run.summary import FAILED, FINISHED, INTERRUPTED, write_summary
 from ufmstar_torch.frames.warnings import LOGGER
+from ufmstar_torch.ufmstar import UfMStar
 
 Show = Callable[[Progress], None]
 Stop = Callable[[], bool]
+_AGAIN = "the same command computes the rest, with the predictions so far"
 
 
 def run(
     job: RunJob,
     out: str | Path,
     *,
-    resume: bool = False,
     overwrite: bool = False,
     progress: Show = lambda _: None,
     stop: Stop = lambda: False,
@@ -44,40 +48,38 @@ def run(
 
     Raises:
         FolderError: the folder cannot be used (``output_folder``).
+        CacheError: predictions cannot be stored there.
         OSError: the summary cannot be written.
         Exception: any other error of the network or UfM*, after the summary was written.
     """
-    path, identity = Path(out), {"identity": job.identity()}
-    how = {"resume": resume, "overwrite": overwrite}
-    with output_folder(path, RUN, identity, **how) as resumed, RunFolder(job, path, resumed) as folder:
-        no_end = "no orderly end: the program was killed, or is still running"
-        for text in write_summary(folder, INTERRUPTED, no_end)["warnings"]:
+    path = Path(out)
+    with output_folder(path, RUN, {"identity": job.identity()}, overwrite=overwrite):
+        folder, row, ufm = RunFolder(job, path), *job.row()
+        cache = PredictionCache(path / CACHE) if job.source.cacheable else None
+        no_end = f"no orderly end: the program was killed ({_AGAIN}), or is still running"
+        for text in write_summary(folder, ufm.mixture, INTERRUPTED, no_end)["warnings"]:
             LOGGER.warning("%s", text)
         ending, outputs = (FAILED, "an error in the program"), {}
         try:
-            _frames(folder, progress, stop)
+            warm_up_job(job, progress)
+            shown = frame_progress(progress, len(job.indices))
+            results = frame_results(job.sequence, job.indices, [row], cache=cache, stop=stop)
+            with closing(results), WriterThread() as writer:
+                for result in results:  # reads, predicts, updates
+                    writer.call(folder.write, result)
+                    shown(result)
             ending = _ending(folder)
-            outputs = _outputs(folder, progress, stop)
+            outputs = _outputs(folder, ufm, progress, stop)
         except (KeyboardInterrupt, Stopped):
-            ending = INTERRUPTED, f"stopped by the user after {_counts(folder)}; --resume goes on"
-        except OSError as error:
-            ending = FAILED, f"{error}; stopped after {_counts(folder)}; --resume goes on"
+            ending = INTERRUPTED, f"stopped by the user after {_counts(folder)}; {_AGAIN}"
+        except (OSError, CacheError) as error:
+            ending = FAILED, f"{error}; stopped after {_counts(folder)}; {_AGAIN}"
         except BaseException as error:
             ending = FAILED, f"{type(error).__name__}: {error}"
             raise
         finally:
-            summary = write_summary(folder, *ending, outputs)
+            summary = write_summary(folder, ufm.mixture, *ending, outputs)
     return summary
-
-
-def _frames(folder: RunFolder, progress: Show, stop: Stop) -> None:
-    """Process the remaining frames."""
-    job = folder.job
-    warm_up_job(job, progress)
-    row, position = job.row(folder.checkpoint), folder.checkpoint.position
-    stream = FrameStream(job.sequence, job.indices, [row], start=position)
-    with WriterThread([folder.metrics, folder]) as writer:
-        stream.drive([writer, ProgressSink(progress, _skipped(folder))], stop=stop)
 
 
 def warm_up_job(job: RunJob, progress: Show) -> None:
@@ -103,13 +105,12 @@ def _counts(folder: RunFolder) -> str:
     return f"{done} ({skipped} skipped)" if skipped else done
 
 
-def _outputs(folder: RunFolder, progress: Show, stop: Stop) -> dict[str, str | None]:
+def _outputs(folder: RunFolder, ufm: UfMStar, progress: Show, stop: Stop) -> dict[str, str | None]:
     """Write the mixture and pictures of all finished frames. Returns by file None, or why it was not made."""
     job = folder.job
     done = [record for record in folder.records if record["state"] == "done"]
     if not done:
         return {}
-    ufm = job.ufm(folder.checkpoint)
     write_mixture_ply(folder.path / "mixture.ply", ufm.mixture, T_world_first=ufm.T_world_first)
     write_mixture_npz(folder.path / "mixture.npz", ufm.mixture, T_world_first=ufm.T_world_first)
     made: dict[str, str | None] = dict.fromkeys(("mixture.ply", "mixture.npz"))

@@ -26,17 +26,21 @@ from ufmstar_torch.gaussians.mixture import GaussianMixture
 FINISHED, INTERRUPTED, FAILED = "finished", "interrupted", "failed"
 Records = Sequence[Mapping[str, Any]]
 _MAPS = 12  # depth maps that are compared with their images
-STAGES = ("read", "prepare", "network", "anchors", "ufm", "metrics", "write", "save")
+STAGES = ("read", "prepare", "network", "anchors", "ufm", "metrics", "write")
 
 
 def write_summary(
-    folder: RunFolder, state: str, reason: str, outputs: Mapping[str, str | None] | None = None
+    folder: RunFolder,
+    mixture: GaussianMixture,
+    state: str,
+    reason: str,
+    outputs: Mapping[str, str | None] | None = None,
 ) -> dict[str, Any]:
-    """Write summary.json from the run's records and sums, and return its content as plain values. ``outputs`` has by
+    """Write summary.json from the run's records and figures, and return its content as plain values. ``outputs`` has by
     file None, or why the file was not made. Raises OSError: the summary cannot be written."""
-    job, checkpoint, records = folder.job, folder.checkpoint, folder.records
+    job, records = folder.job, folder.records
     done = [record for record in records if record["state"] == "done"]
-    figures = job.metrics(checkpoint).figures()
+    figures = folder.metrics.figures()
     result = UFM if job.config.posterior is None else POSTERIOR
     no_truth = "no ground truth" if job.sensor is None else "the recording's depth serves as anchors"
     alone_reason = "the depth comes without a variance of its own"
@@ -62,8 +66,8 @@ def write_summary(
         "uncertainty": _uncertainty(done),
         "recalibrated": job.recalibration is not None,
         "anchors": _anchors(done),
-        "mixture": _mixture(done, job.ufm(checkpoint).mixture),
-        "time": _time(done, checkpoint.sessions),
+        "mixture": _mixture(done, mixture),
+        "time": _time(done, folder.seconds),
         "outputs": outputs or {},
         "settings": job.settings,
         "versions": versions(),
@@ -240,7 +244,7 @@ def _mixture(done: Records, mixture: GaussianMixture) -> dict[str, Any]:
     }
 
 
-def _time(done: Records, sessions: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+def _time(done: Records, seconds: float) -> dict[str, Any]:
     """Medians by stage. "frame" is the time between two frames, which is shorter than the sum of the stages, because
     threads read and write frames. The rate is that of the median frame, because the first one also loads libraries and
     compiled kernels."""
@@ -249,6 +253,5 @@ def _time(done: Records, sessions: Sequence[Mapping[str, float]]) -> dict[str, A
     return {
         "median_ms": {stage: median(times) if times else None for stage, times in stages.items()} | {"frame": total},
         "frames_per_second": 1000 / total if total else None,
-        "wall_seconds": sum(session["seconds"] for session in sessions),
-        "sessions": list(sessions),
+        "wall_seconds": seconds,
     }

@@ -116,7 +116,7 @@ def _poses(
         raise ValueError(
             f"no image has a pose: images lie at {np.nanmin(times):.3f} to {np.nanmax(times):.3f} s, the trajectory's "
             f"{len(stamps)} poses at {stamps[0]:.3f} to {stamps[-1]:.3f} s{gap}, used where they lie at most "
-            f"{options.max_pose_gap:g} s apart; see --max-pose-gap, --time-offset and --fps"
+            f"{options.max_pose_gap:g} s apart; see --reader max_pose_gap, --time-offset and --fps"
         )
     return poses
 

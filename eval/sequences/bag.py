@@ -253,7 +253,7 @@ def _choose(bag: Bag, options: Options) -> _Topics:
         listed = list(candidates)
         chosen = [name for name in listed if name in named] or _without_transports(listed)
         if len(chosen) > 1:
-            raise ValueError(f"{bag.path}: {kind} may be {', '.join(sorted(chosen))}: name one with --topics")
+            raise ValueError(f"{bag.path}: {kind} may be {', '.join(sorted(chosen))}: name one with --reader topics")
         return chosen[0] if chosen else ""
 
     image = one("the image", images)
@@ -353,7 +353,7 @@ class _Content:
         if self._trajectory is None:  # tf
             self._body = topics.frame or chain[-1]
             if self._body not in chain or not self._tree.moves(chain[: chain.index(self._body)]):
-                other = f"it has {', '.join(chain)}; name another one by --topics {topics.pose}=FRAME"
+                other = f"it has {', '.join(chain)}; name another one by --reader topics={topics.pose}=FRAME"
                 how = f"how the image's frame {self._camera!r} moves in {self._body!r}"
                 raise ValueError(f"{self.bag.path}: tf does not say {how}; {other}")
             return
@@ -361,7 +361,7 @@ class _Content:
         self._body = topics.frame or (self._body if of_odometry else self._camera)
         if self._body != self._camera and not set(self._tree.chain(self._body)) & set(chain):
             what = f"{self._body!r}, whose poses {topics.pose} has, with the image's frame {self._camera!r}"
-            remedy = f"if they are the camera's, say --topics {topics.pose}={self._camera}"
+            remedy = f"if they are the camera's, say --reader topics={topics.pose}={self._camera}"
             raise ValueError(f"{self.bag.path}: tf does not connect {what}; {remedy}")
 
     def pose(self, time: float, max_gap: float) -> np.ndarray | None:

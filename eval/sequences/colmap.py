@@ -127,7 +127,7 @@ def _chosen_model(path: Path, index: int | None) -> Path:
     largest = max(models, key=lambda model: counts[model])
     others = ", ".join(f"{model.name} with {counts[model]}" for model in models if model != largest)
     LOGGER.warning(
-        "%s: the model %s with %d images is read, not %s; --model-index chooses another one",
+        "%s: the model %s with %d images is read, not %s; --reader model_index chooses another one",
         path, largest.name, counts[largest], others,
     )  # fmt: skip
     return largest

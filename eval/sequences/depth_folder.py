@@ -10,7 +10,8 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.attach import pair_by_name
 from ufmstar_torch.eval.sequences.frame import FrameError
-from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, SCALE_KEY, check_scale, list_files, read_depth, read_map
+from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, SCALE_KEY, list_files, read_depth, read_map
+from ufmstar_torch.eval.sequences.options import check_scale
 
 _VARIANCE_SUFFIXES = (".npy", ".npz", ".exr", ".tif", ".tiff")
 

@@ -192,12 +192,6 @@ def within(load: Loader, most: float) -> np.ndarray:
     return np.where(depth <= most, depth, np.float32(0))
 
 
-def check_scale(depth_scale: float | None) -> None:
-    """Raises ValueError: metres per unit is neither None nor in (0, 1]."""
-    if depth_scale is not None and not 0 < depth_scale <= 1:
-        raise ValueError(f"depth_scale is in metres per unit (0.001: millimetres, 1/5000: TUM), got {depth_scale}")
-
-
 def positive(depth: np.ndarray) -> np.ndarray:
     """A depth map of float32 with 0 for values that are not finite or not positive."""
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))

@@ -7,11 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from ufmstar_torch.eval.sequences.frame import Size
-from ufmstar_torch.eval.sequences.poses import numbered_lines, read_matrix
-from ufmstar_torch.gaussians.camera import resize_intrinsics
 
 # A file's path, a matrix [3, 3] (or ScanNet's [4, 4]), or the numbers fx, fy, cx, cy [px].
 IntrinsicsLike = str | Path | np.ndarray | Sequence[float]
@@ -31,6 +28,8 @@ _PROJECTION = re.compile(r"P(?:_rect_0)?\d\s*:(.*)")
 def read_intrinsics(source: IntrinsicsLike) -> np.ndarray:
     """[3, 3] float64 [px] from a text file or numbers: 3x3, 4x4, 3x4, or ``fx fy cx cy``; or from KITTI's calib.txt or
     calib_cam_to_cam.txt. Raises ValueError: the file or array has another shape, or KITTI's cameras differ."""
+    from ufmstar_torch.eval.sequences.poses import read_matrix
+
     if isinstance(source, str | Path):
         kitti = _projections(Path(source))
         values, source_name = read_matrix(source) if kitti is None else kitti, f"intrinsics file {source}"
@@ -48,6 +47,8 @@ def read_intrinsics(source: IntrinsicsLike) -> np.ndarray:
 def _projections(path: Path) -> np.ndarray | None:
     """[3, 3] of the projections ``P0:`` (or ``P_rect_00:``) ... of KITTI's rectified cameras, which have equal
     intrinsics; None if the file has no such line. Raises ValueError: a line has no 12 numbers, or they differ."""
+    from ufmstar_torch.eval.sequences.poses import numbered_lines
+
     found = []
     for number, text in numbered_lines(path):
         if line := _PROJECTION.fullmatch(text.strip()):
@@ -99,6 +100,10 @@ def camera_matrix(
 def scale_intrinsics(K: np.ndarray, old: Size | None, new: Size | None) -> np.ndarray:
     """K [3, 3] of images (H, W) ``old`` after a resize to ``new``; unchanged if a size is unknown. Raises ValueError:
     the aspect ratios differ, so the images were not only resized."""
+    import torch
+
+    from ufmstar_torch.gaussians.camera import resize_intrinsics
+
     if old is None or new is None or old == new:
         return K.copy()
     if abs((new[1] / new[0]) / (old[1] / old[0]) - 1) > _ASPECT_TOLERANCE:

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.images import check_scale
 from ufmstar_torch.eval.sequences.intrinsics import DEPTH_FILES, FILES, IntrinsicsLike, camera_file, parse_intrinsics
 from ufmstar_torch.gaussians.conventions import CONVENTIONS, OURS
-
-_WORD, _WORDS = {"type": str | None}, {"type": tuple[str, ...]}  # types on the command line
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -49,27 +46,27 @@ class Options:
     """
 
     layout: str = "auto"
-    intrinsics: IntrinsicsLike | None = field(default=None, metadata=_WORDS)
-    distortion: str | Sequence[str | float] | None = field(default=None, metadata=_WORDS)
-    depth_intrinsics: IntrinsicsLike | None = field(default=None, metadata=_WORDS)
+    intrinsics: IntrinsicsLike | None = None
+    distortion: str | Sequence[str | float] | None = None
+    depth_intrinsics: IntrinsicsLike | None = None
     truth_scale: float | None = None
     max_truth: float | None = None
-    trajectory: str | Path | None = field(default=None, metadata=_WORD)  # with our axes, camera-to-world
-    poses: str = field(default=OURS, metadata={"choices": tuple(CONVENTIONS)})
+    trajectory: str | Path | None = None  # with our axes, camera-to-world
+    poses: str = OURS
     pose_scale: float | None = None
     fps: float | None = None  # multiplies the numbers of images if the layout has such numbers
     time_offset: float = 0.0
     # At 0.1 s a hand that accelerates at 2 m/s^2 departs 2.5 mm from the straight line.
     max_pose_gap: float = 0.1
     max_time_difference: float = 0.02
-    images: str | Path | None = field(default=None, metadata=_WORD)
-    truth: str | Path | None = field(default=None, metadata=_WORD)
-    T_color_depth: np.ndarray | str | Path | None = field(default=None, metadata=_WORD)
+    images: str | Path | None = None
+    truth: str | Path | None = None
+    T_color_depth: np.ndarray | str | Path | None = None
     topics: tuple[str, ...] = ()
     model_index: int | None = None
-    drive: str | int | None = field(default=None, metadata=_WORD)
+    drive: str | int | None = None
     scans: int | None = None  # moving things smear
-    plugin: tuple[str, ...] = field(default=(), metadata={"typed": True})
+    plugin: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("intrinsics", "depth_intrinsics"):
@@ -102,6 +99,12 @@ class Options:
             if name in self.changed():
                 other = "use layout='generic' to combine images, depth and a trajectory freely"
                 raise ValueError(f"layout {layout!r} takes no {name}: its files hold that; {other}")
+
+
+def check_scale(depth_scale: float | None) -> None:
+    """Raises ValueError: metres per unit is neither None nor in (0, 1]."""
+    if depth_scale is not None and not 0 < depth_scale <= 1:
+        raise ValueError(f"depth_scale is in metres per unit (0.001: millimetres, 1/5000: TUM), got {depth_scale}")
 
 
 def with_camera_files(options: Options, folder: Path) -> Options:

@@ -1,1 +1,1 @@
-"""Evaluations of tables: folder, records, cache of predictions, shards."""
+"""Evaluations of tables: folder, records, tasks."""

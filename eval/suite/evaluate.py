@@ -19,7 +19,6 @@ from ufmstar_torch.eval.engine.stream import Stopped
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.run.machine import hardware, versions
-from ufmstar_torch.eval.suite.examples import ExampleWriter
 from ufmstar_torch.eval.suite.job import EvalJob
 from ufmstar_torch.eval.suite.record import Record
 from ufmstar_torch.eval.suite.work_items import TOUR, WorkItem
@@ -73,7 +72,7 @@ def evaluate_item(
     left_out = [row for row in missing if row not in possible]
     lines = []
     if todo:
-        sinks = [ExampleWriter(folder.sequence_folder(item))] if job.stores_examples(item) else []
+        examples = folder.sequence_folder(item) if job.stores_examples(item) else None
         needed = with_references(todo, possible)
 
         def shown(state: Progress) -> None:
@@ -82,7 +81,7 @@ def evaluate_item(
         try:
             for problem in check_sequence(sequence).problems if sequence.layout != TOUR else ():
                 LOGGER.warning("%s: %s (ufmstar data check)", item.label, problem)
-            results = evaluate_sequence(sequence, needed, judge, sinks=sinks, stop=stop, progress=shown)
+            results = evaluate_sequence(sequence, needed, judge, examples=examples, stop=stop, progress=shown)
         except BROKEN as error:
             return folder.fail(item, error, missing)
         for result in results:

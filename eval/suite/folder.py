@@ -2,7 +2,8 @@
 
 ```
 OUT/eval.json                          suite, rows, networks, sequences, settings
-OUT/eval.lock, eval-I-of-N.lock        locked while eval.json is written, and while shard I of N is evaluated
+OUT/eval.lock                          locked during an evaluation
+OUT/eval.stop                          exists while tasks in other processes must end
 OUT/records/DATASET/SEQUENCE/ROW.json  a record, written after ROW.pt: if it exists, both are complete
 OUT/records/DATASET/SEQUENCE/failed.json
 ```
@@ -11,8 +12,8 @@ OUT/records/DATASET/SEQUENCE/failed.json
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,33 +21,24 @@ from typing import Any
 from ufmstar_torch.eval.engine.judge import RowFigures
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.run.files import remove_temporaries, write_json_atomic
-from ufmstar_torch.eval.run.folder import FolderError, FolderKind, hold, output_folder
+from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
 from ufmstar_torch.eval.suite.record import FORMAT, Record, ResultsError
-from ufmstar_torch.eval.suite.work_items import ALL, Shard, WorkItem
+from ufmstar_torch.eval.suite.work_items import WorkItem
 
-FAILED, CACHE = "failed.json", "cache"
+FAILED, CACHE, STOP = "failed.json", "cache", "eval.stop"
 # Files of a report; --overwrite removes them.
 _REPORT: tuple[str, ...] = ("efficiency.json", "results.csv", "report.html")
 _REPORT += ("tables/*.md", "tables/*.tex", "tables/*.csv", "figures/*.png", "figures/*.svg", "figures/*.json")
 _OF_SEQUENCE = ("*.json", "*.pt", "examples/*.npz", "room/*.npz")
 
 
-@contextmanager
 def evaluation_folder(
-    out: Path, about: Mapping[str, Any], *, shard: Shard = ALL, resume: bool = False, overwrite: bool = False
-) -> Iterator[None]:
-    """Create or resume the folder, and lock a shard; see ``output_folder``. A resume adds rows, sequences and networks
-    of ``about`` (eval.json) to the earlier evaluation; suite, settings and the networks of the same base must be equal.
-    The cache of predictions is never removed. Also raises FolderError: another process evaluates the same shard, or any
-    shard of a folder to overwrite."""
-    with output_folder(out, EVALUATION, about, resume=resume, overwrite=overwrite):  # unlocked for other shards
-        lock = hold(out / f"eval-{shard.index}-of-{shard.count}.lock")
-    if lock is None:
-        raise FolderError(f"--out {out}: another process is evaluating shard {shard} there now")
-    try:
-        yield
-    finally:
-        lock.release()
+    out: Path, about: Mapping[str, Any], *, resume: bool = False, overwrite: bool = False
+) -> AbstractContextManager[bool]:
+    """Create or resume the folder, and lock it; see ``output_folder``. A resume adds rows, sequences and networks of
+    ``about`` (eval.json) to the earlier evaluation; suite, settings and the networks of the same base must be equal.
+    The cache of predictions is never removed."""
+    return output_folder(out, EVALUATION, about, resume=resume, overwrite=overwrite)
 
 
 @dataclass(frozen=True)
@@ -66,9 +58,10 @@ class EvalFolder:
         remove_temporaries(path for pattern in (".*.tmp", "*/.*.tmp") for path in folder.glob(pattern))
         return self.missing(item, rows)
 
-    def is_finished(self, item: WorkItem, rows: Iterable[Row]) -> bool:
-        """True if every row has a record, or the sequence has failed."""
-        return (self.sequence_folder(item) / FAILED).exists() or not self.missing(item, rows)
+    def has_begun(self, item: WorkItem, rows: Iterable[Row]) -> bool:
+        """True if the sequence has a folder, but neither all records nor the reason of a failure."""
+        folder = self.sequence_folder(item)
+        return folder.is_dir() and not (folder / FAILED).exists() and bool(self.missing(item, rows))
 
     def missing(self, item: WorkItem, rows: Iterable[Row]) -> list[Row]:
         """The rows without a readable record."""
@@ -157,9 +150,7 @@ EVALUATION = FolderKind(
     manifest="eval.json",
     format=FORMAT,
     lock="eval.lock",
-    wait=60.0,
-    parts=("eval-*-of-*.lock",),
-    files=(*(f"records/*/*/{pattern}" for pattern in _OF_SEQUENCE), *_REPORT),
+    files=(STOP, *(f"records/*/*/{pattern}" for pattern in _OF_SEQUENCE), *_REPORT),
     allowed=(CACHE,),
     temporary=(".eval.json.*.tmp",),
     identity=_identity,

@@ -75,9 +75,10 @@ class EvalJob:
         return {
             "suite": suite.name,
             "title": suite.title,
+            **({"separate": True} if suite.separate else {}),
             "networks": {base: network.identity for base, network in networks.items()},
             "rows": [row.to_dict() for row in suite.rows],
-            "datasets": sorted({item.dataset for item in self.items}),
+            "datasets": list(dict.fromkeys(item.dataset for item in self.items)),
             "sequences": [{"dataset": item.dataset, "sequence": item.sequence} for item in self.items],
             "missing_bases": list(self.missing_bases),
             "settings": {"frames": [f.start, f.stop, f.step], **bins, **opening},

@@ -1,4 +1,4 @@
-"""The sequences of an evaluation, and their shards."""
+"""The sequences of an evaluation."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import hashlib
 import random
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -48,39 +48,6 @@ class WorkItem:
         return sequence
 
 
-@dataclass(frozen=True)
-class Shard:
-    """One of several equal parts of the sequences.
-
-    Raises:
-        ValueError: no such part.
-    """
-
-    index: int = 1  # which, from 1
-    count: int = 1  # number of parts
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.index <= self.count:
-            raise ValueError(f"--shard must be 1/n to n/n, got {self}")
-
-    @classmethod
-    def parse(cls, text: str) -> Shard:
-        """Parse "i/n", i from 1 to n. Raises ValueError: another form."""
-        if not (match := re.fullmatch(r"(\d+)/(\d+)", text)):
-            raise ValueError(f"--shard must be i/n, 1/4 to 4/4 for four parts, got {text!r}")
-        return cls(int(match[1]), int(match[2]))
-
-    def __str__(self) -> str:
-        return f"{self.index}/{self.count}"
-
-    def of(self, items: Sequence[WorkItem]) -> list[WorkItem]:
-        """The shard's items: every n-th, so that similar neighbours are in different shards."""
-        return list(items[self.index - 1 :: self.count])
-
-
-ALL = Shard()
-
-
 def find_work(
     roots: Iterable[str],
     *,
@@ -89,7 +56,7 @@ def find_work(
     only: Iterable[str] | None = None,
     opening: Options = _AS_THEY_ARE,
 ) -> list[WorkItem]:
-    """All sequences below the roots, sorted.
+    """All sequences below the roots, data sets in the order of the roots, sequences by name.
 
     Args:
         roots: ``[DATASET=]PATH``: a folder with sequences below it, a sequence, or ``tour:SEED``. DATASET is the
@@ -103,13 +70,16 @@ def find_work(
         FileNotFoundError: no such root.
         ValueError: no sequence below a root, an unknown name in ``only``, or one name twice in a data set.
     """
-    items = sorted({item for root in roots for item in _below(root, opening)})
+    found = [item for root in roots for item in _below(root, opening)]
+    order_of_dataset = {name: number for number, name in enumerate(dict.fromkeys(item.dataset for item in found))}
+    items = sorted(set(found), key=lambda item: (order_of_dataset[item.dataset], item))
     twice = [key for key, n in Counter(item.folder for item in items).items() if n > 1]
     if twice:
         paths = ", ".join(item.path for item in items if item.folder == twice[0])
         raise ValueError(f"--root: {twice[0].as_posix()} stands for {paths}: name their data sets, DATASET=DIR")
     if only is not None:
-        items = _chosen(items, list(only))
+        chosen = _chosen(items, list(only))
+        items = [item for item in items if item in chosen]
     if sample is None:
         return items
     sampled: list[WorkItem] = []
@@ -149,14 +119,14 @@ def _below(root: str, opening: Options) -> list[WorkItem]:
     return [WorkItem(dataset or one.layout, one.name, str(one.path.absolute()), how) for one, how in each]
 
 
-def _chosen(items: list[WorkItem], only: list[str]) -> list[WorkItem]:
+def _chosen(items: list[WorkItem], only: list[str]) -> set[WorkItem]:
     """The items with the names ``only``. Raises ValueError: a name without an item."""
     named = {name: [item for item in items if name in (item.sequence, item.label)] for name in only}
     missing = [name for name, chosen in named.items() if not chosen]
     if missing:
         shown = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if len(missing) > 3 else "")
         raise ValueError(f"--sequence-list names sequences that are not there: {shown}")
-    return sorted({item for chosen in named.values() for item in chosen})
+    return {item for chosen in named.values() for item in chosen}
 
 
 def _safe(name: str) -> str:

@@ -1,4 +1,4 @@
-"""Anchors, an extension that ``UncertainDepth`` switches on: sparse depths reveal errors that all views share."""
+"""Anchors, which ``UncertainDepth`` switches on: sparse depths that reveal errors that all views share."""
 
 from typing import TYPE_CHECKING
 

@@ -6,15 +6,16 @@ pixel. ``evidence`` describes how these errors are accumulated and spread over t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from ufmstar_torch.frames.arguments import require_float, require_mask
-from ufmstar_torch.frames.frame import FrameInput
-from ufmstar_torch.gaussians.fixed_order import apply, product
+from ufmstar_torch.frames.frame import AnchorInput, FrameInput
+from ufmstar_torch.gaussians.camera import focal_and_centre
+from ufmstar_torch.gaussians.fixed_order import apply
 
 # Largest factor between an anchor and the prediction. A single anchor beyond it would dominate the mean of all others,
 # and larger values overflow in the state. More than FEW such anchors, if they outnumber the valid ones, show that the
@@ -115,14 +116,15 @@ class Anchors:
         pixel = require_float("anchors.pixel", self.pixel).detach().double()
         if pixel.dim() != 3 or pixel.shape[2] != 2:
             raise ValueError(f"anchors.pixel must be [B, N, 2], got {tuple(pixel.shape)}")
-        # inv_ex does not synchronise with the device; for singular intrinsics the result is not finite.
-        mapping = product(K_to.detach().double(), torch.linalg.inv_ex(K_from.detach().double().to(K_to.device)).inverse)
-        mapping = mapping.to(pixel.device)
+        (fx, fy, cx, cy), (fx_to, fy_to, cx_to, cy_to) = (
+            focal_and_centre(K.detach().double().to(pixel.device)) for K in (K_from, K_to)
+        )
+        scale = torch.stack([fx_to / fx, fy_to / fy], -1)[..., None, :]
+        offset = torch.stack([cx_to, cy_to], -1)[..., None, :] - scale * torch.stack([cx, cy], -1)[..., None, :]
         motion = self.motion
         if motion is not None:
-            at = apply(mapping[..., None, :2, :2], motion[..., :2]) + mapping[..., None, :2, 2]
-            motion = torch.cat([at, motion[..., 2:]], -1)
-        return replace(self, pixel=apply(mapping[..., None, :2, :2], pixel) + mapping[..., None, :2, 2], motion=motion)
+            motion = torch.cat([motion[..., :2] * scale + offset, motion[..., 2:]], -1)
+        return replace(self, pixel=pixel * scale + offset, motion=motion)
 
     def to(self, device: torch.device | str) -> Anchors:
         """Copy the anchors to another device."""
@@ -130,41 +132,43 @@ class Anchors:
         return replace(self, **moved)
 
 
-@dataclass(frozen=True)
-class AnchorInput:
-    """Checked anchors, and the frame's values at their pixels.
-
-    Attributes:
-        pixel: [B, N, 2] position (u, v) [px]; 0 where it is impossible or outside the image.
-        index: [B, N] int64 of the pixel in the flattened image.
-        predicted: [B, N] the network's depth at the pixel [m]; 1 where not valid.
-        depth, variance: [B, N] of the anchor [m], [m^2]; 1 and 0 where not valid.
-        own_variance: [B, N] variance that the network predicts at the pixel, A + E as far as they are used [m^2].
-        valid: [B, N] bool: finite, depth > 0, 0 <= variance < depth^2, within a factor of 100 of the prediction, on a
-            valid pixel, not masked.
-        rejected: [B] number of anchors that only this factor makes invalid; None = not counted.
-        contradiction: [B] mean r^2 of the rejected anchors, r at most 100, where they outnumber the valid ones and
-            therefore measure the prediction's error; else 0. None = not counted.
-        pose_error, shared, scale, motion, moving: as in :class:`Anchors`.
-    """
-
-    pixel: Tensor
-    index: Tensor
-    predicted: Tensor
-    depth: Tensor
-    variance: Tensor
-    own_variance: Tensor
-    valid: Tensor
-    rejected: Tensor | None = None
-    contradiction: Tensor | None = None
-    pose_error: Tensor | None = None
-    shared: Tensor | None = None
-    scale: Tensor | None = None
-    motion: Tensor | None = None
-    moving: Tensor | None = None
+# Pixel, depth and variance, the mask of usable anchors, and the frame -> the first columns of ``AnchorInput``: pixel,
+# index, predicted, depth, variance, valid, rejected and contradiction.
+Checked = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+CheckAnchors = Callable[[Tensor, Tensor, Tensor, Tensor | None, FrameInput], Checked]
 
 
-def check_anchors(anchors: Anchors, frame: FrameInput, network_variances: Sequence[Tensor] = ()) -> AnchorInput:
+def check_anchor_values(
+    pixel: Tensor, depth: Tensor, variance: Tensor, mask: Tensor | None, frame: FrameInput
+) -> Checked:  # fmt: skip
+    """Check the values of anchors: pixel [B, N, 2] [px], depth [B, N] [m], variance [B, N] [m^2], all float64, and mask
+    [B, N] or None; the caller has checked shapes and dtypes."""
+    # Standard deviations are compared, as the square of a large depth overflows.
+    usable = (depth > 0) & (depth < torch.inf) & (variance >= 0) & (variance.sqrt() < depth) & inside(pixel, frame.size)
+    if mask is not None:
+        usable = usable & mask
+    one, zero = torch.ones_like(depth), torch.zeros_like(depth)
+    pixel = torch.where(usable[..., None], pixel, zero[..., None])
+    u, v = pixel.round().long().unbind(-1)
+    index = v * frame.size[1] + u
+    predicted = torch.gather(frame.depth.flatten(1), 1, index).double()
+    usable = usable & torch.gather(frame.valid.flatten(1), 1, index)
+    near = (depth <= FARTHEST_OFF * predicted) & (predicted <= FARTHEST_OFF * depth)
+    valid, far = usable & near, usable & ~near
+    rejected = far.sum(1)
+    square = torch.where(far, (depth / predicted - 1).clamp_max(FARTHEST_OFF).square(), zero).sum(1)
+    many = (rejected > FEW) & (rejected > valid.sum(1))
+    contradiction = torch.where(many, square / rejected.clamp_min(1), torch.zeros_like(square))
+    predicted, depth = torch.where(valid, predicted, one), torch.where(valid, depth, one)
+    return pixel, index, predicted, depth, torch.where(valid, variance, zero), valid, rejected, contradiction
+
+
+def check_anchors(
+    anchors: Anchors,
+    frame: FrameInput,
+    network_variances: Sequence[Tensor] = (),
+    kernel: CheckAnchors = check_anchor_values,
+) -> AnchorInput:
     """Check the anchors of one frame and convert them to float64 on the depth's device.
 
     An anchor is invalid if a value is impossible, if it lies outside the image or on a pixel without depth, if its
@@ -174,6 +178,7 @@ def check_anchors(anchors: Anchors, frame: FrameInput, network_variances: Sequen
         anchors: see :class:`Anchors`.
         frame: of the same B streams.
         network_variances: the network's variances in use, of A and E, each [B, H, W] [m^2].
+        kernel: an implementation of :func:`check_anchor_values`.
 
     Raises:
         TypeError: ``anchors`` is no :class:`Anchors`, or a field is no tensor or has the wrong kind of dtype.
@@ -187,10 +192,9 @@ def check_anchors(anchors: Anchors, frame: FrameInput, network_variances: Sequen
     shape = [(b, pixel.shape[1])]
     depth = require_float("anchors.depth", anchors.depth, shape, frame.depth).detach().double()
     variance = require_float("anchors.variance", anchors.variance, shape, frame.depth).detach().double()
-    # Standard deviations are compared, as the square of a large depth overflows.
-    usable = (depth > 0) & (depth < torch.inf) & (variance >= 0) & (variance.sqrt() < depth) & inside(pixel, frame.size)
-    if anchors.valid is not None:
-        usable = usable & require_mask("anchors.valid", anchors.valid, shape, frame.depth)
+    mask = anchors.valid
+    if mask is not None:
+        mask = require_mask("anchors.valid", mask, shape, frame.depth)
     for name in ("pose_error", "shared", "scale"):
         if (value := getattr(anchors, name)) is not None:
             require_float(f"anchors.{name}", value, [(b,)], frame.depth)
@@ -199,39 +203,24 @@ def check_anchors(anchors: Anchors, frame: FrameInput, network_variances: Sequen
         motion = require_float("anchors.motion", motion, like=frame.depth).detach().double()
         if motion.dim() != 3 or motion.shape[0] != b or motion.shape[2] != 3:
             raise ValueError(f"anchors.motion must be [{b}, M, 3], got {tuple(motion.shape)}")
-    one, zero = torch.ones_like(depth), torch.zeros_like(depth)
-    pixel = torch.where(usable[..., None], pixel, zero[..., None])
-    u, v = pixel.round().long().unbind(-1)
-    index = v * frame.size[1] + u
-    predicted = torch.gather(frame.depth.flatten(1), 1, index).double()
-    usable = usable & torch.gather(frame.valid.flatten(1), 1, index)
-    near = (depth <= FARTHEST_OFF * predicted) & (predicted <= FARTHEST_OFF * depth)
-    valid, far = usable & near, usable & ~near
-    rejected = far.sum(1)
-    square = torch.where(far, (depth / predicted - 1).clamp_max(FARTHEST_OFF).square(), zero).sum(1)
-    many = (rejected > FEW) & (rejected > valid.sum(1))
+    pixel, index, predicted, depth, variance, valid, rejected, contradiction = kernel(
+        pixel, depth, variance, mask, frame
+    )
+    predicted_variance = torch.zeros_like(depth)
+    if network_variances:
+        predicted_variance = torch.where(valid, _variance_at(network_variances, index), predicted_variance)
     return AnchorInput(
-        pixel=pixel,
-        index=index,
-        predicted=torch.where(valid, predicted, one),
-        depth=torch.where(valid, depth, one),
-        variance=torch.where(valid, variance, zero),
-        own_variance=torch.where(valid, _variance_at(network_variances, index, zero), zero),
-        valid=valid,
-        rejected=rejected,
-        contradiction=torch.where(many, square / rejected.clamp_min(1), torch.zeros_like(square)),
+        pixel, index, predicted, depth, variance, predicted_variance, valid, rejected, contradiction,
         pose_error=anchors.pose_error,
         shared=anchors.shared,
         scale=anchors.scale,
         motion=motion,
         moving=anchors.moving,
-    )
+    )  # fmt: skip
 
 
-def _variance_at(network_variances: Sequence[Tensor], index: Tensor, default: Tensor) -> Tensor:
-    """[B, N] float64 sum of the maps ``network_variances`` [B, H, W] at pixels ``index``; ``default`` without maps."""
-    if not network_variances:
-        return default
+def _variance_at(network_variances: Sequence[Tensor], index: Tensor) -> Tensor:
+    """[B, N] float64 sum of the maps ``network_variances`` [B, H, W] at pixels ``index``."""
     total, *others = (torch.gather(value.detach().flatten(1), 1, index) for value in network_variances)
     for other in others:
         total = total + other

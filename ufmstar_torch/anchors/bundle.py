@@ -112,13 +112,7 @@ class PoseRefinement(SavedState):
         Returns:
             [W, 4, 4] refined poses; the input poses if too few corners are seen, or after a jump.
         """
-        from ufmstar_torch.anchors.kernels.bundle import (  # compiles when needed
-            FAR,
-            NEAR,
-            equations,
-            inverse_depths,
-            moved,
-        )
+        from ufmstar_torch.anchors.kernels.bundle import adjusted, equations, inverse_depths, moved
 
         self.shared, self.jumped = 0.0, False
         tracks, views = seen[:, -1] & (seen.sum(1) > 1), np.flatnonzero(seen.any(0))
@@ -130,25 +124,23 @@ class PoseRefinement(SavedState):
         precision = seen[np.ix_(tracks, views[:-1])] / growth * (K[0, 0] / _TRACKING) ** 2
         prior = np.broadcast_to(1 / (self._variance[:, None] * unit**2), (len(views), 2, 3)).ravel()
         shift = self.offset.shift(T_world_cam[views])
-        poses, error = moved(T_world_cam[views], shift.ravel()), np.zeros(len(prior))
+        poses = moved(T_world_cam[views], shift.ravel())
         rho = inverse_depths(ray, precision, poses, 1 / depth, _STUDENT, _DEPTH_STEPS)
+        A, b, by_error, rho_step = equations(ray, precision, poses, rho, 1 / depth, _STUDENT)
         try:
-            for _ in range(_STEPS):
-                A, b, by_error, rho_step = equations(ray, precision, poses, rho, 1 / depth, _STUDENT)
-                A, b = _INFORMATION * A, _INFORMATION * b
-                if not error.any() and self._jumps(A[-6:, -6:], b[-6:], prior[-6:], unit):
-                    self.jumped = True
-                    return T_world_cam
-                A = A + np.diag(prior)
-                step = np.asarray(np.linalg.solve(A, b - prior * error), np.float64)
-                poses, error = moved(poses, step), error + step
-                rho = (rho + rho_step - by_error @ step).clip(FAR / depth, NEAR / depth)
-            covariance = np.asarray(np.linalg.inv(A), np.float64)
+            self.jumped = self._jumps(_INFORMATION * A[-6:, -6:], _INFORMATION * b[-6:], prior[-6:], unit)
         except np.linalg.LinAlgError:  # singular: values far out of scale
             return T_world_cam
+        if self.jumped:
+            return T_world_cam
+        first = A, b, by_error, rho_step
+        result = adjusted(ray, precision, poses, rho, 1 / depth, _STUDENT, first, prior, _INFORMATION, _STEPS)
+        if result is None:
+            return T_world_cam
+        error, covariance, by_poses = result
         if not (np.isfinite(poses).all() and np.isfinite(covariance).all()):
             return T_world_cam
-        self.shared = median((by_error @ covariance * by_error).sum(1))
+        self.shared = median(by_poses)
         self._offset_variance = float(np.square(shift[-1].reshape(2, 3) / unit).sum()) / 3
         self._learn(error[-6:].reshape(2, 3) / unit, covariance.diagonal()[-6:].reshape(2, 3) / unit**2)
         self.offset.learn(T_world_cam[views], prior, error, covariance)

@@ -27,18 +27,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.extension import AnchorFrame
-from ufmstar_torch.config import ConfidenceConfig, UfMStarConfig
-from ufmstar_torch.frames.arguments import require_float
-from ufmstar_torch.frames.extension import Chosen, Extension, FrameExtension, Tensors, Total
-from ufmstar_torch.frames.frame import LARGEST, FrameInput
-from ufmstar_torch.frames.output import StepOutput
-from ufmstar_torch.gaussians.state import UfMStarState
+from ufmstar_torch.config import ConfidenceConfig
+from ufmstar_torch.frames.frame import LARGEST, AnchorInput, FrameInput
 
 # Numbers per anchor: c, y, w. Statistics of the gains: the number of frames, and, for the gain over V and over one
 # factor, the sum and the sum of squares, all with exponential forgetting.
@@ -144,103 +138,60 @@ def read(c: Tensor, edges: Tensor, h: Tensor) -> Tensor:
     return torch.where(c.isnan(), 1.0, h.gather(1, bins))
 
 
-class ConfidenceFrame(FrameExtension):
-    """The confidence of one frame.
+def after_frame(
+    packed: Tensor, frame: FrameInput, variance: Tensor | None, config: ConfidenceConfig
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Test the map at the frame's anchors, update it with them, and apply it.
 
     Args:
-        c: [B, H, W] float32.
-        of_anchors: the frame's anchors; None = the map is applied but not updated.
-        frame: of B streams.
+        packed: [B, S] the statistics of the frames before (:class:`Learnt`).
+        frame: with a confidence.
+        variance: V before the map [B, H, W] [m^2]; None = the map is applied but not updated.
         config: of the confidence.
+
+    Returns:
+        The statistics, h(c) [B, H, W], and the gain [B] (:meth:`Learnt.gain`); h is 1 where the gain is not positive.
     """
-
-    def __init__(self, c: Tensor, of_anchors: AnchorFrame | None, frame: FrameInput, config: ConfidenceConfig) -> None:
-        self._c, self._anchors, self._frame, self._config = c, of_anchors, frame, config
-        self._factor: Tensor | None = None
-
-    def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
-        """Test the map at the frame's anchors, update it with them, and compute h at every pixel."""
-        learnt = Learnt.of(state.by_stream["confidence"])
-        if self._anchors is not None and self._anchors.anchors is not None:
-            learnt = self._taught(learnt, total(self._anchors.disagreement(out.disagreement, self._frame.depth)))
-        edges, h, _ = factors(learnt, self._config)
-        gain = learnt.gain()
-        h = torch.where(gain[:, None] > 0, h, torch.ones_like(h))
-        self._factor = read(self._c.flatten(1).to(edges), edges, h).view_as(self._c)
-        state = state.with_tensors({"confidence": learnt.packed()})
-        return state, replace(out, statistics=replace(out.statistics, confidence=gain))
-
-    def _taught(self, learnt: Learnt, variance: Tensor) -> Learnt:
-        """The statistics after the frame's anchors; ``variance`` is V before the map [B, H, W]."""
-        assert self._anchors is not None
-        anchors, dtype = self._anchors.anchors, learnt.c.dtype
-        assert anchors is not None
-        c = self._c.flatten(1).gather(1, anchors.index).to(dtype)
-        V = variance.detach().flatten(1).gather(1, anchors.index).double()
-        usable = anchors.valid & V.isfinite() & (V > 0) & ~c.isnan()
-        V = torch.where(usable, V, torch.ones_like(V))
-        spread = V + anchors.variance
-        y = ((anchors.depth - anchors.predicted).square() / spread).clamp_max(self._config.largest).to(dtype)
-        w = torch.where(usable, (V / spread).square(), torch.zeros_like(V)).to(dtype)
-        edges, h, one = factors(learnt, self._config)
-        likelihood = [-0.5 * (y / f + f.log()) for f in (read(c, edges, h), torch.ones_like(one), one)]
-        weight = w.sum(1)
-        gains = [(w * (likelihood[0] - other)).sum(1) / weight.clamp_min(1e-6) for other in likelihood[1:]]
-        enough = (learnt.w > 0).sum(1) >= FULL * self._config.bins
-        judged = learnt.judged(gains, enough & (weight > 0), self._config.half_life)
-        return judged.added(c.nan_to_num(), y, w, self._config.each)
-
-    def map_variance(self, variance: Tensor, chosen: Chosen) -> Tensor:
-        """V' = h(c) V."""
-        return variance if self._factor is None else variance * chosen(self._factor).to(variance.dtype)
+    assert frame.confidence is not None
+    learnt = Learnt.of(packed)
+    if variance is not None and frame.anchors is not None:
+        learnt = _taught(learnt, frame.confidence, frame.anchors, variance, config)
+    edges, h, _ = factors(learnt, config)
+    gain = learnt.gain()
+    h = torch.where(gain[:, None] > 0, h, torch.ones_like(h))
+    factor = read(frame.confidence.flatten(1).to(edges), edges, h).view_as(frame.confidence)
+    return learnt.packed(), factor, gain
 
 
-class ConfidenceExtension(Extension):
-    """The network's confidence, calibrated at anchors. ``config``: with ``confidence`` and ``anchors``."""
-
-    argument = "confidence"
-
-    def __init__(self, config: UfMStarConfig) -> None:
-        assert config.confidence is not None
-        self._config: ConfidenceConfig = config.confidence
-
-    def by_stream(self, streams: int, dtype: torch.dtype, device: torch.device | str) -> dict[str, Tensor]:
-        """``confidence`` [B, 3 N + 5], the last N anchors and the gains (:class:`Learnt`)."""
-        return {"confidence": torch.zeros(streams, FIELDS * self._config.anchors + GAINS, dtype=dtype, device=device)}
-
-    def require_state(self, state: Tensors) -> None:
-        """See :meth:`Extension.require_state`."""
-        learnt = Learnt.of(state["confidence"])
-        bad = (learnt.w < 0) | (learnt.w > 1) | (learnt.y < 0) | (learnt.y > self._config.largest)
-        if bool(bad.any()) or bool((learnt.gains[:, ::2] < 0).any()) or bool((learnt.gains.abs() > LARGEST).any()):
-            raise ValueError("confidence holds impossible errors, weights or gains")
-
-    def of_frame(
-        self,
-        frame: FrameInput,
-        network_variances: Sequence[Tensor],
-        argument: Any,
-        before: Sequence[FrameExtension],
-        *,
-        dense: bool,
-    ) -> FrameExtension:
-        """The frame's confidence; nothing without one. Without ``dense``, the map is applied but not updated.
-
-        Raises:
-            TypeError, ValueError: ``confidence`` is no map of the depth's shape.
-        """
-        if argument is None:
-            return FrameExtension()
-        of_anchors = [one for one in before if isinstance(one, AnchorFrame)] if dense else []
-        return ConfidenceFrame(
-            as_confidence(argument, frame), of_anchors[0] if of_anchors else None, frame, self._config
-        )
+def _taught(
+    learnt: Learnt, confidence: Tensor, anchors: AnchorInput, variance: Tensor, config: ConfidenceConfig
+) -> Learnt:
+    """The statistics after a frame's anchors."""
+    dtype = learnt.c.dtype
+    c = confidence.flatten(1).gather(1, anchors.index).to(dtype)
+    V = variance.detach().flatten(1).gather(1, anchors.index).double()
+    usable = anchors.valid & V.isfinite() & (V > 0) & ~c.isnan()
+    V = torch.where(usable, V, torch.ones_like(V))
+    spread = V + anchors.variance
+    y = ((anchors.depth - anchors.predicted).square() / spread).clamp_max(config.largest).to(dtype)
+    w = torch.where(usable, (V / spread).square(), torch.zeros_like(V)).to(dtype)
+    edges, h, one = factors(learnt, config)
+    likelihood = [-0.5 * (y / f + f.log()) for f in (read(c, edges, h), torch.ones_like(one), one)]
+    weight = w.sum(1)
+    gains = [(w * (likelihood[0] - other)).sum(1) / weight.clamp_min(1e-6) for other in likelihood[1:]]
+    enough = (learnt.w > 0).sum(1) >= FULL * config.bins
+    judged = learnt.judged(gains, enough & (weight > 0), config.half_life)
+    return judged.added(c.nan_to_num(), y, w, config.each)
 
 
-def as_confidence(values: Any, frame: FrameInput) -> Tensor:
-    """Convert a confidence to [B, H, W] float32, clamped to finite values. Raises TypeError, ValueError: not a map of
-    the depth's shape."""
-    size = tuple(frame.depth.shape)
-    c = require_float("confidence", values, [size, (size[0], 1, *size[1:])], frame.depth).detach()
-    limit = torch.finfo(torch.float32).max
-    return c.reshape(size).float().clamp(-limit, limit)
+def size(config: ConfidenceConfig) -> int:
+    """Numbers per stream of the statistics."""
+    return FIELDS * config.anchors + GAINS
+
+
+def require(packed: Tensor, config: ConfidenceConfig) -> None:
+    """Raise a ValueError if no anchors can have led to the statistics."""
+    learnt = Learnt.of(packed)
+    bad = (learnt.w < 0) | (learnt.w > 1) | (learnt.y < 0) | (learnt.y > config.largest)
+    if bool(bad.any()) or bool((learnt.gains[:, ::2] < 0).any()) or bool((learnt.gains.abs() > LARGEST).any()):
+        raise ValueError("confidence holds impossible errors, weights or gains")

@@ -30,6 +30,7 @@ from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, OtherCameraErro
 from ufmstar_torch.anchors.motion import LANDMARK, LINE, OFF_LINE, SEARCH, MotionTests, Tested, located, moves
 from ufmstar_torch.anchors.saved_state import SavedState
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
+from ufmstar_torch.gaussians.camera import inverse_intrinsics
 from ufmstar_torch.runtime.checked import Checked, number
 
 if TYPE_CHECKING:
@@ -49,6 +50,9 @@ _SCALE = 0.005
 _COARSE_NOISE = 4.0
 # [px] Distance from the border within which a view does not show a position.
 _BORDER = 3
+# Mapping of pixels to those of an image of half the size, and back.
+_HALVED = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
+_DOUBLED = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1]])
 _CORNERS = "corners_"  # prefix of the names of the tracker's state
 
 
@@ -311,7 +315,7 @@ class DenseEvidence(SavedState):
         from ufmstar_torch.anchors.kernels.check import CERTAIN, confirmed
         from ufmstar_torch.anchors.kernels.dense import measure
 
-        self._baseline = float(np.linalg.norm(np.linalg.inv(K) @ views.b[-1]))
+        self._baseline = float(np.linalg.norm(inverse_intrinsics(K) @ views.b[-1]))
         matches = measure(small, pixel, views, self._search())
         accepted = confirmed(pixel, matches, cell)
         agreeing = accepted[matches.agreed + matches.contradicted > 1]
@@ -333,9 +337,8 @@ class DenseEvidence(SavedState):
         from ufmstar_torch.anchors.kernels.dense import MARGIN, Views, measure
 
         half = _halved(small)
-        S = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
-        H, images = S @ views.H @ np.linalg.inv(S), np.stack([_halved(image) for image in views.image])
-        reduced = Views(images, np.ascontiguousarray(H), np.ascontiguousarray(views.b @ S.T), views.noise / 4)
+        H, images = _HALVED @ views.H @ _DOUBLED, np.stack([_halved(image) for image in views.image])
+        reduced = Views(images, np.ascontiguousarray(H), np.ascontiguousarray(views.b @ _HALVED.T), views.noise / 4)
         occupied = (occupied - 0.5) / 2
         inside = ((occupied >= 0) & (occupied < half.shape[::-1])).all(1)
         pixel = _pixels(half, cell // 2, occupied[inside])
@@ -374,7 +377,7 @@ class DenseEvidence(SavedState):
         shares, keyframes = (np.array(column) for column in zip(*chosen, strict=True))
         image, pose = self._keyframes.images(keyframes), self._keyframes.poses(keyframes)
         R_keyframe_world = pose[:, :3, :3].transpose(0, 2, 1)
-        H = K @ R_keyframe_world @ T[:3, :3] @ np.linalg.inv(K)
+        H = K @ R_keyframe_world @ T[:3, :3] @ inverse_intrinsics(K)
         b = ((T[:3, 3] - pose[:, :3, 3])[:, None] @ pose[:, :3, :3])[:, 0] @ K.T
         noise = self._errors.positions(K, width, self._depth)[shares]
         return Views(image, np.ascontiguousarray(H), np.ascontiguousarray(b), noise), shares

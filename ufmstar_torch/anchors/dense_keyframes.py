@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.anchors.saved_state import SavedState, saved_image
+from ufmstar_torch.gaussians.camera import inverse_intrinsics
 
 # A frame becomes a keyframe if the camera has moved by this share of the median depth, or turned by this angle [rad].
 _MOVED, _TURNED = 0.015, np.deg2rad(4.0)
@@ -104,7 +105,7 @@ class Keyframes(SavedState):
         """[n] share of a grid of points, at a depth in the camera T, that the views show."""
         height, width = self._image[0].shape
         v, u = (np.indices((4, 4)).reshape(2, -1) + 0.5) / 4
-        rays = np.linalg.inv(K) @ np.stack([u * width, v * height, np.ones(16)])
+        rays = inverse_intrinsics(K) @ np.stack([u * width, v * height, np.ones(16)])
         K_R = K @ pose[:, :3, :3].transpose(0, 2, 1)
         moved = K_R @ (T[:3, 3] - pose[:, :3, 3])[..., None]
         x, y, z = np.moveaxis(K_R @ (depth * T[:3, :3] @ rays) + moved, 1, 0)

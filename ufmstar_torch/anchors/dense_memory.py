@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.anchors.epipolar import MEDIAN_SQUARE, median
 from ufmstar_torch.anchors.saved_state import SavedState
+from ufmstar_torch.gaussians.camera import inverse_intrinsics
 
 # A landmark is measured again when the camera has moved by the share _DUE of its depth, times 1 plus the number of
 # confirmations, at most _LONGEST.
@@ -193,7 +194,7 @@ class Memory(SavedState):
             slot = np.argsort(age, kind="stable")[: len(rho)]
             self.confirmed[slot] = 0
         n = len(slot)
-        rays = np.concatenate([pixel[:n], np.ones((n, 1))], axis=1) @ np.linalg.inv(K).T
+        rays = np.concatenate([pixel[:n], np.ones((n, 1))], axis=1) @ inverse_intrinsics(K).T
         self._point[slot] = rays / rho[:n, None] @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
         self._pose[slot], self._sigma[slot] = T_world_cam, np.sqrt(variance[:n]) / rho[:n]
         self._patch[slot] = patches(image, pixel[:n])

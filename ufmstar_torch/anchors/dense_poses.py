@@ -20,6 +20,7 @@ d^2 for each baseline, as far as the pixels determine d, and the camera's errors
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -92,7 +93,8 @@ class PoseErrors(SavedState):
         self._variance = np.zeros((self._baselines, 2))  # of w and s [rad^2, m^2]
         self._unexplained = np.full(self._baselines, _FIRST_UNEXPLAINED**2)  # [px^2]
         self._disagreement = 1.0
-        self._camera, self._covariance = np.zeros(CAMERA), np.eye(CAMERA)
+        self._camera: NDArray[np.float64] = np.zeros(CAMERA)
+        self._covariance: NDArray[np.float64] = np.eye(CAMERA)
 
     def positions(self, K: NDArray[np.float64], width: int, depth: float) -> NDArray[np.float64]:
         """[baselines] variance of a position in a keyframe by all errors [px^2], at a depth [m], in an image of a
@@ -151,7 +153,7 @@ class PoseErrors(SavedState):
             return Fit(measured.rho, np.full(len(pixel), np.inf), np.full(len(pixel), np.nan))
         self._learn_poses(solution, shares, K, depth)
         if trusted:
-            self._learn_camera(solution, views.image.shape[2])
+            self._learn_camera(solution, prior[0][-CAMERA:, -CAMERA:], views.image.shape[2])
         compared = used & (measured.agreed > 1)[:, None]
         self._learn_noise(solution.residual[compared], solution.across_residual, measured.across_noise, shows, shares)
         dispersion = (self._disagreement + solution.residual.sum(1)) / np.maximum(measured.agreed, 1)
@@ -161,12 +163,10 @@ class PoseErrors(SavedState):
 
     def _prior(self, shares: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Prior precision [S, S] and mean [S] of the errors of V keyframes and of the camera, S = 6 V + 4."""
-        sigma = np.sqrt(np.repeat(self._variance[shares], 3, axis=1))
-        shared = np.where(np.eye(len(shares)), 1.0, _SHARED)
-        poses = np.einsum("kl,kc,lc,cd->kcld", np.linalg.inv(shared), 1 / sigma, 1 / sigma, np.eye(POSE))
+        over = np.repeat(1 / np.sqrt(self._variance[shares]), 3, axis=1).ravel()
         n = POSE * len(shares)
         precision = np.zeros((n + CAMERA, n + CAMERA))
-        precision[:n, :n] = poses.reshape(n, n)
+        precision[:n, :n] = _shared_precision(len(shares)) * over * over[:, None]
         precision[n:, n:] = np.linalg.inv(self._covariance)
         return precision, np.concatenate([np.zeros(n + 3), self._camera[3:]])  # K includes the first three
 
@@ -180,13 +180,13 @@ class PoseErrors(SavedState):
             step = (1 - self._memory) * (error2 - determined * before) / np.maximum(determined, 1)
             self._variance[share] = np.maximum(before + step, least)
 
-    def _learn_camera(self, solution: Solution, width: int) -> None:
-        precision, prior = np.linalg.inv(self._covariance), np.linalg.inv(self._camera_prior(width))
+    def _learn_camera(self, solution: Solution, precision: NDArray[np.float64], width: int) -> None:
+        prior = np.diag(1 / self._camera_prior(width).diagonal())
         posterior = np.linalg.inv(solution.covariance[-CAMERA:, -CAMERA:])
         measured = solution.error[-CAMERA:] + np.append(self._camera[:3], 0)
         weighted = (1 - _PART) * precision @ self._camera + _PART * posterior @ measured
         combined = (1 - _PART) * precision + _PART * posterior
-        self._covariance = np.linalg.inv((1 - _FADE) * combined + _FADE * prior)
+        self._covariance = np.asarray(np.linalg.inv((1 - _FADE) * combined + _FADE * prior), np.float64)
         self._camera = self._covariance @ weighted * (1 - _FADE)
 
     def _learn_noise(
@@ -211,6 +211,13 @@ class PoseErrors(SavedState):
 
     def _faded(self, running: float, newest: float) -> float:
         return self._memory * running + (1 - self._memory) * float(newest)
+
+
+@functools.lru_cache(maxsize=8)
+def _shared_precision(views: int) -> NDArray[np.float64]:
+    """[6 V, 6 V] inverse of the correlation of the errors of V keyframes' relative poses."""
+    shared = np.where(np.eye(views), 1.0, _SHARED)
+    return np.asarray(np.kron(np.linalg.inv(shared), np.eye(POSE)))
 
 
 def _medians(values: NDArray[np.float64], where: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -10,7 +10,8 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from ufmstar_torch.anchors.anchors import FARTHEST_OFF, AnchorInput, Anchors, inside
+from ufmstar_torch.anchors.anchors import FARTHEST_OFF, Anchors, inside
+from ufmstar_torch.frames.frame import AnchorInput
 
 _LOG = logging.getLogger("ufmstar_torch")
 _FEW = 8  # least anchors of a frame that are judged

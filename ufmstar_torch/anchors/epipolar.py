@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.gaussians.camera import inverse_intrinsics
+
 # Least depth of a projected point, as a share of the median depth; the depth of nearer points is raised to it.
 NEAREST = 1e-3
 # Limit of the inverse depth, as a share of that at which a point reaches the earlier camera's focal plane.
@@ -32,7 +34,7 @@ def off_lines(
     Returns:
         [N] distances [px], [N] inverse depths of the nearest points on the whole lines [1/m], [N] baselines [m].
     """
-    rays = np.concatenate([position, np.ones((len(position), 1))], axis=1) @ np.linalg.inv(K).T
+    rays = np.concatenate([position, np.ones((len(position), 1))], axis=1) @ inverse_intrinsics(K).T
     R_before_world = T_before[:, :3, :3].transpose(0, 2, 1)
     shift = (R_before_world @ (T[:3, 3] - T_before[:, :3, 3])[..., None])[..., 0]
     x, b = (R_before_world @ (T[:3, :3] @ rays.T).T[..., None])[..., 0] @ K.T, shift @ K.T

@@ -38,7 +38,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.anchors import AnchorInput
+from ufmstar_torch.frames.frame import AnchorInput
 from ufmstar_torch.gaussians.fixed_order import total
 
 SUMS = 3  # entries of a row of sums: w, w r and w e

@@ -96,8 +96,9 @@ class Landmarks:
         moving = torch.tensor([self.moving], device=intrinsics.device)
         error, shared, scale = frame
         values = padded(self.pixel), padded(self.depth), padded(self.variance)
-        result = Anchors(*values, valid, error, shared, scale, motion, moving)
-        return result.moved(torch.as_tensor(K_camera), intrinsics.reshape(3, 3))
+        result, K = Anchors(*values, valid, error, shared, scale, motion, moving), intrinsics.reshape(3, 3)
+        same = K.is_cpu and np.array_equal(K.numpy(), K_camera)
+        return result if same else result.moved(torch.as_tensor(K_camera), K)
 
 
 class LandmarkSource(Protocol):

@@ -44,7 +44,7 @@ class PoseCheck:
         if not self._left or image.is_meta:
             return
         T_first, K_first = (x.detach().reshape(-1, *x.shape[-2:])[:1].cpu().double() for x in (pose, intrinsics))
-        if any(camera_faults(T_first, K_first, (torch.inf, torch.inf), self._tolerance)):
+        if any(camera_faults(T_first.numpy(), K_first.numpy(), (torch.inf, torch.inf), self._tolerance)):
             return
         try:
             gray, T, K = checked(

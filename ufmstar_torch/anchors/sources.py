@@ -16,12 +16,11 @@ from torch import Tensor
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.anchors.landmarks import Landmarks, LandmarkSource
+from ufmstar_torch.anchors.names import CORNERS, DENSE, FILE_TYPES
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.files.arrays import read_npz
 from ufmstar_torch.gaussians.camera import invert_rigid
 
-CORNERS, DENSE = "corners", "dense"
-FILE_TYPES = (".csv", ".txt", ".npz")
 # Largest number of landmarks in one image; a tracker follows 300.
 _MAX_VISIBLE = 500
 

@@ -17,8 +17,8 @@ from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, LandmarkSource, OtherCameraError
 from ufmstar_torch.anchors.sources import landmark_source
 from ufmstar_torch.anchors.tracker import LandmarkTracker
-from ufmstar_torch.frames.frame import FRAME_FAULTS, intrinsics_fault, pose_fault
-from ufmstar_torch.gaussians.camera import rotation_deviation
+from ufmstar_torch.frames.frame import FRAME_FAULTS
+from ufmstar_torch.kernels.cpu.check import intrinsics_fault, pose_fault
 
 _LOG = logging.getLogger("ufmstar_torch")
 _CAUSES = (
@@ -114,7 +114,7 @@ class StreamLandmarks:
         before, faults = self._states(), [0] * b
         if rotation_tolerance is not None:
             size = (torch.inf, torch.inf) if images is None else images.shape[1:3]
-            faults = camera_faults(torch.from_numpy(T), K, size, rotation_tolerance)
+            faults = camera_faults(T, K.numpy(), size, rotation_tolerance)
         if not skip and (faulty := [f"stream {i}: {FRAME_FAULTS[fault]}" for i, fault in enumerate(faults) if fault]):
             raise ValueError("; ".join(faulty))
         try:
@@ -147,9 +147,11 @@ class StreamLandmarks:
                 _LOG.warning("stream %d: %s; no depth is used. %s", i, landmarks.none, _CAUSES)
         capacity = max(len(landmarks.depth) for landmarks in result)
         by_stream = [landmarks.anchors(K[i].numpy(), K[i], capacity) for i, landmarks in enumerate(result)]
+        device = pose.device if image is None else image.device
+        if len(by_stream) == 1:
+            return by_stream[0].to(device)
         fields = {name: torch.cat([getattr(anchors, name) for anchors in by_stream]) for name in _FIELDS}
-        anchors = Anchors(**fields, motion=_padded([anchors.motion for anchors in by_stream]))
-        return anchors.to(pose.device if image is None else image.device)
+        return Anchors(**fields, motion=_padded([anchors.motion for anchors in by_stream])).to(device)
 
     def _updated(
         self, source: LandmarkSource, image: NDArray[np.uint8] | None, T: NDArray[np.float64], K: NDArray[np.float64]
@@ -227,10 +229,12 @@ def _padded(motion: Sequence[Tensor | None]) -> Tensor | None:
     return result
 
 
-def camera_faults(pose: Tensor, K: Tensor, size: tuple[float, ...], tolerance: float) -> list[int]:
+def camera_faults(
+    pose: NDArray[np.float64], K: NDArray[np.float64], size: tuple[float, ...], tolerance: float
+) -> list[int]:
     """Indices into ``FRAME_FAULTS`` of poses [B, 4, 4] and intrinsics [B, 3, 3] of images of a size (H, W)."""
-    pose_faults = pose_fault(pose, rotation_deviation(pose[:, :3, :3]), tolerance)
-    return torch.where(pose_faults > 0, pose_faults, intrinsics_fault(K, size)).tolist()
+    cameras = zip(pose.tolist(), K.tolist(), strict=True)
+    return [pose_fault(T, tolerance) or intrinsics_fault(camera, *size) for T, camera in cameras]
 
 
 def as_bytes(image: Tensor) -> Tensor:

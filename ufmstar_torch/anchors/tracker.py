@@ -20,6 +20,7 @@ from ufmstar_torch.anchors.corners import find, follow
 from ufmstar_torch.anchors.epipolar import NEAREST, median, off_lines, weighted_median
 from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, OtherCameraError, checked
 from ufmstar_torch.anchors.saved_state import SavedState, saved_image
+from ufmstar_torch.gaussians.camera import inverse_intrinsics
 from ufmstar_torch.runtime.checked import Checked, number
 
 if TYPE_CHECKING:
@@ -333,7 +334,7 @@ class LandmarkTracker(SavedState):
         finite = np.isfinite(depth)
         if finite.sum() < _ENOUGH:
             return None
-        rays = np.concatenate([position, np.ones((len(position), 1))], axis=1) @ np.linalg.inv(K).T
+        rays = np.concatenate([position, np.ones((len(position), 1))], axis=1) @ inverse_intrinsics(K).T
         median_depth = median(depth[finite])
         point = np.where(finite[:, None], point, median_depth * rays @ last[:3, :3].T + last[:3, 3])
 

@@ -39,6 +39,7 @@ FRAME_FAULTS = (
     "intrinsics have their principal point outside the depth map; expected the intrinsics of the depth map, not those "
     "of an image of another size (ufmstar_torch.gaussians.camera.resize_intrinsics)",
 )
+NOT_FINITE = 1  # index of a pose with NaN or infinity
 # Accepted ranges. Within them, no square or quotient of the algorithm leaves the range of float32.
 DEPTH_RANGE = (1e-6, 1e6)  # [m]
 LARGEST = 1e12  # A and E [m^2], and entries of features
@@ -47,6 +48,40 @@ FARTHEST = 1e9  # [m] any coordinate of a camera
 # The principal point of real cameras and usual crops lies within these shares of the image; that of a K for twice or
 # half the size does not.
 CENTRE_RANGE = (0.2, 0.8)
+
+
+@dataclass(frozen=True)
+class AnchorInput:
+    """Checked anchors, and the frame's values at their pixels.
+
+    Attributes:
+        pixel: [B, N, 2] position (u, v) [px]; 0 where it is impossible or outside the image.
+        index: [B, N] int64 of the pixel in the flattened image.
+        predicted: [B, N] the network's depth at the pixel [m]; 1 where not valid.
+        depth, variance: [B, N] of the anchor [m], [m^2]; 1 and 0 where not valid.
+        own_variance: [B, N] variance that the network predicts at the pixel, A + E as far as they are used [m^2].
+        valid: [B, N] bool: finite, depth > 0, 0 <= variance < depth^2, within a factor of 100 of the prediction, on a
+            valid pixel, not masked.
+        rejected: [B] number of anchors that only this factor makes invalid; None = not counted.
+        contradiction: [B] mean r^2 of the rejected anchors, r at most 100, where they outnumber the valid ones and
+            therefore measure the prediction's error; else 0. None = not counted.
+        pose_error, shared, scale, motion, moving: as in :class:`~ufmstar_torch.anchors.anchors.Anchors`.
+    """
+
+    pixel: Tensor
+    index: Tensor
+    predicted: Tensor
+    depth: Tensor
+    variance: Tensor
+    own_variance: Tensor
+    valid: Tensor
+    rejected: Tensor | None = None
+    contradiction: Tensor | None = None
+    pose_error: Tensor | None = None
+    shared: Tensor | None = None
+    scale: Tensor | None = None
+    motion: Tensor | None = None
+    moving: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -68,6 +103,8 @@ class FrameInput:
         host_fault: ``fault`` on the CPU if pose and intrinsics were there, so that reading it does not wait; else None.
         member: [B] float64 index of the network, or of the random sample, that predicted; None = always the same.
         informative: [B] False where the image shows nothing, so that its depth is a guess; None = all True.
+        anchors: of the frame, or None.
+        confidence: [B, H, W] float32, finite or NaN, the network's confidence; None = not predicted, or not used.
     """
 
     depth: Tensor
@@ -84,6 +121,8 @@ class FrameInput:
     host_fault: Tensor | None = None
     member: Tensor | None = None
     informative: Tensor | None = None
+    anchors: AnchorInput | None = None
+    confidence: Tensor | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -210,6 +249,15 @@ def check_frame(
     else:  # filled on the device: a copy would synchronise
         index = torch.full(shape[:1], float(member), dtype=torch.float64, device=plain.device)
     return replace(frame, member=index, informative=_of_streams("informative", informative, plain))
+
+
+def as_confidence(values: object, frame: FrameInput) -> Tensor:
+    """Convert a confidence to [B, H, W] float32, clamped to finite values. Raises TypeError, ValueError: not a map of
+    the depth's shape."""
+    size = tuple(frame.depth.shape)
+    c = require_float("confidence", values, [size, (size[0], 1, *size[1:])], frame.depth).detach()
+    limit = torch.finfo(torch.float32).max
+    return c.reshape(size).float().clamp(-limit, limit)
 
 
 def raise_faults(frame: FrameInput) -> None:

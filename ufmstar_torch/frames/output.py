@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.gaussians.mixture import GaussianMixture
-from ufmstar_torch.posterior.conformal import NORMAL
 from ufmstar_torch.posterior.distribution import LEAST_VARIANCE, DepthDistribution
 
 _WITHOUT_EVIDENCE = (
@@ -100,6 +102,8 @@ class StepOutput:
         disagreement: M [B, H, W] [m^2] after the moving average, NaN where not valid; [B, n] on a subset.
         features: regressed features [B, H, W, F] or [B, n, F].
         measured: [B, H, W] or [B, n] share in [0, 1] of M that rests on surfaces seen from different places.
+        residual: [B, H, W, 2] or [B, n, 2] the relative error r and its excess e that anchors let expect
+            (``anchors.evidence``); None without ``config.anchors``.
         current_cam: C_i in the camera frame.
         statistics: of this frame.
     """
@@ -107,80 +111,103 @@ class StepOutput:
     disagreement: Tensor
     features: Tensor
     measured: Tensor
+    residual: Tensor | None
     current_cam: GaussianMixture
     statistics: FrameStatistics
 
 
+class MapKind(NamedTuple):
+    """A map of the output: the paper's symbol, the unit, and its meaning."""
+
+    symbol: str
+    unit: str
+    meaning: str
+
+
+# Every map of an output, in the order of files and pictures. [B, H, W], NaN where not valid.
+MAPS: dict[str, MapKind] = {
+    "depth": MapKind("", "m", "the best depth that is known: the posterior's, or else the network's"),
+    "variance": MapKind("", "m^2", "the variance of that depth"),
+    "network_depth": MapKind("d", "m", "the network's depth"),
+    "ufm_variance": MapKind("V", "m^2", "the variance of UfM* for the network's depth: M + A + E + B"),
+    "disagreement": MapKind("M", "m^2", "the multiview disagreement"),
+    "aleatoric": MapKind("A", "m^2", "the network's aleatoric variance; with variances_in_h averaged over views"),
+    "epistemic": MapKind("E", "m^2", "the network's epistemic variance; with variances_in_h likewise"),
+    "anchored": MapKind("B", "m^2", "the mean square error at anchors in excess of M + A + E"),
+    "bias": MapKind("r", "1", "the relative error g/d - 1 that anchors let expect"),
+    "measured": MapKind("s", "1", "the share of M that rests on surfaces seen from different places"),
+    "posterior_outlier": MapKind("p", "1", "the probability of another surface than that of the correcting anchors"),
+    "posterior_inlier_variance": MapKind("V_1", "m^2", "the variance on the surface of these anchors"),
+    "confidence": MapKind("c", "1", "the network's confidence, in its own unit"),
+    "features": MapKind("", "1", "the regressed further entries of H, [B, H, W, F], in the caller's units"),
+}
+
+
 @dataclass(frozen=True, repr=False)
-class UfMStarOutput:
-    """The prediction of one frame with its variance. Maps have the shape of the argument ``depth``.
+class UncertaintyOutput:
+    """The depth of one frame with its variance, of UfM* or of any other method.
+
+    Maps have the shape of the argument ``depth``. A further map is an attribute by its name in ``MAPS``, for example
+    ``out.disagreement``; it is None if the method does not compute it.
 
     Attributes:
-        depth: the argument ``depth`` [m].
-        variance: V, the total variance of the depth [m^2]: M, plus A and E if passed (and not switched off in the
-            config), plus B with ``config.anchors``; at least ``config.variance_floor``. NaN where not valid.
-        disagreement: M, the multiview disagreement [m^2]. NaN where not valid.
-        aleatoric, epistemic: the arguments A and E [m^2], or None; with ``config.variances_in_h`` of the mixture.
-        anchored: B, the mean square error at anchors in excess of M + A + E [m^2] (``evidence``); None unless
-            ``config.anchors``.
-        bias: the relative error r = g/d - 1 that anchors predict; None unless ``config.anchors``.
-        posterior_depth, posterior_variance: the results of :meth:`posterior`; None unless ``config.posterior``.
-        posterior_outlier: probability p that the pixel lies on another surface than the anchors that corrected it. NaN
-            before any anchor; None unless ``config.posterior``.
-        posterior_inlier_variance: V_1 [m^2], the variance if it lies on their surface. ``posterior_variance`` V is that
-            of the mixture: on another surface, the variance is (V - (1 - p) V_1)/p.
-        quantiles: [B, 3] half-widths of the central intervals of 50, 90 and 99 %, in standard deviations of a normal
-            distribution (``posterior.conformal``). NaN in a stream without evidence; None unless ``config.posterior``.
-        recalibrated: [B, 1] True if a ``Recalibration`` has mapped ``variance``, or None.
-        features: regressed further entries of H, [B, H, W, F], in the caller's units.
-        measured: share in [0, 1] of M that rests on surfaces seen from different places; below one half the pixel
-            counts as not measured (``config.unmeasured``). NaN where not valid.
+        depth: the best that is known [m]: the posterior's, NaN where not valid, or else the network's. Before the first
+            anchor of a stream, the posterior's equals the network's.
+        variance: of ``depth`` [m^2]: the posterior's, or else V of UfM*: M, plus A and E if passed (and not switched
+            off in the config), plus B with ``config.anchors``; at least ``config.variance_floor``. NaN where not valid.
+            The posterior's is that of a mixture: ``posterior_inlier_variance`` with the probability
+            1 - ``posterior_outlier``.
         valid: True where the pixel was used.
-        current_cam: C_i, the segments of this frame in the camera frame, float64.
+        maps: the further maps by name.
         statistics: per-stream counts of this frame.
+        quantiles: [B, 3] half-widths of the central intervals of 50, 90 and 99 %, in standard deviations of a normal
+            distribution (``posterior.conformal``). NaN in a stream without evidence; None without a posterior or a
+            ``Recalibration``.
+        current_cam: C_i, the segments of this frame in the camera frame, float64, or None.
+        prediction: the network's output, for "full" the predictive mean with mean A and E over the members; None for a
+            module without networks.
+        member: index of the network that was run; None if all were, or none.
     """
 
     depth: Tensor
     variance: Tensor
-    disagreement: Tensor
-    aleatoric: Tensor | None
-    epistemic: Tensor | None
-    features: Tensor
-    measured: Tensor
     valid: Tensor
-    current_cam: GaussianMixture
+    maps: Mapping[str, Tensor]
     statistics: FrameStatistics
-    anchored: Tensor | None = None
-    bias: Tensor | None = None
-    posterior_depth: Tensor | None = None
-    posterior_variance: Tensor | None = None
-    posterior_outlier: Tensor | None = None
-    posterior_inlier_variance: Tensor | None = None
     quantiles: Tensor | None = None
-    recalibrated: Tensor | None = None
+    current_cam: GaussianMixture | None = None
+    prediction: DepthPrediction | None = None
+    member: int | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        """A map by its name, or None."""
+        if name in MAPS:
+            return self.maps.get(name)
+        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *self.maps]
 
     def __repr__(self) -> str:
         """Shape, median standard deviation and counts in one line."""
         std = "" if self.variance.device.type == "meta" else f", median std {float(self.std.nanmedian()):.3g} m"
-        return f"UfMStarOutput({' x '.join(map(str, self.variance.shape))}{std}, {self.statistics!r})"
+        return f"UncertaintyOutput({' x '.join(map(str, self.variance.shape))}{std}, {self.statistics!r})"
 
     @property
     def std(self) -> Tensor:
         """sqrt(variance) [m]."""
         return self.variance.sqrt()
 
-    def posterior(self) -> tuple[Tensor, Tensor]:
-        """p(depth | network, UfM*, anchors): depth [m] and its variance [m^2], NaN where not valid
-        (``ufmstar_torch.posterior``).
-
-        Before the first anchor they equal ``depth`` and ``variance`` to the last bit.
+    @property
+    def intrinsics(self) -> Tensor:
+        """[B, 3, 3] of the depth map [px].
 
         Raises:
-            ValueError: without ``config.posterior``.
+            ValueError: a module without networks, whose caller has them.
         """
-        if self.posterior_depth is None or self.posterior_variance is None:
-            raise ValueError("posterior needs UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())")
-        return self.posterior_depth, self.posterior_variance
+        if self.prediction is None:
+            raise ValueError("intrinsics are those that were passed with the depth")
+        return self.prediction.K
 
     def interval(self, level: float) -> tuple[Tensor, Tensor]:
         """Central interval that holds the true depth with probability ``level``: lower and upper end [m], in the shape
@@ -225,7 +252,7 @@ class UfMStarOutput:
     @property
     def has_intervals(self) -> bool:
         """True if :meth:`interval` and the probabilities have evidence in at least one stream."""
-        return self.recalibrated is not None or (self.quantiles is not None and bool(self.quantiles.isfinite().any()))
+        return self.quantiles is not None and bool(self.quantiles.isfinite().any())
 
     def distribution(self) -> DepthDistribution:
         """The distribution of the depth at every pixel, of which the intervals and probabilities are.
@@ -233,22 +260,17 @@ class UfMStarOutput:
         Raises:
             ValueError: no stream has evidence, as :meth:`interval`.
         """
-        if not self.has_intervals:
+        if self.quantiles is None or not self.has_intervals:
             raise ValueError(_WITHOUT_EVIDENCE if self.quantiles is None else _NO_ANCHORS_YET)
-        V1, p = self.posterior_inlier_variance, self.posterior_outlier
-        streams = 1 if self.depth.dim() < 3 else len(self.depth)
-        quantiles = self.variance.new_full((streams, 3), torch.nan) if self.quantiles is None else self.quantiles
-        if V1 is None or p is None:
-            mean, variance, weight = self.depth[None], self.variance[None], torch.ones_like(self.depth)[None]
+        d, V, V1, p = self.depth, self.variance, self.posterior_inlier_variance, self.posterior_outlier
+        if p is None:
+            weight, mean, variance = torch.ones_like(d)[None], d[None], V[None]
         else:
-            d, V = self.posterior()
             p = torch.where(p.isnan() & V.isfinite(), 0.0, p)  # before any anchor
             elsewhere = torch.maximum((V - (1 - p) * V1) / p.clamp_min(1e-12), V1)
             weight, mean, variance = torch.stack([1 - p, p]), torch.stack([d, d]), torch.stack([V1, elsewhere])
-        if self.recalibrated is not None:
-            quantiles = torch.where(quantiles.isnan() & self.recalibrated, quantiles.new_tensor(NORMAL), quantiles)
         weight = torch.where(variance.isfinite(), weight, torch.nan)
-        return DepthDistribution(weight, mean, variance.clamp_min(LEAST_VARIANCE), quantiles)
+        return DepthDistribution(weight, mean, variance.clamp_min(LEAST_VARIANCE), self.quantiles)
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,8 @@ class UfMStarState:
         skipped: [B] int64 number of frames skipped because of a fault.
         smoothed: [B, H, W] moving average of the dense disagreement [m^2] in the mixture's dtype, NaN without a
             value; of size 0 x 0 before the first average.
-        by_component: tensors of extensions [B, K, C] by name, sums over the observations of each component.
-        by_stream: tensors of extensions [B, C] by name, which describe a stream as a whole.
+        by_component: tensors of the anchors [B, K, C] by name, sums over the observations of each component.
+        by_stream: tensors [B, C] by name that anchors have taught of a stream as a whole (``posterior.memory``).
     """
 
     mean: Tensor
@@ -51,7 +51,7 @@ class UfMStarState:
     def initial(
         cls, streams: int, config: UfMStarConfig, dtype: torch.dtype, device: torch.device | str
     ) -> UfMStarState:
-        """The empty state of ``streams`` independent streams, without extensions."""
+        """The empty state of ``streams`` independent streams, without anchors."""
         capacity = min(config.initial_capacity, config.max_components or config.initial_capacity)
         mixture = GaussianMixture.empty(streams, capacity, features=config.entries, dtype=dtype, device=device)
         counter = torch.zeros(streams, dtype=torch.int64, device=device)
@@ -75,7 +75,7 @@ class UfMStarState:
 
         Args:
             config: of UfM*.
-            like: a state with the tensors of the extensions, with any number of streams and components.
+            like: a state with the tensors of the anchors, with any number of streams and components.
 
         Raises:
             ValueError: shapes that do not fit each other or the config; values that are not finite or out of range;
@@ -143,5 +143,5 @@ class UfMStarState:
         return self.with_tensors({name: value(name, old) for name, old in self.tensors().items()})
 
 
-# Names of the tensors without extensions, in order.
+# Names of the tensors without anchors, in order.
 NAMES = tuple(f.name for f in fields(UfMStarState) if f.name not in ("by_component", "by_stream"))

@@ -5,16 +5,19 @@ from __future__ import annotations
 import functools
 import warnings
 from dataclasses import replace
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 
-from ufmstar_torch.anchors.extension import REFERENCE as ANCHOR_REFERENCE
-from ufmstar_torch.anchors.extension import AnchorKernels
+from ufmstar_torch.anchors.anchors import CheckAnchors, check_anchor_values
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.frame import CheckKernel, check_values
 from ufmstar_torch.gaussians.state import UfMStarState
 from ufmstar_torch.kernels.host import on_host
+from ufmstar_torch.steps.merge import REFERENCE as MERGE_REFERENCE
+from ufmstar_torch.steps.merge import MergeKernels
+from ufmstar_torch.steps.sample import REFERENCE as SAMPLE_REFERENCE
+from ufmstar_torch.steps.sample import SampleKernels
 from ufmstar_torch.steps.step import Step, step
 from ufmstar_torch.steps.step_parts import REFERENCE, Kernels
 
@@ -58,26 +61,42 @@ def select_step(name: str, device_type: str) -> Step:
     return functools.partial(step, kernels=select_kernels(name, device_type))
 
 
-def select_check(name: str, device_type: str) -> CheckKernel:
-    """The check of a frame's values; arguments and errors as :func:`select_step`."""
+class FrameKernels(NamedTuple):
+    """The implementations of the parts beside a step.
+
+    Attributes:
+        check: of a frame's values.
+        check_anchors: of anchors' values.
+        sample: means over a sample of pixels.
+        merge: merging of components.
+    """
+
+    check: CheckKernel
+    check_anchors: CheckAnchors
+    sample: SampleKernels
+    merge: MergeKernels
+
+
+def select_frame(name: str, device_type: str) -> FrameKernels:
+    """The parts beside a step; arguments and errors as :func:`select_step`."""
     if _compiled(name, device_type):
+        from ufmstar_torch.anchors.kernels import learn
         from ufmstar_torch.kernels.cpu import check as check_cpu
+        from ufmstar_torch.kernels.cpu import merge as merge_cpu
+        from ufmstar_torch.kernels.cpu import sample as sample_cpu
 
-        return check_cpu.check_values
+        return FrameKernels(
+            check_cpu.check_values,
+            learn.check_anchor_values,
+            SampleKernels(sample_cpu.sample_pixels, sample_cpu.sample_statistics),
+            MergeKernels(merge_cpu.close_pairs, merge_cpu.evidence),
+        )
+    check = check_values
     if _on_gpu(name, device_type):
-        from ufmstar_torch.kernels.triton import check
+        from ufmstar_torch.kernels.triton import check as check_triton
 
-        return check.check_values
-    return check_values
-
-
-def select_anchors(name: str, device_type: str) -> AnchorKernels:
-    """Kernels of the anchors' evidence; arguments as :func:`select_step`. Raises ValueError: "numba" off the CPU."""
-    if _compiled(name, device_type):
-        from ufmstar_torch.anchors.kernels import learn as fast
-
-        return AnchorKernels(fast.inliers, fast.learn_in_view)
-    return ANCHOR_REFERENCE
+        check = check_triton.check_values
+    return FrameKernels(check, check_anchor_values, SAMPLE_REFERENCE, MERGE_REFERENCE)
 
 
 def select_kernels(name: str, device_type: str) -> Kernels:

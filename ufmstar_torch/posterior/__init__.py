@@ -1,1 +1,1 @@
-"""Extension that ``UncertainDepth`` switches on: p(depth | network, UfM*, anchors), a depth that anchors correct."""
+"""The posterior of ``UncertainDepth``: p(depth | network, UfM*, anchors), a depth that anchors correct."""

@@ -134,6 +134,19 @@ def read(
 
 
 @with_nan
+def widen(depth, variance, inlier, shared, scale, contradiction, limit, floor):
+    """Raise two variances [H, W] to ``floor`` and add what the anchors of a frame share (``correct.widened``)."""
+    for i in range(depth.shape[0]):
+        d, V, V1 = depth[i], variance[i], inlier[i]
+        for j in range(len(d)):
+            square = np.float64(d[j]) * np.float64(d[j])
+            common = square * shared + scale
+            added = square * (contradiction + (common if common < limit else limit))
+            V[j] = (floor if V[j] < floor else V[j]) + added
+            V1[j] = (floor if V1[j] < floor else V1[j]) + added
+
+
+@with_nan
 def _pixels(depth, valid, logs, claimed, left, right, across, base, slopes, limits, y, spread, inlier, outlier):
     """Write y [H, W], the variances of d e^y over e^2y, and p at every pixel; y and p are NaN where not valid.
 

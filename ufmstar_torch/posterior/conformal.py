@@ -112,6 +112,13 @@ def quantiles(state: Tensor) -> Tensor:
     return torch.where(state[:, :1] >= LEAST_FRAMES, at_pixels.cummax(1).values, torch.nan)
 
 
+def normal_where_missing(quantiles: Tensor | None, variance: Tensor) -> Tensor:
+    """[B, 3] the quantiles, the normal distribution's where they are NaN or None; ``variance``: [B, ...]."""
+    if quantiles is None:
+        return variance.new_tensor(NORMAL).expand(len(variance), len(NORMAL))
+    return torch.where(quantiles.isnan(), quantiles.new_tensor(NORMAL), quantiles)
+
+
 def corrected(size: Tensor, quantiles: Tensor) -> Tensor:
     """|z| of the normal distribution for |z| = ``size`` [B, ...]: linear between 0 and the ``quantiles`` [3, B, ...],
     proportional beyond the last."""

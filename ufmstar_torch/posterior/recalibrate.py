@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, ClassVar, Final, Literal
+from typing import Any, Final, Literal
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.confidence import as_confidence
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.frames.extension import Chosen, Extension, FrameExtension
-from ufmstar_torch.frames.frame import FrameInput
-from ufmstar_torch.runtime.checked import Checked, choice
-from ufmstar_torch.runtime.stateful import flat, plain
+from ufmstar_torch.runtime.checked import Checked, choice, flat
+from ufmstar_torch.runtime.stateful import plain
 
 VARIANCE: Final = "variance"
 CONFIDENCE: Final = "confidence"
@@ -27,7 +24,7 @@ _HARMLESS = ("on_bad_frame", "backend", "initial_capacity", "max_components")
 
 
 @dataclass(frozen=True)
-class Recalibration(Checked, Extension):
+class Recalibration(Checked):
     """A map V -> V', the same at every pixel.
 
     Between two knots log V' is linear in log V. Above the last knot V' / V is constant. Below the first knot V' is
@@ -56,8 +53,6 @@ class Recalibration(Checked, Extension):
     ufm: Mapping[str, Any] = field(default_factory=dict)
     network: str = ""
     sequences: tuple[str, ...] = ()
-
-    argument: ClassVar[str] = CONFIDENCE  # see Extension; used by a map of the confidence
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -90,9 +85,17 @@ class Recalibration(Checked, Extension):
         beyond = (position - v[-1]).clamp_min(0)
         return torch.where(variance.isnan(), variance, (inside + beyond).exp().to(variance.dtype))
 
-    def map_variance(self, variance: Tensor) -> Tensor:
-        """V' of V, for a map of the variance."""
-        return self(variance) if self.covariate == VARIANCE else variance
+    def mapped(self, variance: Tensor, confidence: Tensor | None) -> Tensor:
+        """V' of V [...], with the network's confidence [...] at the same pixels for a map of the confidence.
+
+        Raises:
+            ValueError: a map of the confidence without a confidence.
+        """
+        if self.covariate == VARIANCE:
+            return self(variance)
+        if confidence is None:
+            raise ValueError("the recalibration maps the confidence, but the network predicts none")
+        return variance * self.factor(confidence).to(variance.dtype)
 
     def factor(self, confidence: Tensor) -> Tensor:
         """h(c) [...] in float64, for a map of the confidence."""
@@ -101,22 +104,6 @@ class Recalibration(Checked, Extension):
         upper = torch.searchsorted(c, position).clamp(1, len(c) - 1)
         share = ((position - c[upper - 1]) / (c[upper] - c[upper - 1])).clamp(0, 1)
         return torch.lerp(h.log()[upper - 1], h.log()[upper], share).exp().nan_to_num(1.0)
-
-    def of_frame(
-        self,
-        frame: FrameInput,
-        network_variances: Sequence[Tensor],
-        argument: Any,
-        before: Sequence[FrameExtension],
-        *,
-        dense: bool,
-    ) -> FrameExtension:
-        """A map of the confidence during a frame. Raises ValueError: the frame has no confidence."""
-        if self.covariate == VARIANCE:
-            return _Recalibrated(frame)
-        if argument is None:
-            raise ValueError("the recalibration maps the confidence, but the network predicts none")
-        return _Recalibrated(frame, self.factor(as_confidence(argument, frame)))
 
     def require(self, config: UfMStarConfig, network: str = "") -> None:
         """Check that settings and network are those of the fit.
@@ -148,22 +135,6 @@ class Recalibration(Checked, Extension):
         if len(v) > 1:
             return v, r
         return ((v[0], 2 * v[0]), (r[0], 2 * r[0])) if self.covariate == VARIANCE else ((v[0], v[0] + 1), (r[0], r[0]))
-
-
-class _Recalibrated(FrameExtension):
-    """During a frame of B streams, V times a ``factor`` [B, H, W] for a map of the confidence."""
-
-    def __init__(self, frame: FrameInput, factor: Tensor | None = None) -> None:
-        self._frame, self._factor = frame, factor
-
-    def map_variance(self, variance: Tensor, chosen: Chosen) -> Tensor:
-        """V' = h(c) V."""
-        return variance if self._factor is None else variance * chosen(self._factor).to(variance.dtype)
-
-    def outputs(self) -> dict[str, Tensor]:
-        """Intervals need no other evidence."""
-        depth = self._frame.depth
-        return {"recalibrated": torch.ones(len(depth), 1, dtype=torch.bool, device=depth.device)}
 
 
 def recalibration_path(weights: str | Path) -> Path:

@@ -63,8 +63,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.anchors.anchors import AnchorInput
-from ufmstar_torch.frames.frame import FrameInput
+from ufmstar_torch.frames.frame import AnchorInput, FrameInput
 from ufmstar_torch.kernels.cpu.arrays import array
 from ufmstar_torch.kernels.cpu.threads import each
 from ufmstar_torch.posterior.cells import cell_means, features, read

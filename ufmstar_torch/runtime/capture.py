@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from ufmstar_torch.frames.output import UfMStarOutput
+from ufmstar_torch.frames.output import UncertaintyOutput
 from ufmstar_torch.ufmstar import UfMStar
 
 _WARM_UP = 3  # frames before the capture, which compile the kernels
@@ -64,7 +64,7 @@ class Captured:
             self._replay = (record or _as_graph)(self._frame)
             ufm._store(state)
 
-    def __call__(self, *frame: Tensor | None) -> UfMStarOutput:
+    def __call__(self, *frame: Tensor | None) -> UncertaintyOutput:
         """Process the next frame; arguments as at the capture.
 
         Raises:
@@ -84,7 +84,7 @@ class Captured:
         self._replay()
         return self._out
 
-    def _run(self, ufm: UfMStar) -> UfMStarOutput:
+    def _run(self, ufm: UfMStar) -> UncertaintyOutput:
         depth, pose, intrinsics, *optional = self._inputs
         assert depth is not None
         assert pose is not None

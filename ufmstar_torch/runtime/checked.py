@@ -169,3 +169,13 @@ def _check_number(name: str, value: object, metadata: Mapping[str, Any]) -> None
     if outside:
         interval = f"{'(' if open_low else '['}{low}, {high}{')' if metadata['open_high'] else ']'}"
         raise ValueError(f"{name} must lie in {interval}, got {value!r}")
+
+
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested values by dotted name, for example segment.min_pixels; lists of mappings by number."""
+    by_name: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, list) and value and isinstance(value[0], Mapping):
+            value = {str(number): item for number, item in enumerate(value)}
+        by_name |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) and value else {prefix + name: value}
+    return by_name

@@ -9,8 +9,7 @@ from typing import Any
 EXTRAS = {
     **dict.fromkeys(("torchvision", "onnx", "onnxruntime", "safetensors", "transformers"), "models"),
     **dict.fromkeys(("filelock", "torchmetrics", "scipy", "cv2", "imageio", "imageio_ffmpeg", "kornia_rs"), "eval"),
-    **dict.fromkeys(("PIL", "tqdm", "jsonargparse", "h5py", "jinja2", "pandas", "OpenEXR", "yaml"), "eval"),
-    "ai_edge_litert": "litert",
+    **dict.fromkeys(("PIL", "tqdm", "tyro", "h5py", "jinja2", "pandas", "OpenEXR", "yaml"), "eval"),
     "matplotlib": "viz",
     "lightning": "train",
     "kornia": "train",

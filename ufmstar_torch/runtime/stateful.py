@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.runtime.checked import Checked
+from ufmstar_torch.runtime.checked import Checked, flat
 from ufmstar_torch.runtime.one_caller import OneCaller, one_caller
 
 
@@ -177,16 +177,6 @@ def _config_of(state: object) -> dict[str, Any]:
 def plain(config: Checked) -> dict[str, Any]:
     """The config's values after a round trip through JSON."""
     return _config_of(_bytes_of(config))
-
-
-def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested values by dotted name, for example segment.min_pixels; lists of mappings by number."""
-    by_name: dict[str, Any] = {}
-    for name, value in values.items():
-        if isinstance(value, list) and value and isinstance(value[0], Mapping):
-            value = {str(number): item for number, item in enumerate(value)}
-        by_name |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) and value else {prefix + name: value}
-    return by_name
 
 
 def full_precision(device: torch.device) -> AbstractContextManager[object]:

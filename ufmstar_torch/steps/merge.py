@@ -1,4 +1,4 @@
-"""Reduction of the mixture with little change to the regressed map: an extension, not in the paper (``config.merge``).
+"""Reduction of the mixture with little change to the regressed map; not in the paper (``config.merge``).
 
 The paper's method only adds components, and a surface that each view segments differently collects dozens of them.
 Every ``merge.every`` frames, two rules reduce the mixture; both are pure functions of it.
@@ -31,16 +31,14 @@ shares at these points. Their means and covariances do not change.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.frames.extension import Extension, FrameExtension, Total
 from ufmstar_torch.frames.frame import FrameInput
-from ufmstar_torch.frames.output import StepOutput
 from ufmstar_torch.gaussians.fixed_order import total
 from ufmstar_torch.gaussians.gaussian import cholesky3, floor_covariance, inverse_lower3, storage_floor
 from ufmstar_torch.gaussians.mixture import GaussianMixture
@@ -59,48 +57,25 @@ _LEAST_SHARE = 1e-9
 Components = dict[str, Tensor]
 
 
-class MergeExtension(Extension):
-    """Merging every ``merge.every`` frames. ``config``: with ``merge``."""
-
-    def __init__(self, config: UfMStarConfig) -> None:
-        self._config = config
-
-    def of_frame(
-        self,
-        frame: FrameInput,
-        network_variances: Sequence[Tensor],
-        argument: object,
-        before: Sequence[FrameExtension],
-        *,
-        dense: bool,
-    ) -> FrameExtension:
-        """Merging after this frame."""
-        return _MergeFrame(frame, self._config)
+def after_frame(
+    state: UfMStarState, frame: FrameInput, config: UfMStarConfig, kernels: MergeKernels | None = None
+) -> tuple[UfMStarState, dict[str, Tensor]]:
+    """Merge the streams that are due after a frame, and count the components."""
+    state = merged(state, frame.fault == 0, config, kernels)
+    alone = state.mixture.valid & (state.views == 0)
+    return state, {"components": state.mixture.components, "single_view": alone.sum(1)}
 
 
-class _MergeFrame(FrameExtension):
-    """Merging after one frame."""
-
-    changes_mixture = True
-
-    def __init__(self, frame: FrameInput, config: UfMStarConfig) -> None:
-        self._frame, self._config = frame, config
-
-    def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
-        """Merge the due streams, and count the components."""
-        state = merged(state, self._frame.fault == 0, self._config)
-        alone = state.mixture.valid & (state.views == 0)
-        counts = {"components": state.mixture.components, "single_view": alone.sum(1)}
-        return state, replace(out, statistics=replace(out.statistics, **counts))
-
-
-def merged(state: UfMStarState, fine: Tensor, config: UfMStarConfig) -> UfMStarState:
+def merged(
+    state: UfMStarState, fine: Tensor, config: UfMStarConfig, kernels: MergeKernels | None = None
+) -> UfMStarState:
     """The state after a frame, with the streams merged whose frame count is a multiple of ``merge.every``.
 
     Args:
         state: of B streams, after the step.
         fine: [B] True where the frame was used.
         config: with ``merge``.
+        kernels: as :func:`merge`.
 
     Checking which streams are due synchronises with an accelerator.
     """
@@ -111,12 +86,14 @@ def merged(state: UfMStarState, fine: Tensor, config: UfMStarConfig) -> UfMStarS
     if not bool(due.any()):
         return state
     sums = torch.cat([state.mean.new_zeros(*state.weight.shape, 0), *state.by_component.values()], -1)
-    mixture, sums = merge(state.mixture, sums, due, config)
+    mixture, sums = merge(state.mixture, sums, due, config, kernels)
     parts = sums.split([value.shape[-1] for value in state.by_component.values()], -1) if state.by_component else ()
     return state.with_tensors(mixture.tensors() | dict(zip(state.by_component, parts, strict=True)))
 
 
-def merge(mixture: GaussianMixture, sums: Tensor, due: Tensor, config: UfMStarConfig) -> tuple[GaussianMixture, Tensor]:
+def merge(
+    mixture: GaussianMixture, sums: Tensor, due: Tensor, config: UfMStarConfig, kernels: MergeKernels | None = None
+) -> tuple[GaussianMixture, Tensor]:
     """Join, then dissolve; the remaining components move up and keep their order.
 
     Args:
@@ -124,18 +101,21 @@ def merge(mixture: GaussianMixture, sums: Tensor, due: Tensor, config: UfMStarCo
         sums: [B, K, C] sums over the observations of each component.
         due: [B] True for the streams to merge; the others are unchanged.
         config: ``merge``, which is not None, and ``prior_weight``.
+        kernels: implementation of each part; None = the reference.
 
     Returns:
         The mixture [B, K] and the sums. Components that neither joined nor received anything are unchanged to the last
         bit.
     """
     assert config.merge is not None
+    kernels = kernels or REFERENCE
     every = mixture.tensors() | {"sums": sums}
     after = {name: value.clone() for name, value in every.items()}
     for b in due.nonzero().flatten().tolist():
         n = int(mixture.components[b])
         before = {name: v[b, :n].double() if v.is_floating_point() else v[b, :n] for name, v in every.items()}
-        reduced = dissolve(join(before, config.merge.loss, mixture.covariance.dtype), config)
+        joined = join(before, config.merge.loss, mixture.covariance.dtype, kernels)
+        reduced = dissolve(joined, config, kernels)
         for name, value in reduced.items():
             after[name][b] = 0
             after[name][b, : len(value)] = value.to(after[name].dtype)
@@ -143,19 +123,21 @@ def merge(mixture: GaussianMixture, sums: Tensor, due: Tensor, config: UfMStarCo
     return GaussianMixture(**after), sums
 
 
-def join(g: Components, limit: float, stored: torch.dtype) -> Components:
+def join(g: Components, limit: float, stored: torch.dtype, kernels: MergeKernels) -> Components:
     """Join mutually best pairs, in rounds, until no pair is within the limit; the first of a pair holds the result.
 
     Args:
         g: n components.
         limit: largest loss l of a pair [nat].
         stored: dtype to which the joint covariances will be rounded.
+        kernels: implementation of each part.
     """
     n = len(g["weight"])
     fresh = torch.ones(n, dtype=torch.bool, device=g["weight"].device)
     joined, pairs, loss = ~fresh, torch.zeros(2, 0, dtype=torch.int64, device=fresh.device), g["weight"][:0]
     while True:
-        found = _close_pairs(g, fresh, limit)
+        log_det = _log_det(g["covariance"])
+        found = kernels.pairs(g["mean"], g["covariance"], g["weight"], g["views"], log_det, fresh, limit)
         pairs, loss = torch.cat([pairs, found[0]], 1), torch.cat([loss, found[1]])
         mutual = _mutual(pairs, loss, len(fresh))
         if not bool(mutual.any()):
@@ -174,16 +156,18 @@ def join(g: Components, limit: float, stored: torch.dtype) -> Components:
     return g | {"covariance": g["covariance"].index_copy(0, joined.nonzero().flatten(), floored)}
 
 
-def _close_pairs(g: Components, fresh: Tensor, limit: float) -> tuple[Tensor, Tensor]:
-    """Pairs i < j [2, P] within the limit with at least one ``fresh`` [n] component, and their losses [P].
+def close_pairs(
+    mean: Tensor, covariance: Tensor, weight: Tensor, views: Tensor, log_det: Tensor, fresh: Tensor, limit: float
+) -> tuple[Tensor, Tensor]:
+    """Pairs i < j [2, P] within the limit with at least one ``fresh`` [n] component, and their losses [P]; ``log_det``
+    [n] is log|Sigma|.
 
     A bound excludes most pairs without their determinant: log|Sigma| >= a log|Sigma_i| + b log|Sigma_j| +
     log(1 + a b q) with q >= d_x^2 / (a Sigma_i + b Sigma_j)_xx for every axis, so l > limit where
     q > (exp(2 min(a, b) limit) - 1) / (a b), which is at most 4 (exp(limit) - 1).
     """
     slot = torch.arange(len(fresh), device=fresh.device)
-    reach, weight, mean = 4 * math.expm1(limit) * (1 + 1e-9), g["weight"], g["mean"]
-    spread, log_det = torch.diagonal(g["covariance"], dim1=-2, dim2=-1), _log_det(g["covariance"])
+    reach, spread = 4 * math.expm1(limit) * (1 + 1e-9), torch.diagonal(covariance, dim1=-2, dim2=-1)
     found = [(slot[:0].expand(2, 0), weight[:0])]
     for i in slot[fresh].split(max(1, _CHUNK // max(1, len(fresh)))):
         close = ~fresh | (slot > i[:, None])  # a pair of two fresh components once
@@ -193,13 +177,17 @@ def _close_pairs(g: Components, fresh: Tensor, limit: float) -> tuple[Tensor, Te
             close &= (mean[i, None, axis] - mean[:, axis]).square() <= reach * variance
         row, j = close.nonzero().unbind(1)
         pair = torch.stack([torch.minimum(i[row], j), torch.maximum(i[row], j)])
-        first, second = ({name: value[which] for name, value in g.items()} for which in pair)
-        a, b = _parts(first, second)
-        volume = _log_det(_joint(first, second)["covariance"]) - a * log_det[pair[0]] - b * log_det[pair[1]]
+        (first, second), d = weight[pair], mean[pair[0]] - mean[pair[1]]
+        a, b = first / (first + second), second / (first + second)
+        volume = (
+            _log_det(_joint_covariance(covariance[pair[0]], covariance[pair[1]], a, b, d))
+            - a * log_det[pair[0]]
+            - b * log_det[pair[1]]
+        )
         loss = 0.5 * volume / torch.minimum(a, b)
-        lighter_first = first["weight"] < second["weight"]
-        lighter = torch.where(lighter_first, first["views"], second["views"])
-        heavier = torch.where(lighter_first, second["views"], first["views"])
+        lighter, heavier = (
+            torch.where(first < second, views[one], views[other]) for one, other in (pair, pair.flip(0))
+        )
         within = (loss <= limit) & ~((lighter > 0) & (heavier == 0))
         found.append((pair[:, within], loss[within]))
     return torch.cat([pair for pair, _ in found], 1), torch.cat([loss for _, loss in found])
@@ -228,16 +216,21 @@ def _joint(g: Components, h: Components) -> Components:
         shape = (-1, *[1] * (g[name].dim() - 1))
         return a.view(shape) * g[name] + b.view(shape) * h[name]
 
-    d = g["mean"] - h["mean"]
-    between = (a * b)[:, None, None] * d[:, :, None] * d[:, None, :]
+    joint = _joint_covariance(g["covariance"], h["covariance"], a, b, g["mean"] - h["mean"])
     compared = g["compared"] + h["compared"]
     weighted = g["compared"] * g["disagreement"] + h["compared"] * h["disagreement"]
     return {name: average(name) for name in ("mean", "features")} | {
-        "covariance": average("covariance") + between,
+        "covariance": joint,
         "disagreement": torch.where(compared > 0, weighted / compared, torch.zeros_like(weighted)),
         "reference": torch.where((a >= b)[:, None], g["reference"], h["reference"]),
         **{name: g[name] + h[name] for name in ("weight", "compared", "views", "sums")},
     }
+
+
+def _joint_covariance(S: Tensor, T: Tensor, a: Tensor, b: Tensor, d: Tensor) -> Tensor:
+    """[P, 3, 3] of pairs of covariances S and T, parts a and b, and difference d [P, 3] of the means."""
+    a, b = a[:, None, None], b[:, None, None]
+    return a * S + b * T + a * b * d[:, :, None] * d[:, None, :]
 
 
 def _log_det(S: Tensor) -> Tensor:
@@ -250,25 +243,60 @@ def _log_det(S: Tensor) -> Tensor:
     return torch.log(p0 * p1 * p2)
 
 
-def self_shares(g: Components, prior_weight: float) -> Tensor:
+def self_shares(g: Components, prior_weight: float, kernels: MergeKernels) -> Tensor:
     """[n] s_k, each component's mean weight share at its own cubature points, by the exact sum over the components."""
-    mean, points, whitening = g["mean"], _cubature(g), inverse_lower3(cholesky3(g["covariance"]))
+    whitening = inverse_lower3(cholesky3(g["covariance"]))
     sigma = torch.diagonal(g["covariance"], dim1=-2, dim2=-1).sqrt()
     log_peak = torch.diagonal(whitening, dim1=-2, dim2=-1).log().sum(-1) - 1.5 * math.log(2 * math.pi)
     log_peak = log_peak + g["weight"].log()
-    evidence = mean.new_full((len(mean), _POINTS), prior_weight)
+    arguments = _cubature(g), g["mean"], sigma, whitening, log_peak, prior_weight, _REACH, _LEAST_SHARE
+    return (torch.exp(log_peak - 1.5)[:, None] / kernels.evidence(*arguments)).mean(1)
+
+
+def evidence(
+    points: Tensor, mean: Tensor, sigma: Tensor, whitening: Tensor, log_peak: Tensor, prior: float, reach: float,
+    least: float,
+) -> Tensor:  # fmt: skip
+    """[n, 6] the sum of all components' densities and the ``prior`` weight at each component's cubature points.
+
+    Args:
+        points: [n, 6, 3], ``reach`` standard deviations from the means [m].
+        mean, sigma: [n, 3] of the components; sigma along the axes [m].
+        whitening: [n, 3, 3] L^-1 [1/m].
+        log_peak: [n] log of the peak densities.
+        prior: of the regression.
+        reach: see ``points``.
+        least: share of a component's density at its own points below which others are omitted there.
+    """
+    out = mean.new_full(points.shape[:2], prior)
     for i in torch.arange(len(mean), device=mean.device).split(max(1, _CHUNK // max(1, len(mean)))):
         # Component i has the density peak exp(-3/2) at its six points. Beyond ``radius`` standard deviations, the
-        # density of another component falls below _LEAST_SHARE of that.
-        radius = (2 * (log_peak - log_peak[i, None] + 1.5 - math.log(_LEAST_SHARE))).clamp_min(0).sqrt()
+        # density of another component falls below ``least`` of that.
+        radius = (2 * (log_peak - log_peak[i, None] + 1.5 - math.log(least))).clamp_min(0).sqrt()
         near = torch.ones_like(radius, dtype=torch.bool)
         for axis in range(3):
             gap = (mean[i, None, axis] - mean[:, axis]).abs()
-            near &= gap <= _REACH * sigma[i, None, axis] + radius * sigma[:, axis]
+            near &= gap <= reach * sigma[i, None, axis] + radius * sigma[:, axis]
         row, k = near.nonzero().unbind(1)
         squared = ((points[i[row]] - mean[k, None]) @ whitening[k].mT).square().sum(-1)
-        evidence.index_add_(0, i[row], torch.exp(log_peak[k, None] - 0.5 * squared))
-    return (torch.exp(log_peak - 1.5)[:, None] / evidence).mean(1)
+        out.index_add_(0, i[row], torch.exp(log_peak[k, None] - 0.5 * squared))
+    return out
+
+
+@dataclass(frozen=True)
+class MergeKernels:
+    """The implementations of the replaceable parts.
+
+    Attributes:
+        pairs: see :func:`close_pairs`.
+        evidence: see :func:`evidence`.
+    """
+
+    pairs: Callable[..., tuple[Tensor, Tensor]]
+    evidence: Callable[..., Tensor]
+
+
+REFERENCE = MergeKernels(close_pairs, evidence)
 
 
 def _cubature(g: Components) -> Tensor:
@@ -285,10 +313,10 @@ def _mean_shares(g: Components, points: Tensor, config: UfMStarConfig) -> Tensor
     return total(share.unflatten(0, (-1, _POINTS)), 1) / _POINTS
 
 
-def dissolve(g: Components, config: UfMStarConfig) -> Components:
+def dissolve(g: Components, config: UfMStarConfig, kernels: MergeKernels) -> Components:
     """Remove the components whose share at their own points is small, and distribute their sums to the others."""
     assert config.merge is not None
-    weak = self_shares(g, config.prior_weight) < config.merge.share
+    weak = self_shares(g, config.prior_weight, kernels) < config.merge.share
     if not bool(weak.any()):
         return g
     share = _mean_shares(g, _cubature(g)[weak], config) * ~weak

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,16 +18,40 @@ from ufmstar_torch.steps import unmeasured
 _MAPS = ("variance", "disagreement", "aleatoric", "epistemic", "anchored", "depth")
 
 
-def mean_uncertainty(out: StepOutput, maps: Mapping[str, Tensor | None], used: Tensor) -> MeanUncertainty:
+class SampleKernels(NamedTuple):
+    """The implementations of the replaceable parts.
+
+    Attributes:
+        pixels: see :func:`sample_pixels`.
+        statistics: see :func:`sample_statistics`; without gradients.
+    """
+
+    pixels: Callable[[Tensor, int, int], tuple[Tensor, Tensor]]
+    statistics: Callable[[Tensor], SampleStatistics]
+
+
+def mean_uncertainty(
+    out: StepOutput,
+    maps: Mapping[str, Tensor | None],
+    depth: Tensor,
+    index: Tensor,
+    used: Tensor,
+    statistics: Callable[[Tensor], SampleStatistics] | None = None,
+) -> MeanUncertainty:
     """Averages of V, M, A, E and B over the sampled pixels.
 
     Args:
         out: of the step on the sample [B, n].
-        maps: [B, n] the variance, its parts and the depth, by name; None = no statistics.
+        maps: [B, n] the variance and its parts, by name; None = no statistics.
+        depth: [B, H, W] of the image [m].
+        index: [B, n] of the sampled pixels in the flattened image.
         used: [B, n] True for the pixels to average.
+        statistics: an implementation of :func:`sample_statistics` for values without a graph.
     """
+    maps = {**maps, "depth": torch.gather(depth.flatten(1), 1, index)}
     sampled = {name: torch.where(used, value, torch.nan) for name in _MAPS if (value := maps.get(name)) is not None}
-    each = sample_statistics(torch.stack(list(sampled.values())))
+    values = torch.stack(list(sampled.values()))
+    each = sample_statistics(values) if statistics is None or values.requires_grad else statistics(values)
     by_map = {name: SampleStatistics(*(value[i] for value in vars(each).values())) for i, name in enumerate(sampled)}
     count, variance = used.sum(1), by_map["variance"]
     # finite population correction: a sample of all pixels has no error
@@ -44,24 +69,25 @@ def mean_uncertainty(out: StepOutput, maps: Mapping[str, Tensor | None], used: T
     )
 
 
-def sample_size(size: tuple[int, int], pixels: int | None, fraction: float | None) -> int:
-    """Number of pixels to sample in an image of ``size`` (H, W): ``pixels``, or a ``fraction`` of all; default 1000.
+def sample_size(size: tuple[int, int], pixels: int | None, fraction: float | None, seed: int) -> tuple[int, int]:
+    """Number of pixels to sample in an image of ``size`` (H, W): ``pixels``, or a ``fraction`` of all; default 1000;
+    and the seed.
 
     Raises:
         ValueError: both arguments, or one out of range.
     """
-    every = size[0] * size[1]
+    every, seed = size[0] * size[1], require_whole("seed", seed)
     if pixels is not None and fraction is not None:
         raise ValueError("pass pixels or fraction, not both")
     if fraction is not None:
         if not 0 < require_number("fraction", fraction) <= 1:
             raise ValueError(f"fraction must lie in (0, 1], got {fraction}")
-        return max(1, round(fraction * every))
+        return max(1, round(fraction * every)), seed
     if pixels is None:
-        return min(1000, every)
+        return min(1000, every), seed
     if isinstance(pixels, bool) or not isinstance(pixels, int | np.integer) or not 1 <= pixels <= every:
         raise ValueError(f"pixels must be a whole number from 1 to H*W = {every}, got {pixels!r}")
-    return int(pixels)
+    return int(pixels), seed
 
 
 def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:
@@ -79,7 +105,7 @@ def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]
         index [B, count] into the flattened image and used [B, count]; with fewer than ``count`` valid pixels the rest
         of ``used`` is False.
     """
-    seed, flat = require_whole("seed", seed), valid.flatten(1)
+    flat = valid.flatten(1)
     pixels, on_cpu = flat.shape[1], valid.device.type == "cpu"
     requested = 2 * count if on_cpu else pixels  # elsewhere, counting the valid ones would synchronise
     while True:
@@ -118,3 +144,6 @@ def sample_statistics(values: Tensor) -> SampleStatistics:
 def random_order(pixels: int, seed: int) -> Tensor:
     """A permutation of the numbers below ``pixels``; the caller must not modify it."""
     return torch.randperm(pixels, generator=torch.Generator().manual_seed(seed))
+
+
+REFERENCE = SampleKernels(sample_pixels, sample_statistics)

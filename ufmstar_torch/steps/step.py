@@ -10,13 +10,13 @@ world coordinates never reach the float32 state, and components that a frame doe
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors import learn as anchors
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.frames.extension import NONE, FrameExtensions
 from ufmstar_torch.frames.frame import FrameInput
 from ufmstar_torch.frames.output import FrameStatistics, StepOutput
 from ufmstar_torch.gaussians.camera import focal_and_centre, relative_pose
@@ -41,7 +41,6 @@ class Step(Protocol):
         *,
         pixels: Tensor | None = None,
         smooth: bool = True,
-        extensions: FrameExtensions = NONE,
         observer: StepObserver | None = None,
     ) -> tuple[UfMStarState, StepOutput]: ...
 
@@ -53,7 +52,6 @@ def step(
     *,
     pixels: Tensor | None = None,
     smooth: bool = True,
-    extensions: FrameExtensions = NONE,
     observer: StepObserver | None = None,
     kernels: Kernels = REFERENCE,
     grow: bool = True,
@@ -66,7 +64,6 @@ def step(
         config: of UfM*.
         pixels: [B, n] indices into the flattened image to regress only there; None = every pixel.
         smooth: apply the exponential moving average.
-        extensions: extensions during this frame.
         observer: called after every stage.
         kernels: implementation of each part.
         grow: whether the mixture may get more slots; False: the caller has provided enough.
@@ -107,14 +104,21 @@ def step(
         mixture, sums, _, gone = fuse.make_room(mixture, sums, mixture.components, new.sum(1), centre, limit)
     mixture, dropped = fuse.append(mixture, current_first, new, view, config)
     mixture_cam = mixture.to(torch.float64).rigid(R_cam, t_cam)
-    changed, mixture_cam = extensions.before_regression({**state.by_stream, **sums}, mixture_cam, regress.distribute)
+    learnt = None
+    if config.anchors is not None:
+        learnt = anchors.learn({**state.by_stream, **sums}, mixture_cam, frame, config, regress.distribute)
+        columns = learnt.beyond.to(mixture_cam.features.dtype)
+        mixture_cam = mixture_cam.replace(features=torch.cat([mixture_cam.features, columns], -1))
     mixture_cam = unmeasured.before_regression(mixture_cam)
     stage("append")
 
     result = kernels.regress_image(mixture_cam, frame.depth, frame.intrinsics, frame.valid, config, pixels)
     at_pixels = regress.at_pixels(frame.depth, pixels)
     result, measured = unmeasured.after_regression(result, at_pixels, config, frame.informative)
-    result = extensions.after_regression(result)
+    features, residual = result.features, None
+    if learnt is not None:
+        features, columns = features.split([features.shape[-1] - anchors.COLUMNS, anchors.COLUMNS], -1)
+        residual = learnt.residual(columns)
     stage("regress")
 
     counts = {
@@ -131,20 +135,25 @@ def step(
     disagreement, smoothed = result.disagreement, state.smoothed
     if smooth and config.ema_alpha < 1.0:
         smoothed, disagreement = regress.moving_average(smoothed, disagreement, frame.size, config.ema_alpha, pixels)
+    of_anchors = {} if learnt is None else learnt.tensors()
     updated = state.with_tensors({
-        **mixture.tensors(), **sums, **changed, "T_world_first": first, "started": state.started | fine,
+        **mixture.tensors(), **sums, **of_anchors, "T_world_first": first, "started": state.started | fine,
         "frames": state.frames + fine, "skipped": state.skipped + ~fine, "smoothed": smoothed,
     })  # fmt: skip
-    statistics = frame_statistics(frame, counts)
-    out = StepOutput(disagreement, result.features, measured, current_cam, statistics)
+    statistics = frame_statistics(frame, counts, learnt)
+    out = StepOutput(disagreement, features, measured, residual, current_cam, statistics)
     stage("average")
     return updated, out
 
 
-def frame_statistics(frame: FrameInput, counts: Mapping[str, Tensor]) -> FrameStatistics:
-    """The statistics of a frame: ``counts`` from the step, the others from the check of the frame."""
+def frame_statistics(
+    frame: FrameInput, counts: Mapping[str, Tensor], learnt: anchors.Learnt | None = None
+) -> FrameStatistics:
+    """The statistics of a frame: ``counts`` from the step, the others from the check of the frame and its anchors."""
+    of_anchors: dict[str, Any] = {} if learnt is None else anchors.counts(frame.anchors, learnt.used)
     return FrameStatistics(
         **counts,
+        **of_anchors,
         beyond=frame.beyond,
         out_of_range=frame.out_of_range,
         fault=frame.fault,

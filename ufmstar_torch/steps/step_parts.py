@@ -26,7 +26,7 @@ class StepObserver(Protocol):
         Work between two kernels belongs to the later stage. segment: SPGF and the floor of its covariances.
         correspond: the transformation of the mixture into the camera frame, and the matching. fuse: the disagreement of
         overlaps, the transformation of the segments into the first camera's frame, growth, and the fusion. append: the
-        new components, the transformation of the mixture into the camera frame, and the columns of extensions. regress:
+        new components, the transformation of the mixture into the camera frame, and the columns of anchors. regress:
         the regression. average: the moving average, statistics and the new state. The caller of the step ends "check".
         """
         ...

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.anchors.kernels.cholesky import factored, inverted, substituted
 from ufmstar_torch.kernels.compile_cpu import reordered
 
 # Parameters of a pose's error: a rotation about the camera's axes [rad] and a shift along the world's [m].
@@ -65,6 +66,79 @@ def moved(T_world_cam: NDArray[np.float64], error: NDArray[np.float64]) -> NDArr
     result = T_world_cam.copy()
     _move(error, result)
     return result
+
+
+def adjusted(
+    ray: NDArray[np.float64], precision: NDArray[np.float64], T_world_cam: NDArray[np.float64],
+    rho: NDArray[np.float64], prior: float, student: float, first: tuple[NDArray[np.float64], ...],
+    pose_precision: NDArray[np.float64], information: float, steps: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]] | None:  # fmt: skip
+    """Gauss-Newton steps on poses and inverse depths.
+
+    Args:
+        ray, precision, T_world_cam, rho, prior, student: as :func:`equations`; poses and ``rho`` are overwritten.
+        first: A, b, h and v of :func:`equations` for the first step, which are overwritten by those of the last one.
+        pose_precision: [6 W] of the prior of the poses' errors, whose mean is 0.
+        information: factor on A and b.
+        steps: number of steps.
+
+    Returns:
+        The errors [6 W], their covariance [6 W, 6 W], and the variance [N] of ``rho`` by it. None where the equations
+        are singular.
+    """
+    error, covariance, by_poses = np.zeros(len(pose_precision)), np.zeros_like(first[0]), np.zeros(len(rho))
+    arguments = ray, precision, T_world_cam, rho, prior, student, *first, pose_precision, information, steps
+    fine = _adjust(*arguments, error, covariance, by_poses)
+    return (error, covariance, by_poses) if fine else None
+
+
+@reordered
+def _adjust(
+    ray, precision, poses, rho, prior, student, A, b, h, v, pose_precision, information, steps, error, covariance,
+    by_poses,
+):  # fmt: skip
+    views, size = len(poses), len(b)
+    rotation, translation, to_view = np.empty((views - 1, 3, 3)), np.empty((views - 1, 3)), np.empty((views, 3, 3))
+    for step in range(steps):
+        if step > 0:
+            for k in range(views):
+                for i in range(3):
+                    for j in range(3):
+                        to_view[k, i, j] = poses[k, j, i]
+            for k in range(views - 1):
+                for i in range(3):
+                    translation[k, i] = 0.0
+                    for j in range(3):
+                        translation[k, i] += poses[k, j, i] * (poses[views - 1, j, 3] - poses[k, j, 3])
+                        rotation[k, i, j] = 0.0
+                        for m in range(3):
+                            rotation[k, i, j] += poses[k, m, i] * poses[views - 1, m, j]
+            A[:], b[:], h[:], v[:] = 0.0, 0.0, 0.0, 0.0
+            _equations(ray, precision, rotation, translation, to_view, rho, prior, student, A, b, h, v)
+        for i in range(size):
+            b[i] = information * b[i] - pose_precision[i] * error[i]
+            for j in range(i + 1):
+                A[i, j] *= information
+            A[i, i] += pose_precision[i]
+        if not factored(A):
+            return False
+        substituted(A, b)
+        _move(b, poses)
+        for i in range(size):
+            error[i] += b[i]
+        for n in range(len(rho)):
+            change = v[n]
+            for i in range(size):
+                change -= h[n, i] * b[i]
+            rho[n] = min(max(rho[n] + change, FAR * prior), NEAR * prior)
+    inverted(A, covariance)
+    for n in range(len(rho)):
+        for i in range(size):
+            total = 0.0
+            for j in range(size):
+                total += covariance[i, j] * h[n, j]
+            by_poses[n] += total * h[n, i]
+    return True
 
 
 def _between(T_world_cam: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

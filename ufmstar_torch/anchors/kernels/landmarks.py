@@ -16,6 +16,7 @@ from ufmstar_torch.anchors.kernels.dense import (
     sampled,
     zncc,
 )
+from ufmstar_torch.gaussians.camera import inverse_intrinsics
 from ufmstar_torch.kernels.compile_cpu import reordered
 
 # Least ZNCC of a landmark's patch with an image that shows it.
@@ -70,7 +71,7 @@ def sight(
     pixel, depth, spread, shown = np.zeros((n, 2)), np.zeros(n), np.zeros(n), np.zeros(n, np.int64)
     camera = (np.ascontiguousarray(K @ T_world_cam[:3, :3].T), np.ascontiguousarray(T_world_cam[:3, 3]))
     patch = patch.reshape(n, COUNT)
-    _sight(image, point, pose, sigma, patch, used, *camera, np.linalg.inv(K), pixel, depth, spread, shown)
+    _sight(image, point, pose, sigma, patch, used, *camera, inverse_intrinsics(K), pixel, depth, spread, shown)
     return pixel, depth, spread, shown
 
 

@@ -7,18 +7,19 @@ other streams change no bit.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.anchors import AnchorInput
+from ufmstar_torch.anchors.anchors import FARTHEST_OFF, FEW, Checked
 from ufmstar_torch.anchors.evidence import CLAIM, COUNTS, LEAST_SIGMA, Evidence
-from ufmstar_torch.anchors.extension import Learnt
 from ufmstar_torch.anchors.kernels.neighbours import grid, supported
+from ufmstar_torch.anchors.learn import Learnt
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.frames.frame import FrameInput
+from ufmstar_torch.frames.frame import AnchorInput, FrameInput
 from ufmstar_torch.kernels.compile_cpu import kernel, leaf, part
 from ufmstar_torch.kernels.cpu.arrays import array
 from ufmstar_torch.kernels.cpu.regress import Seen, View
@@ -29,6 +30,57 @@ from ufmstar_torch.kernels.cpu.threads import each
 
 _PER_CELL = 16  # mean number of anchors in a cell of the search for components
 _NEGLIGIBLE = 1e-30  # smaller means become 0, before single precision loses them
+
+
+def check_anchor_values(
+    pixel: Tensor, depth: Tensor, variance: Tensor, mask: Tensor | None, frame: FrameInput
+) -> Checked:  # fmt: skip
+    """As :func:`ufmstar_torch.anchors.anchors.check_anchor_values`, for CPU tensors; the same values."""
+    streams, n = depth.shape
+    values = [array(x) for x in (pixel, depth, variance)]
+    used = np.ones((streams, n), np.bool_) if mask is None else array(mask)
+    position, valid, index = (
+        np.zeros((streams, n, 2)),
+        np.zeros((streams, n), np.bool_),
+        np.zeros((streams, n), np.int64),
+    )
+    (predicted, out_depth), out_variance = np.ones((2, streams, n)), np.zeros((streams, n))
+    rejected, contradiction = np.zeros(streams, np.int64), np.zeros(streams)
+    outputs = position, index, predicted, out_depth, out_variance, valid, rejected, contradiction
+    inputs = zip(*values, used, array(frame.depth), array(frame.valid), strict=True)
+    each(_check, [(*one, *(x[b : b + 1] if x.ndim == 1 else x[b] for x in outputs)) for b, one in enumerate(inputs)])
+    a, b, c, d, e, f, g, h = map(torch.from_numpy, outputs)
+    return a, b, c, d, e, f, g, h
+
+
+@kernel
+def _check(
+    pixel, depth, variance, mask, depth_map, valid_map, position, index, predicted, out_depth, out_variance, valid,
+    rejected, contradiction,
+):  # fmt: skip
+    """One stream of N anchors; writes where they are usable."""
+    height, width = depth_map.shape
+    fine, square = 0, 0.0
+    for i in range(depth.size):
+        u, v, d, s2 = np.rint(pixel[i, 0]), np.rint(pixel[i, 1]), depth[i], variance[i]
+        if not (mask[i] and 0 < d < np.inf and s2 >= 0 and math.sqrt(s2) < d):
+            continue
+        if not (u >= 0 and u < width and v >= 0 and v < height):
+            continue
+        position[i, 0], position[i, 1] = pixel[i, 0], pixel[i, 1]
+        index[i] = np.int64(v) * width + np.int64(u)
+        z = np.float64(depth_map[np.int64(v), np.int64(u)])
+        if not valid_map[np.int64(v), np.int64(u)]:
+            continue
+        if d <= FARTHEST_OFF * z and z <= FARTHEST_OFF * d:
+            predicted[i], out_depth[i], out_variance[i], valid[i] = z, d, s2, True
+            fine += 1
+        else:
+            r = min(d / z - 1, FARTHEST_OFF)
+            square += r * r
+            rejected[0] += 1
+    if rejected[0] > FEW and rejected[0] > fine:
+        contradiction[0] = square / rejected[0]
 
 
 def inliers(anchors: AnchorInput) -> Tensor:
@@ -46,24 +98,24 @@ def _inliers(pixel, predicted, depth, variance, valid, out):
 
 
 def learn_in_view(
-    evidence: Evidence,
+    tensors: Mapping[str, Tensor],
     capacity: int,
     seen: Sequence[Seen],
     views: Sequence[View],
     frame: FrameInput,
-    anchors: AnchorInput | None,
     config: UfMStarConfig,
 ) -> Learnt:
-    """As :func:`ufmstar_torch.anchors.extension.learn` with the exact sum over the components in view
+    """As :func:`ufmstar_torch.anchors.learn.learn` with the exact sum over the components in view
     (``kernels.cpu.regress.views_of``); the error of the shares is at most twice the regression's.
 
     Args:
-        evidence: of the mixture's first slots; later slots have none.
+        tensors: of the state, with the evidence of the mixture's first slots; later slots have none.
         capacity: slots of the mixture; the first ones hold each stream's ``seen`` components.
         seen, views: the first two of the last three features receive what was learnt of the components.
-        frame, anchors, config: as there.
+        frame, config: as there.
     """
-    b, before, overall_before = len(views), array(evidence.component), array(evidence.overall)
+    b, anchors = len(views), frame.anchors
+    before, overall_before = array(tensors["evidence"]), array(tensors["overall_evidence"])
     component, overall = np.empty((b, capacity, 3), before.dtype), np.empty((b, 3), before.dtype)
     beyond, stream, used = np.empty((b, capacity, 2)), np.empty((b, 2)), np.zeros((b, 1), np.int64)
     if anchors is None:

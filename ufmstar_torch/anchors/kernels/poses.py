@@ -13,7 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.anchors.kernels.cholesky import factored, inverted
 from ufmstar_torch.anchors.kernels.dense import Views
+from ufmstar_torch.gaussians.camera import inverse_intrinsics
 from ufmstar_torch.kernels.compile_cpu import reordered
 
 # Rounds of Student-t weights, and their degrees of freedom.
@@ -48,7 +50,7 @@ def linearised(
     """
     shape = (*slope.shape, EACH)
     on_line, across = np.zeros(shape), np.zeros(shape)
-    _linearised(pixel, rho, along, slope, views.H, views.b, K, np.linalg.inv(K), on_line, across)
+    _linearised(pixel, rho, along, slope, views.H, views.b, K, inverse_intrinsics(K), on_line, across)
     return on_line, across
 
 
@@ -154,7 +156,10 @@ def _solved(
             *(change, value, weight, residual, across_change, across, across_weight, across_residual, student),
             *(A, r, mean_change, mean),
         )
-        _inverse(A, covariance)
+        if not factored(A):
+            covariance[:] = np.nan
+            return
+        inverted(A, covariance)
         error[:] = covariance @ r
         rho[:] = mean - mean_change @ error
         for k in range(views):
@@ -195,7 +200,7 @@ def _equations(
                 by, by_across = w * change[n, k, c], a * across_change[n, k, c]
                 mean_change[n, index] += by
                 r[index] += by * value[n, k] + by_across * across[n, k]
-                for d in range(c + 1):  # a lower triangle, which :func:`_inverse` reads
+                for d in range(c + 1):  # a lower triangle, which :func:`factored` reads
                     by_view[c, d] += by * change[n, k, d] + by_across * across_change[n, k, d]
         for c in range(EACH):
             for d in range(c + 1):
@@ -207,29 +212,3 @@ def _equations(
             mean_change[n] /= total[n]
     A -= weighted.T @ mean_change
     r -= weighted.T @ mean
-
-
-@reordered
-def _inverse(A, inverse):
-    """Invert a symmetric positive definite matrix by L L^T; its lower triangle is read and overwritten."""
-    size = len(A)
-    for j in range(size):
-        for i in range(j, size):
-            total = A[i, j]
-            for k in range(j):
-                total -= A[i, k] * A[j, k]
-            A[i, j] = np.sqrt(total) if i == j else total / A[j, j]
-    lower = np.zeros((size, size))  # L^-1
-    for j in range(size):
-        lower[j, j] = 1 / A[j, j]
-        for i in range(j + 1, size):
-            total = 0.0
-            for k in range(j, i):
-                total += A[i, k] * lower[k, j]
-            lower[i, j] = -total / A[i, i]
-    for i in range(size):
-        for j in range(i + 1):
-            total = 0.0
-            for k in range(i, size):
-                total += lower[k, i] * lower[k, j]
-            inverse[i, j] = inverse[j, i] = total

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.gaussians.camera import inverse_intrinsics
 from ufmstar_torch.kernels.compile_cpu import kernel, part
 
 # From the rays' nearest point the reprojection error converges quadratically; three steps reach rounding on all but the
@@ -61,7 +62,7 @@ def triangulate(
     scale = np.diag([0.0, 0.0, 1.0])
     scale[:2, :2] = K[:2, :2]
     to_image = np.ascontiguousarray(scale @ rotation.transpose(0, 2, 1))
-    to_ray = np.ascontiguousarray(rotation @ np.linalg.inv(scale))
+    to_ray = np.ascontiguousarray(rotation @ inverse_intrinsics(scale))
     _tracks(pixel - K[:2, 2], seen, to_image, to_ray, centre, DAMPING, STEPS, point, covariance, error, ahead)
     return Triangulated(point + origin, covariance, error, ahead)
 

@@ -88,12 +88,34 @@ def _restrict(use: NDArray[np.bool_], values: NDArray[Any], least: float, most: 
         use &= values <= most
 
 
+def pose_fault(T: _Matrix, tolerance: float) -> int:
+    """Code 1 to 4 or 7 of a camera-to-world pose (``frame.FRAME_FAULTS``), 0 for none.
+
+    Args:
+        T: [4][4] [m].
+        tolerance: largest deviation of R^T R from the identity.
+    """
+    return _pose_fault(T, _deviation(_gram(T)), tolerance)
+
+
+def intrinsics_fault(K: _Matrix, height: float, width: float) -> int:
+    """Code 5, 6, 8 or 9 of intrinsics [3][3] of an image of ``height`` and ``width`` [px], 0 for none."""
+    (fx, skew, cx), (other, fy, cy), last = K
+    if not _finite(K):
+        return 5
+    if skew or other or last != [0.0, 0.0, 1.0] or fx <= 0 or fy <= 0:
+        return 6
+    if min(fx, fy) < FOCAL_RANGE[0] or max(fx, fy) > FOCAL_RANGE[1]:
+        return 8
+    return 9 if min(cx, cy) < -0.5 or cx > width - 0.5 or cy > height - 0.5 else 0
+
+
 def _camera(T: _Matrix, K: _Matrix, height: int, width: int, tolerance: float) -> tuple[_Matrix, _Matrix, int, float]:
     """The pose with its nearest rotation and the intrinsics of a stream (identities where there is a fault), the code
     of the first fault (``FRAME_FAULTS``), and max |R^T R - I| of the pose ``T``."""
     gram = _gram(T)
     deviation = _deviation(gram)
-    fault = _pose_fault(T, deviation, tolerance) or _intrinsics_fault(K, height, width)
+    fault = _pose_fault(T, deviation, tolerance) or intrinsics_fault(K, height, width)
     if fault:
         return _EYE4, _EYE3, fault, deviation
     rotation = [row[:3] for row in T[:3]]
@@ -136,15 +158,3 @@ def _pose_fault(T: _Matrix, deviation: float, tolerance: float) -> int:
     if sum(a * b for a, b in zip(cross, z, strict=False)) < 0:
         return 4
     return 7 if max(abs(row[3]) for row in T[:3]) > FARTHEST else 0
-
-
-def _intrinsics_fault(K: _Matrix, height: int, width: int) -> int:
-    """Code 5, 6, 8 or 9, 0 for none."""
-    (fx, skew, cx), (other, fy, cy), last = K
-    if not _finite(K):
-        return 5
-    if skew or other or last != [0.0, 0.0, 1.0] or fx <= 0 or fy <= 0:
-        return 6
-    if min(fx, fy) < FOCAL_RANGE[0] or max(fx, fy) > FOCAL_RANGE[1]:
-        return 8
-    return 9 if min(cx, cy) < -0.5 or cx > width - 0.5 or cy > height - 0.5 else 0

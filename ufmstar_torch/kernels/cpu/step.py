@@ -8,7 +8,7 @@ streams nor that of threads changes a bit.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,8 +16,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ufmstar_torch.anchors.kernels.learn import inliers, learn_in_view
+from ufmstar_torch.anchors.learn import COLUMNS, Learnt, learn
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.frames.extension import NONE, FrameExtensions
 from ufmstar_torch.frames.frame import FrameInput
 from ufmstar_torch.frames.output import StepOutput
 from ufmstar_torch.gaussians.camera import relative_pose
@@ -59,7 +60,7 @@ class _Pairs(NamedTuple):
 
 
 class _Joined(NamedTuple):
-    """The mixture after the fusion by field, and in the form for the regression; tensors of extensions by name; the
+    """The mixture after the fusion by field, and in the form for the regression; the sums over anchors by name; the
     numbers of new and of dropped components."""
 
     mixture: dict[str, Tensor]
@@ -76,7 +77,6 @@ def step(
     *,
     pixels: Tensor | None = None,
     smooth: bool = True,
-    extensions: FrameExtensions = NONE,
     observer: StepObserver | None = None,
 ) -> tuple[UfMStarState, StepOutput]:
     """As :func:`ufmstar_torch.steps.step.step`, for CPU tensors."""
@@ -88,20 +88,22 @@ def step(
     cameras, pairs = _match(state, frame, segments, config)
     stage("correspond")
 
-    joined = _join(state, frame, segments, cameras[0], pairs, config, extensions.columns)
+    columns = 0 if config.anchors is None else COLUMNS
+    joined = _join(state, frame, segments, cameras[0], pairs, config, columns)
     stage("fuse")
 
-    changed: dict[str, Tensor] = {}
-    views, shift = None, None
-    if extensions.columns:
-        changed, views, shift = _columns(state, joined, frame, extensions, config, torch.from_numpy(cameras[0]))
+    learnt, views, shift = None, None, None
+    if columns:
+        learnt, views = _learn(state, joined, frame, config, torch.from_numpy(cameras[0]))
+        shift = None if views is None else array(learnt.stream)  # which the regression then adds
     stage("append")
 
     result = regress_maps(joined.seen, frame.depth, frame.intrinsics, config, pixels, views, shift)
     measured, disagreement = result.features[..., -1], result.disagreement
     if frame.informative is not None:
         measured = measured * frame.informative.view(-1, *[1] * (measured.dim() - 1)).to(measured.dtype)
-    result = extensions.after_regression(replace(result, features=result.features[..., :-1]))
+    features, expected, _ = result.features.split([result.features.shape[-1] - columns - 1, columns, 1], -1)
+    residual = None if learnt is None else expected if shift is not None else learnt.residual(expected)
     stage("regress")
 
     smoothed, alpha, previous = state.smoothed, config.ema_alpha if smooth else 1.0, disagreement
@@ -115,9 +117,11 @@ def step(
         smoothed = with_pixels(smoothed, pixels, after)
     names = ("T_world_first", "started", "frames", "skipped")
     stream_fields = dict(zip(names, map(torch.from_numpy, cameras), strict=True))
-    updated = state.with_tensors({**joined.mixture, **joined.sums, **changed, **stream_fields, "smoothed": smoothed})
-    statistics = frame_statistics(frame, _counts(frame, pairs, joined, unmeasured))
-    out = StepOutput(disagreement, result.features, measured, current_cam, statistics)
+    of_anchors = {} if learnt is None else learnt.tensors()
+    changed = {**joined.mixture, **joined.sums, **of_anchors, **stream_fields, "smoothed": smoothed}
+    updated = state.with_tensors(changed)
+    statistics = frame_statistics(frame, _counts(frame, pairs, joined, unmeasured), learnt)
+    out = StepOutput(disagreement, features, measured, residual, current_cam, statistics)
     stage("average")
     return updated, out
 
@@ -166,7 +170,7 @@ def _join(
     config: UfMStarConfig,
     columns: int,
 ) -> _Joined:
-    """Step 4, and the mixture in the form for the regression, with ``columns`` for extensions; ``first`` is
+    """Step 4, and the mixture in the form for the regression, with ``columns`` for anchors; ``first`` is
     camera-to-world of the first cameras."""
     slots = tuple(array(getattr(state, name)) for name in _NAMES)
     needed = max(pair.occupied + pair.created for pair in pairs)
@@ -227,24 +231,21 @@ def _within_limit(joined: _Joined, old: Sequence[int], position: Tensor, limit: 
     )
 
 
-def _columns(
-    state: UfMStarState, joined: _Joined, frame: FrameInput, extensions: FrameExtensions, config: UfMStarConfig,
-    first: Tensor,
-) -> tuple[dict[str, Tensor], list[View] | None, NDArray[np.float64] | None]:  # fmt: skip
-    """Write the columns of extensions to the features before the last. Returns the changed tensors of the state; and,
-    if an extension works on the components in view, the views and the shift that the regression adds to the columns."""
+def _learn(
+    state: UfMStarState, joined: _Joined, frame: FrameInput, config: UfMStarConfig, first: Tensor
+) -> tuple[Learnt, list[View] | None]:
+    """Learn from the frame's anchors, and write the columns for the regression to the features before the last. The
+    views are those of the exact regression, which are built here already."""
     capacity, tensors = joined.mixture["weight"].shape[1], {**state.by_stream, **joined.sums}
     if config.regression == "exact":
         views = views_of(joined.seen, frame.depth, frame.intrinsics, config, state.covariance.dtype)
-        if (result := extensions.in_view(tensors, capacity, joined.seen, views)) is not None:
-            return result[0], views, array(result[1])
+        return learn_in_view(tensors, capacity, joined.seen, views, frame, config), views
     mixture = GaussianMixture(**joined.mixture).to(torch.float64)
     mixture_cam = mixture.rigid(*relative_pose(first, frame.T_world_cam))
-    changed, with_columns = extensions.before_regression(tensors, mixture_cam, distribute)
-    columns = array(with_columns.features)[..., -extensions.columns :]
-    for one, values in zip(joined.seen, columns, strict=True):
-        one.features[:, -extensions.columns - 1 : -1] = values[: len(one.disagreement)]
-    return changed, None, None
+    learnt = learn(tensors, mixture_cam, frame, config, distribute, inliers)
+    for one, values in zip(joined.seen, array(learnt.beyond), strict=True):
+        one.features[:, -COLUMNS - 1 : -1] = values[: len(one.disagreement)]
+    return learnt, None
 
 
 def _distance(b: int, pair: _Pairs, segments: Sequence[Floats], config: UfMStarConfig) -> NDArray[np.float64]:

@@ -1,7 +1,12 @@
-"""A depth network in a TensorFlow Lite file, possibly quantised, run by LiteRT."""
+"""A depth network in a TensorFlow Lite file, possibly quantised, run by LiteRT (``pip install ai-edge-litert``).
+
+network = LiteRTNetwork("fastdepth_int8.tflite", {"outputs": {"kind": "metric"}})
+model = UncertainDepth(network)
+"""
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +18,6 @@ from torch import Tensor
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models.network import DeclaredNetwork, require_image
 from ufmstar_torch.models.outputs import PlainSpec, ProgramSpec
-from ufmstar_torch.runtime.optional import optional
 
 
 class LiteRTNetwork(DeclaredNetwork):
@@ -27,7 +31,7 @@ class LiteRTNetwork(DeclaredNetwork):
         threads: of the CPU; 0 = LiteRT's default.
 
     Raises:
-        ModuleNotFoundError: ``ai-edge-litert`` is not installed (extra ``litert``).
+        ModuleNotFoundError: ``ai-edge-litert`` is not installed.
         FileNotFoundError: there is no such file.
         ValueError: the file is damaged, or spec and file do not match.
     """
@@ -43,9 +47,7 @@ class LiteRTNetwork(DeclaredNetwork):
 
     def _open(self) -> None:
         """Create an interpreter, and look up the input and the declared outputs."""
-        runtime = optional(
-            "ai_edge_litert.interpreter", "a .tflite file needs the package ai-edge-litert", "'ufmstar-torch[litert]'"
-        )
+        runtime = import_module("ai_edge_litert.interpreter")
         if not Path(self.path).is_file():
             raise FileNotFoundError(f"no .tflite file {self.path}")
         try:

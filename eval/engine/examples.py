@@ -14,46 +14,45 @@ They are written while a sequence is evaluated, below its folder::
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.eval.engine.estimators import Gaussians
-from ufmstar_torch.eval.engine.rows import RowResult
-from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
-from ufmstar_torch.eval.run.files import write_atomic
+from ufmstar_torch.eval.engine.rows import RowResult, RowRunner
+from ufmstar_torch.eval.engine.stream import FrameResult
 from ufmstar_torch.eval.sequences.frame import Frame, Size
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
 from ufmstar_torch.eval.sequences.intrinsics import scale_intrinsics
+from ufmstar_torch.files.atomic import write_atomic
 
 # Shares of the frames after which the mixture is stored; it is stored again at the end.
 ROOM_SHARES = (0.25, 0.5)
+_EXAMPLES = 3  # frames, evenly spaced
 _POINTS = 4  # along each side of a pixel, for the picture
 _MAPS = ("depth", "variance", "aleatoric", "epistemic", "disagreement", "measured")
 
 
-class ExampleWriter(FrameSink):
-    """A sink that writes examples of a sequence, and UfM*'s mixtures after a quarter, half and all of the frames.
+class ExampleWriter:
+    """Writes examples of a sequence, and UfM*'s mixtures after a quarter, half and all of the frames.
 
     Args:
         folder: of the sequence, in which "examples" and "room" are created.
-        frames: number of examples, evenly spaced over the frames.
+        total: number of frames.
+        rows: that process them.
     """
 
-    def __init__(self, folder: Path, frames: int = 3) -> None:
-        self._folder, self._count = folder, frames
+    def __init__(self, folder: Path, total: int, rows: Sequence[RowRunner]) -> None:
+        self._folder = folder
+        self._frames = _moments([(n + 0.5) / _EXAMPLES for n in range(_EXAMPLES)], total)
+        self._rooms = _moments(ROOM_SHARES, total)
+        self._gaussians = {row.key: row.estimator for row in rows if isinstance(row.estimator, Gaussians)}
         self._paths: dict[str, list[NDArray[np.float64]]] = {}
         self._last: dict[str, tuple[str, NDArray[np.float64]]] = {}
 
-    def begin(self, stream: FrameStream) -> None:
-        total = len(stream.indices)
-        self._frames = _moments([(n + 0.5) / self._count for n in range(self._count)], total)
-        self._rooms = _moments(ROOM_SHARES, total)
-        self._gaussians = {row.key: row.estimator for row in stream.rows if isinstance(row.estimator, Gaussians)}
-
-    def take(self, result: FrameResult) -> None:
+    def add(self, result: FrameResult) -> None:
         """Store a frame that is due. If no row used the frame, the next one is stored instead. Raises OSError, see
         ``write_atomic``."""
         if not result.rows or result.frame is None:
@@ -78,7 +77,7 @@ class ExampleWriter(FrameSink):
         first = next(iter(scenes.values()))
         _write(folder / f"{frame.name}.npz", {**first, "index": np.array(frame.index)})
         for key, row in result.rows.items():
-            maps = {part: getattr(row, part) for part in _MAPS}
+            maps = {part: row.map(part) for part in _MAPS}
             arrays = {part: value.float().numpy() for part, value in maps.items() if value is not None}
             scene = scenes[key]
             same_camera = scene["truth"].shape == first["truth"].shape and np.array_equal(scene["K"], first["K"])
