@@ -87,11 +87,13 @@ def measure(
     on_gpu = next((d for d in (device, multiview_device) if d.type == "cuda"), None)
     meter = meter or EnergyMeter(None if on_gpu is None else on_gpu.index or 0)
     with pinned_threads(plan.threads or 1):
-        on_multiview = dict.fromkeys((MULTIVIEW, SAMPLE), _unit(multiview_device))
-        units = dict.fromkeys((DEPTH, NETWORK), _unit(device)) | on_multiview
-        how: dict[str, Any] = {"device": device, "multiview_device": multiview_device}
-        how |= {"samples": plan.samples, "clock": CLOCKS[plan.clock]}
-        how["metered"] = {part for part in (DEPTH, ONCE, EVERY, MULTIVIEW) if _metered(units, part, meter)}
+        units = dict.fromkeys((DEPTH, NETWORK), _unit(device)) | dict.fromkeys(
+            (MULTIVIEW, SAMPLE), _unit(multiview_device)
+        )
+        how: dict[str, Any] = {"device": device, "multiview_device": multiview_device, "samples": plan.samples}
+        parts_measured = (DEPTH, ONCE, EVERY, MULTIVIEW, SAMPLE)
+        how["metered"] = {part for part in parts_measured if _metered(units, part, meter)}
+        how["clock"] = CLOCKS[plan.clock]
         parts = _timed(chosen, networks, sequence, range(len(sequence))[selected], plan, how)
         work = {part: (units.get(part[1], units[NETWORK]), calls) for part, calls in parts.calls.items()}
         energy = measure_energy(meter, work, seconds=plan.seconds, windows=plan.windows)

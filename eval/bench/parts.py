@@ -151,7 +151,7 @@ def time_parts(
     device: torch.device,
     multiview_device: torch.device,
     restart: bool = False,
-    metered: Collection[str] = (DEPTH, ONCE, EVERY, MULTIVIEW),
+    metered: Collection[str] = (DEPTH, ONCE, EVERY, MULTIVIEW, SAMPLE),
     samples: bool = False,
     clock: Clock = time.perf_counter,
 ) -> TimedParts:
@@ -164,7 +164,7 @@ def time_parts(
         restart: True if the sequence begins again after them; the rows then forget them.
         metered: parts whose calls are kept for the meter: of multiview steps those on every frame, of networks, whose
             cost does not depend on the image, those on the first ``_INFERENCES`` frames.
-        samples: also run the part ``SAMPLE`` of UfM* without anchors.
+        samples: True to run the part ``SAMPLE`` of UfM* without anchors, too.
         clock: returns seconds.
 
     Raises:

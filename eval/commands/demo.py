@@ -38,8 +38,8 @@ class DemoOptions(MachineOptions):
             FastDepth (.onnx).
         onboard: Run live, as on a small robot: one quantised network, 30 images/s, things of many sizes.
         seconds: With --onboard, walk this long [s].
-        power: With --onboard, read this log of an external power meter: CSV with the columns time (seconds since 1970)
-            and power (W) (default: the computer's own counters, if there are any).
+        power: With --onboard, take the energy from this log of an external power meter, a CSV file with the columns
+            time (seconds since 1970) and power (W) (default: the computer's own counters, if there are any).
         device: Run on cpu, cuda or cuda:N.
         threads: Use this many CPU threads (default: all cores, with --onboard all but one).
     """

@@ -132,7 +132,7 @@ class EvalOptions(MachineOptions):
         threads: Each process uses this many CPU threads (default: all cores, divided among --processes).
         processes: Run this many processes on this computer.
         scheduler: Run on the Dask cluster of this scheduler, tcp://HOST:8786, whose workers see the same files.
-        dry_run: Show rows, sequences and what is missing, and stop; this needs --suite alone.
+        dry_run: Show rows, sequences and what is missing, and stop; needs --suite alone.
     """
 
     USAGE: ClassVar[str] = (

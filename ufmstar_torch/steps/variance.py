@@ -64,12 +64,12 @@ def network_variances_at(
     With ``config.variances_in_h`` the last three features are the mixture's A, E and weight share s; each of A and E is
     then its mean over the mixture plus (1 - s) times the pixel's own.
     """
-    a, e = (None if value is None else at_pixels(value, pixels) for value in network_variances(frame, config))
+    values = [None if value is None else at_pixels(value, pixels) for value in network_variances(frame, config)]
     if config.variances_in_h:
-        mean_a, mean_e, explained = features[..., -3:].unbind(-1)
-        a = None if a is None else mean_a + (1 - explained) * a
-        e = None if e is None else mean_e + (1 - explained) * e
-    return NetworkVariances(a, e)
+        *means, explained = features[..., -3:].unbind(-1)
+        pairs = zip(values, means, strict=True)
+        values = [None if value is None else mean + (1 - explained) * value for value, mean in pairs]
+    return NetworkVariances(*values)
 
 
 def total_variance(
