@@ -202,11 +202,13 @@ class MergeConfig(Checked):
         loss: loss per pixel up to which two Gaussians are joined
         share: share in its own points below which a Gaussian is dissolved in the others
         every: frames of a stream from one merging to the next
+        accelerators: merge on accelerators, too, where every frame then waits for the device
     """
 
     loss: float = number(2.0, "l_max", "nat", 0.0, 10.0, open_low=True)
     share: float = number(0.1, "s_min", "1", 0.0, 0.5)
     every: int = number(50, "n", "frames", 1)
+    accelerators: bool = False
 
 
 @dataclass(frozen=True)
@@ -340,6 +342,10 @@ class UfMStarConfig(Checked):
     def entries(self) -> int:
         """Regressed quantities per Gaussian beside m: ``features``, and with ``variances_in_h`` A, E and 1."""
         return self.features + 3 * self.variances_in_h
+
+    def merges_on(self, device_type: str) -> bool:
+        """True if components are merged on a ``torch.device.type``."""
+        return self.merge is not None and (device_type == "cpu" or self.merge.accelerators)
 
     def within(self, max_depth: float | None, states_confidence: bool = False) -> UfMStarConfig:
         """The settings for a network that states its largest depth [m], for ``segment.max_depth``, or a confidence, for

@@ -39,7 +39,7 @@ def time_streams(
         For every count "streams", "step" and, on CUDA, "graph" (:class:`~ufmstar_torch.runtime.capture.Captured`):
         times [ms] of one frame of all streams.
     """
-    config = UfMStarConfig(on_bad_frame="skip", initial_capacity=_SLOTS, max_components=_SLOTS, merge=None)
+    config = UfMStarConfig(on_bad_frame="skip", initial_capacity=_SLOTS, max_components=_SLOTS)
     lines = []
     with pinned_threads(plan.threads or 1):
         wanted = None if plan.frames is None else plan.warm_up + plan.frames
