@@ -33,7 +33,8 @@ class Coverage(SumMetric):
 
     def sums(self, pixels):
         depth, variance, truth = pixels.judged
-        return {"inside": (np.abs(truth - depth) <= 2 * np.sqrt(variance)).sum(), "pixels": len(truth)}
+        inside = (truth - depth).abs() <= 2 * variance.sqrt()
+        return {"inside": pixels.judged.number(inside), "pixels": pixels.judged.number()}
 
     def compute(self):
         return {"within_2_sigma": share(self.inside, self.pixels)}

@@ -76,6 +76,27 @@ def test_the_tables_of_a_tour(script: Any, capsys: pytest.CaptureFixture[str]) -
     assert "| A + M, M shuffled |" in printed
 
 
+@pytest.mark.parametrize(
+    ("name", "wrong", "pointwise", "gaussian"),
+    [("A", 0, 0, 0), ("B", 1, 1, 1), ("C", 1, 0, 0), ("D", 1, 0, 1), ("E", 0, 0, 1)],
+)
+def test_the_papers_cases_of_disagreement(script: Any, name: str, wrong: int, pointwise: int, gaussian: int) -> None:
+    """Each case's error and disagreements are zero (0) or not (1), as the paper orders them."""
+    case = script("draw_disagreement_cases").make_case(name)
+    assert (case.error > 0.2) == wrong
+    assert (case.error < 1e-9) != wrong
+    for value, high in ((case.pointwise, pointwise), (case.gaussian, gaussian)):
+        assert (value > 0.04) == high
+        assert (abs(value) < 1e-12) != high
+
+
+def test_the_gaussian_disagreement_of_a_part_is_below_that_of_the_whole(script: Any) -> None:
+    """D and E lie between A and B, and B's disagreements are those of two points .6 m apart."""
+    a, b, d, e = (script("draw_disagreement_cases").make_case(name) for name in "ABDE")
+    assert a.gaussian < e.gaussian < d.gaussian < b.gaussian
+    assert (b.pointwise, b.gaussian) == (pytest.approx(0.6**2 / 2), pytest.approx(0.3**2))
+
+
 @pytest.mark.slow
 def test_a_constant_of_the_posterior_variance_leaves_the_depth(script: Any) -> None:
     """With a network of corrupted truth, the constant changes the variance and not the depth."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,6 +19,11 @@ from ufmstar_torch.eval.bench.energy import CPU, GPU
 from ufmstar_torch.eval.bench.measure import Plan, measure
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork
 from ufmstar_torch.eval.bench.parts import MULTIVIEW, time_parts
+from ufmstar_torch.eval.engine.evaluate import Judge, evaluate_sequence
+from ufmstar_torch.eval.engine.networks import NetworkSource
+from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.frames.image_check import reduced, shows_something
+from ufmstar_torch.frames.networks import NetworksInTurn
 from ufmstar_torch.models.any_network import wrap_network
 from ufmstar_torch.models.preprocess import Preprocess
 
@@ -61,7 +67,8 @@ def test_a_row_is_what_the_module_makes_of_the_networks_turns(timed, sequence):
             image = torch.from_numpy(frame.image).permute(2, 0, 1)[None]
             x, K = members[0].preprocess(image, torch.from_numpy(frame.intrinsics)[None])
             p = members[n % 4](x)
-            ufm(p.depth, torch.from_numpy(frame.T_world_cam)[None], K, p.aleatoric_variance)
+            view = {"member": n % 4, "informative": shows_something(reduced(image))}
+            ufm(p.depth, torch.from_numpy(frame.T_world_cam)[None], K, p.aleatoric_variance, **view)
     assert torch.equal(timed.staged["UfM*-Ensemble"].module.mean, ufm.mean)
     used = int(ufm.mixture.components) * ufm.mixture.bytes_per_component()
     assert timed.memory["UfM*-Ensemble"]["bytes_end"] == used
@@ -170,9 +177,51 @@ def test_what_cannot_be_measured_is_left_out_and_named(sequence):
     assert [row["row"] for row in message["rows"]] == ["UfM*-Ensemble"]
     assert len(message["left_out"]) == 4
     assert message["left_out"]["Evidential"] == "no network for evidential"
-    for wrong, words in ((rows_of("Evidential"), "can be measured"), (rows_of("UfM*-Ensemble"), "8 readable frames")):
+    for wrong, words in ((rows_of("Evidential"), "can be measured"), (rows_of("UfM*-Ensemble"), "8 usable frames")):
         with pytest.raises(ValueError, match=words):
-            measure(wrong, one, sequence, meter=NO_METER)
+            measure(wrong, one, sequence, meter=NO_METER, plan=Plan(frames=40))
+    with pytest.raises(ValueError, match="0 usable frames"):
+        measure(rows_of("UfM*-Ensemble"), one, sequence, meter=NO_METER, selected=slice(20, 30))
+
+
+def test_all_selected_frames_are_measured_as_in_the_evaluation(sequence):
+    """Latencies of every selected frame, and the memory of the evaluation after the last one and in the mean."""
+    selected, rows = slice(1, None), rows_of("UfM-Aleatoric", "UfM*-Aleatoric")
+    networks = {"aleatoric": TimedNetwork("aleatoric", [network()], "Linear")}
+    with_depth = open_sequence(f"tour:1?frames=150&size={SIZE[0]}x{SIZE[1]}&sensor=0")
+    seen = replace(sequence, entries=tuple(
+        replace(entry, load_depth=rendered.load_depth)
+        for entry, rendered in zip(sequence.entries, with_depth.entries, strict=False)
+    ))  # fmt: skip
+    message = measure(rows, networks, seen, plan=Plan(threads=1), meter=NO_METER, selected=selected)
+    assert message["plan"]["frames"] == 7
+    one = network()
+    source = NetworkSource(NetworksInTurn(one, preprocess=one.preprocess), torch.device("cpu"), {})
+    judged = evaluate_sequence(seen, rows, Judge({"aleatoric": source}, torch.device("cpu"), limit=selected))
+    for row, figures in zip(message["rows"], judged, strict=True):
+        assert row["latency"]["multiview"]["count"] == figures.frames["done"] == 7
+        measured = row["memory"]["multiview"]
+        assert measured["bytes_end"] == figures.state["bytes_end"] > 0
+        assert measured["bytes_mean"] == pytest.approx(figures.state["bytes_mean"])
+    ufm = message["rows"][0]["memory"]["multiview"]
+    assert ufm["bytes_mean"] < ufm["bytes_end"]
+
+
+def test_the_meter_repeats_every_frame_of_a_multiview_step(sequence):
+    """A window runs all frames, from the reset on, however short it may be."""
+    windows = []
+
+    def measured(work):
+        work()
+        windows.append(1)
+        return 1.0, {CPU: 1.0}
+
+    meter = SimpleNamespace(missing={}, measure=measured)
+    networks = {"aleatoric": TimedNetwork("aleatoric", [network()], "Linear")}
+    plan = Plan(threads=1, seconds=0.0, windows=1)
+    message = measure(rows_of("UfM*-Aleatoric"), networks, sequence, plan=plan, meter=meter)
+    assert message["rows"][0]["energy"]["multiview"]["gross"]["millijoules"] == pytest.approx(1000 / 8)
+    assert len(windows) == 3  # depth, once, multiview
 
 
 def test_a_network_that_predicts_all_in_one_is_not_separable(sequence):

@@ -17,12 +17,13 @@ from ufmstar_torch.eval.bench.networks import (
     ONCE,
     TimedNetwork,
     depth_alone,
+    parameter_bytes,
     timed_networks,
-    weight_bytes,
 )
 from ufmstar_torch.eval.bench.parts import MultiviewStep
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.report.efficiency import megabytes
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble, converted_layers
@@ -55,9 +56,17 @@ def test_100k_points_of_ufm_are_4_megabytes_and_the_smoothing_map_a_fifth():
 def test_ten_members_are_90_percent():
     members = [network(offset=0.1 * n) for n in range(10)]
     memory = TimedNetwork("ensemble", members, "Linear").memory()
-    head = weight_bytes(members[0].head)
-    assert memory == {"depth": 8, "uncertainty": 9 * 8 + 10 * head}  # the backbone has two weights
+    head = parameter_bytes(members[0].head)
+    assert memory == {"depth": 8, "uncertainty": 9 * 8 + 10 * head, "buffers": 0}  # the backbone has two weights
     assert overhead_percent(9, 1) == pytest.approx(90)
+
+
+def test_fastdepth_weighs_what_the_paper_states_and_its_buffers_are_counted_apart():
+    """The paper: 15.8 MB, and 142.6 MB for nine further members."""
+    memory = TimedNetwork("ensemble", [FastDepth() for _ in range(10)], "FastDepth").memory()
+    assert (megabytes(memory["depth"]), megabytes(memory["uncertainty"])) == ("15.8", "142.6")
+    buffers = [b for module in FastDepth().modules() for b in module.buffers(recurse=False)]
+    assert memory["buffers"] == 10 * sum(b.nbytes for b in buffers) > 1e6
 
 
 def fast_depth(method, dropout=0.0):
@@ -74,7 +83,7 @@ def test_a_batch_ensemble_adds_its_factors_and_the_head():
     plain = fast_depth("aleatoric")
     head = plain.head.weight.nbytes  # its bias is one of the members' biases
     memory = one.memory()
-    assert memory["depth"] == weight_bytes(plain.backbone)
+    assert memory["depth"] == parameter_bytes(plain.backbone)
     assert memory["uncertainty"] == factors + biases + head
     x, K = torch.rand(1, 3, 64, 64), torch.eye(3)[None]
     torch.testing.assert_close(one.predict(DEPTH, x, K).depth, one.predict(ONCE, x, K).depth, rtol=1e-4, atol=1e-4)
@@ -84,7 +93,7 @@ def test_mc_dropout_adds_a_head_and_depth_alone_does_not_sample():
     sampling = MonteCarloDropout(fast_depth("aleatoric", dropout=0.2))
     one = TimedNetwork("mc_dropout", [sampling], "FastDepth", samples=3)
     x, K = torch.rand(1, 3, 64, 64), torch.eye(3)[None]
-    assert one.memory()["uncertainty"] == weight_bytes(sampling.network.head)
+    assert one.memory()["uncertainty"] == parameter_bytes(sampling.network.head)
     assert torch.equal(one.predict(DEPTH, x, K).depth, one.predict(DEPTH, x, K).depth)
     assert not torch.equal(one.predict(ONCE, x, K).depth, one.predict(ONCE, x, K).depth)
     assert one.predict(EVERY, x, K).epistemic_variance.max() > 0
@@ -97,7 +106,7 @@ def test_a_graph_of_onnx_runtime_is_depth_alone_and_weighs_what_its_file_does(tm
     timed = TimedNetwork("depth_only", [network], "FastDepth")
     assert timed.depth is network
     assert timed.why_whole is None
-    assert timed.memory() == {"depth": path.stat().st_size, "uncertainty": 0}
+    assert timed.memory() == {"depth": path.stat().st_size, "uncertainty": 0, "buffers": 0}
 
 
 def test_depth_alone_is_the_same_depth_from_a_copy():
@@ -109,7 +118,7 @@ def test_depth_alone_is_the_same_depth_from_a_copy():
     assert prediction.aleatoric_variance is None
     assert not {p.data_ptr() for p in alone.parameters()} & {p.data_ptr() for p in whole.parameters()}
     lazy = LazyMember(lambda: whole, whole.preprocess)
-    assert TimedNetwork("evidential", [lazy], "FastDepth").memory()["uncertainty"] == weight_bytes(whole.head)
+    assert TimedNetwork("evidential", [lazy], "FastDepth").memory()["uncertainty"] == parameter_bytes(whole.head)
 
 
 def test_a_depth_only_row_is_not_charged_for_a_head_that_it_ignores():

@@ -11,6 +11,7 @@ from random_gaussians import covariances, means
 
 import oracle
 from ufmstar_torch.gaussians import gaussian
+from ufmstar_torch.gaussians.gaussian import pointwise_disagreement
 
 pytestmark = pytest.mark.numerics
 
@@ -160,3 +161,13 @@ def test_pixel_footprint_is_the_variance_across_one_pixel():
     assert gaussian.pixel_footprint(torch.tensor(2.0), torch.tensor(200.0)).item() == pytest.approx(
         edge.var(), rel=1e-3
     )
+
+
+def test_pointwise_disagreement_is_the_trace_of_the_sample_covariance():
+    points = torch.randn(4, 5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    expected = [np.trace(np.cov(views.numpy().T)) for views in points]
+    torch.testing.assert_close(pointwise_disagreement(points), torch.tensor(expected, dtype=torch.float64))
+    assert pointwise_disagreement(points.float()).dtype == torch.float32
+    assert torch.equal(pointwise_disagreement(points[:, :1].expand(4, 3, 3)), torch.zeros(4, dtype=torch.float64))
+    with pytest.raises(ValueError, match="at least two views"):
+        pointwise_disagreement(points[:, :1])

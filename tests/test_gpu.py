@@ -23,7 +23,7 @@ pytestmark = [
     pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device, torch sees none"),
 ]
 
-FIXED = {"on_bad_frame": "skip", "initial_capacity": 256, "max_components": 256, "merge": None}
+FIXED = {"on_bad_frame": "skip", "initial_capacity": 256, "max_components": 256}
 
 
 def frames(streams: int, count: int):

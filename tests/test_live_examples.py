@@ -98,6 +98,9 @@ def test_the_demo_on_board(tmp_path, monkeypatch, capsys):
         assert text in out
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["realtime"]["images"] == 30
-    assert {file.name for file in (tmp_path / "out").iterdir()} >= {"onboard.png", "onboard_int8.onnx"}
+    files = {"onboard.png", "onboard_int8.onnx", "onboard_costs.png"}
+    assert {file.name for file in (tmp_path / "out").iterdir()} >= files
+    assert set(summary["costs"]["seconds"]) == {"camera and network", "UfM*", "rest"}
+    assert len(summary["costs"]["times"]) == summary["realtime"]["results"]
     assert cli.main([*words, "--overwrite", "--device", "cuda"]) == 2
     assert cli.main([*words, "--seconds", "0"]) == 2

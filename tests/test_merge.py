@@ -257,3 +257,11 @@ def test_a_module_leaves_another_room_as_it_is():
     assert len(before) > 1, "the first room has something to merge"
     assert torch.equal(after[after[:, 0] < 50], before)
     assert int((after[:, 0] > 50).sum()) == 1, "the second room was merged"
+
+
+def test_merging_is_on_by_default_on_the_cpu_alone():
+    default, paper = UfMStarConfig(), UfMStarConfig.paper()
+    assert [default.merges_on(kind) for kind in ("cpu", "cuda", "meta")] == [True, False, False]
+    assert UfMStarConfig(merge=MergeConfig(accelerators=True)).merges_on("cuda")
+    assert not paper.merges_on("cpu")
+    assert paper.merge is None

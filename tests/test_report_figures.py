@@ -198,6 +198,25 @@ def test_the_same_figure_gives_the_same_file_and_no_global_state(tmp_path):
     assert ("matplotlib.pyplot" in sys.modules) == pyplot
 
 
+def test_the_overlap_figure_shows_the_improvement_in_nll_with_its_zero_line() -> None:
+    """The paper's figure: NLL of aleatoric minus that of UfM*-Aleatoric over the skipped images; then the others."""
+    skips, figures = (0, 1, 4), {}
+    for name, falls in (("Aleatoric", 0.0), ("UfM*-Aleatoric", 1.0)):
+        (row,) = rows_of(name)
+        for skip in skips:
+            for sequence, level in (("a", 2.0), ("b", 6.0)):
+                nll = level - falls * (3 - skip / 2)
+                figures[Row(row.method, Setting(skip=skip)), ("d", sequence)] = {"nll": nll, "ece_delta": 0.1}
+    figure = draw_sweep(in_memory(figures), "aleatoric", "skip")
+    assert len(figure.axes) == 4
+    assert "improvement" in figure.axes[0].get_title(loc="left")
+    lines = drawn(figure.axes[0])
+    assert lines["UfM*"].get_xdata().tolist() == list(skips)
+    np.testing.assert_allclose(lines["UfM*"].get_ydata(), [3.0, 2.5, 1.0])
+    assert list(lines["alone"].get_ydata()) == [0, 0]
+    assert "alone" in drawn(figure.axes[1])
+
+
 # ---- sweeps with anchors ----
 
 STAR = STAR_OF_DEPTH.method

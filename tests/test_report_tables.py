@@ -34,7 +34,7 @@ from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting, setting_from
 from ufmstar_torch.eval.methods.suite import names, suite_named
-from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.eval.metrics import SequenceMetrics, mean_and_ci
 from ufmstar_torch.eval.report.data import Results, load_results
 from ufmstar_torch.eval.report.means import Mean, difference, mean_of
 from ufmstar_torch.eval.report.names import NLL, row_labels
@@ -90,12 +90,20 @@ def test_coverage_has_columns_where_a_row_has_intervals():
 
 
 class TestMainTable:
-    def test_fewer_than_five_sequences_have_no_interval(self, results):
+    def test_intervals_begin_with_two_sequences_and_those_of_few_are_marked(self, results):
         assert main_table(results, "7-scenes").notes[1] == "One sequence: no confidence intervals."
         four = in_memory({(row, ("d", s)): {"nll": ord(s) / 9} for row in (ALONE, UFM_STAR) for s in "abcd"})
-        assert main_table(four).notes[1] == "4 sequences, fewer than 5: no confidence intervals."
-        assert not any(cell.half for cell in main_table(four).cells.to_numpy().flat)
+        assert "w: wide, since Student's interval of 4 sequences rests on normality" in main_table(four).notes[1]
+        (cell, _) = main_table(four).cells["", "NLL ↓"]
+        mean, half = mean_and_ci([ord(s) / 9 for s in "abcd"])
+        assert (cell.value, cell.half, cell.wide) == (f"{mean:.2f}", f"{half:.2f}", True)
+        assert parsed(markdown(main_table(four)))["Ensemble"]["NLL ↓"] == f"{mean:.2f} ± {half:.2f} w"
+        assert rf"${mean:.2f} \pm {half:.2f}\,\mathrm{{w}}$" in latex(main_table(four))
         assert not any(cell.remark for cell in difference_table(four).cells.to_numpy().flat)
+        two = in_memory({(row, ("d", s)): {"nll": ord(s) / 9} for row in (ALONE, UFM_STAR) for s in "ab"})
+        five = in_memory({(row, ("d", s)): {"nll": ord(s) / 9} for row in (ALONE, UFM_STAR) for s in "abcde"})
+        assert all(cell.half and cell.wide for cell in main_table(two).cells["", "NLL ↓"])
+        assert all(cell.half and not cell.wide for cell in main_table(five).cells["", "NLL ↓"])
 
     def test_the_best_of_each_base_is_bold(self):
         values = {"Ensemble": 2.0, "UfM*-Ensemble": 1.0, "Aleatoric": 0.5, "UfM*-Aleatoric": 0.7}
@@ -382,11 +390,27 @@ class TestThePapersNumbers:
         half = 2.776 * 250**0.5 / 5**0.5  # Student's t of four degrees of freedom, variance of 0, 10, ..., 40
         assert cells["energy [mJ] ↓"] == f"1927 ± {half:.0f}"  # 1857 of the network, 50 to 90 of the step
         assert cells["memory [MB] ↓"] == "1245"
-        assert "memory on all sequences, energy on 5 of them" in table.notes[-1]
+        assert "on all selected frames of 5 sequences" in table.notes[-1]
+        assert result.efficiency["plan"]["frames"] == 500
         assert result.efficiency["rows"][0]["latency"]["multiview"]["median_ms"] == 24.0
         assert result.efficiency["sequence"]["name"] == "5 sequences"
         without = over_sequences({("d", "s"): measured_line(mvd=(24.0, None), dnn=(252.0, None))})
         assert without["sequences"][0]["energy_mj"] == {"UfM*-Ensemble": None}
+
+    def test_memory_is_one_number_in_all_tables(self):
+        """The main table adds the network's and the state's columns of the table of efficiency, whatever the records
+        have, because both are measured over the same frames."""
+        sizes = {("d", "a"): 10e6, ("d", "b"): 30e6}
+        networks = {"network_uncertainty_bytes": 5e6}
+        runs = {
+            where: measured_line(mvd=(24.0, 50.0), memory={"mvd": size, **networks}) for where, size in sizes.items()
+        }
+        result = in_memory({(UFM_STAR, where): {"nll": 1.0} for where in runs}, efficiency=over_sequences(runs))
+        main = parsed(markdown(main_table(result)))["UfM*-Ensemble"]
+        costs = parsed(markdown(all_tables(result)["efficiency"][0]))["UfM*-Ensemble"]
+        assert (costs["Memory: DNN unc. [MB]"], costs["Memory: MVD [MB]"]) == ("5.0", "20.0")
+        assert (costs["Memory: MVD, mean [MB]"], costs["Memory: DNN buffers [MB]"]) == ("10.0", "1.0")
+        assert main["memory [MB] ↓"].split(" ±")[0] == "25.0"
 
     def test_table_2_stands_below_what_was_measured(self, tmp_path):
         result = in_memory({(ALONE, ("d", "s")): {"nll": 1.0}}, efficiency=measured_line())

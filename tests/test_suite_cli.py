@@ -12,7 +12,7 @@ from tiny_suite import TRUTH, Stub
 from ufmstar_torch.eval.bench import measure as measurement
 from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.commands.options import joined
-from ufmstar_torch.eval.methods.suite import names
+from ufmstar_torch.eval.methods.suite import names, suite_named
 from ufmstar_torch.eval.suite.tasks import warned_once
 
 
@@ -81,9 +81,9 @@ def test_a_dry_run_counts_and_writes_nothing(ufmstar, rooms, tmp_path):
     words = words_for(rooms, tmp_path / "out", "--dry-run", "--frames", "1:")
     code, text, _ = ufmstar(*words)
     assert code == 0
-    assert "5 rows:" in text
+    assert "6 rows:" in text
     lines = "".join(f"  rooms/{name}: 3 frames\n" for name in ("ash", "birch", "cedar"))
-    assert f"3 sequences:\n{lines}9 frames, 15 records" in text
+    assert f"3 sequences:\n{lines}9 frames, 18 records" in text
     assert not (tmp_path / "out").exists()
 
 
@@ -104,7 +104,8 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
 
     def measure(rows, networks, sequence, **how):
         measured.append(([row.method.name for row in rows], sequence.name, how["plan"].frames, how["plan"].threads))
-        return {"rows": [], "sequence": {"name": sequence.name}, "count": len(measured)}
+        counted = {"rows": [], "plan": {"frames": 3}, "count": len(measured)}
+        return {**counted, "sequence": {"name": sequence.name}}
 
     monkeypatch.setattr(measurement, "measure", measure)
     monkeypatch.setattr(measurement, "timed_networks", lambda networks, rows: networks)
@@ -116,7 +117,8 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
     written = json.loads((tmp_path / "out" / "efficiency.json").read_text())
     assert (written["sequence"], written["count"]) == ({"name": "3 sequences"}, 2.0), "means over the sequences"
     assert [one["sequence"] for one in written["sequences"]] == ["ash", "birch", "cedar"]
-    assert measured == [(rows, name, 1, 1) for name in ("ash", "birch", "cedar")]
+    assert measured == [(rows, name, None, 1) for name in ("ash", "birch", "cedar")]
+    assert written["plan"]["frames"] == 9
     assert ufmstar(*words, "--resume")[0] == 0
     assert len(measured) == 3
     (tmp_path / "out" / "efficiency.json").unlink()
@@ -132,3 +134,28 @@ def test_a_warning_of_many_streams_is_logged_once(caplog):
             for stream, text in ((0, "a frame has no segment"), (1, "a frame has no segment"), (1, "other")):
                 logger.warning("stream %d: %s", stream, text)
     assert caplog.messages == 2 * ["stream 0: a frame has no segment", "stream 1: other"]
+
+
+def test_a_dry_run_needs_nothing_and_states_what_is_missing(ufmstar):
+    """Every row of the paper's table with its needs, without a network, a sequence or a folder."""
+    code, text, err = ufmstar("eval", "--suite", "paper-table-1", "--dry-run")
+    assert code == 0, err
+    assert "25 rows:" in text
+    lines = {line.split()[0]: line for line in text.splitlines() if "[no network]" in line}
+    assert lines["Ensemble"].endswith(
+        "needs several networks that predict an aleatoric variance (ensemble), ground truth"
+    )
+    dropout = "needs a network with dropout in its decoder that predicts an aleatoric variance (mc_dropout), poses"
+    assert dropout in lines["UfM-MCD-100K"]
+    assert all(f"  --network {base}=MODEL:FILE: " in text for base in suite_named("paper-table-1").bases)
+    assert "no --root: folders with sequences" in text
+    assert "no --out: " in text
+    assert "\n0 sequences:" in text
+    assert ufmstar("eval", "--dry-run")[0] == 2, "the suite is needed"
+
+
+def test_a_dry_run_with_one_network_lists_the_other_rows_too(ufmstar, rooms):
+    words = ("--network", TRUTH, "--root", f"rooms={rooms}", "--dry-run")
+    code, text, err = ufmstar("eval", "--suite", "ablation-anchors", "--base", "depth_only", *words)
+    assert code == 0, err
+    assert "poses, OpenCV, ground truth" in text

@@ -192,7 +192,7 @@ def test_files_that_are_not_there(tmp_path):
 
 
 def test_a_in_h_agrees_with_the_oracle():
-    config = UfMStarConfig(segment=SPGF, aleatoric_in_h=True, backend="torch", unmeasured="paper")
+    config = UfMStarConfig(segment=SPGF, variances_in_h=True, backend="torch", unmeasured="paper")
     estimator, sampled = Gaussians(config, CPU), UfMStar(config.replace(features=1, backend="auto"))
     judge = oracle.Oracle(oracle_settings(SPGF))
     depths, poses, K = scenes.sequence(3, 30, 40, 0.05)
@@ -210,15 +210,34 @@ def test_a_in_h_agrees_with_the_oracle():
         assert mean.aleatoric.maximum.item() == pytest.approx(np.nanmax(A), rel=1e-4)
     assert sampled.query(torch.zeros(1, 2, 3)).features.shape == (1, 2, 1)
     assert np.nanmax(np.abs(A - a)) > 0.01, "the mixture's average is not the pixel's value"
-    with pytest.raises(ValueError, match="aleatoric must be given with config"):
+    with pytest.raises(ValueError, match="aleatoric or epistemic must be given"):
         estimator.update(replace(maps, aleatoric_variance=None), torch.tensor(T))
 
 
+def test_e_in_h_follows_the_rule_of_a():
+    """E alone, and A beside it, are averaged as A alone; a variance that the network does not predict has no part."""
+    config = UfMStarConfig(segment=SPGF, variances_in_h=True, unmeasured="paper")
+    both, first, second = UfMStar(config), UfMStar(config), UfMStar(config)
+    depths, poses, K = scenes.sequence(2, 30, 40, 0.05)
+    for i, (depth, T) in enumerate(zip(depths, poses, strict=True)):
+        z, T, camera = torch.tensor(depth)[None], torch.tensor(T)[None], torch.tensor(K)[None]
+        a, e = 0.01 * (1 + i) * z**2, 0.02 * (2 - i) * z
+        out = both(z, T, camera, aleatoric=a, epistemic=e)
+        alone_a, alone_e = first(z, T, camera, aleatoric=a), second(z, T, camera, epistemic=e)
+        torch.testing.assert_close(out.aleatoric, alone_a.aleatoric, equal_nan=True)
+        torch.testing.assert_close(out.epistemic, alone_e.epistemic, equal_nan=True)
+        total = out.disagreement + out.aleatoric + out.epistemic
+        torch.testing.assert_close(out.variance, total, equal_nan=True)
+    assert alone_a.epistemic is None
+    assert alone_e.aleatoric is None
+    assert (out.epistemic - e).abs()[out.valid].max() > 0.01, "the mixture's average is not the pixel's value"
+
+
 def test_a_in_h_is_a_row_of_its_own():
-    one = row("UfM*-Aleatoric", overrides={"aleatoric_in_h": True})
+    one = row("UfM*-Aleatoric", overrides={"variances_in_h": True})
     config = ufm_star_config(one)
-    assert (config.aleatoric_in_h, config.features, config.entries) == (True, 0, 2)
-    assert one.label == "UfM*-Aleatoric (aleatoric_in_h True)"
+    assert (config.variances_in_h, config.features, config.entries) == (True, 0, 3)
+    assert one.label == "UfM*-Aleatoric (variances_in_h True)"
 
 
 # ---- how images come to the networks ----

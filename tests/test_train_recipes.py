@@ -90,7 +90,7 @@ def test_the_yardstick_is_the_likelihood_of_one_variance():
         maps = (value[n : n + 1] for value in (predicted, 0.25 * variance, 0.75 * variance))
         validation.update(DepthPrediction(*maps), depth[n : n + 1], valid[n : n + 1])
     error, truth = (predicted - depth)[valid].numpy(), depth[valid].numpy()
-    figures = validation.figures(Sums(0.3 * 11, 11))
+    figures = validation.figures(Sums(torch.tensor([0.3 * 11, 11], dtype=torch.float64)))
     normal = torch.distributions.Normal(predicted[valid], 0.3**0.5)
     assert figures["val_nll"] == pytest.approx(-float(normal.log_prob(depth[valid]).mean()), rel=1e-12)
     # A constant variance has no gain.
@@ -100,9 +100,21 @@ def test_the_yardstick_is_the_likelihood_of_one_variance():
     ratio = np.maximum((truth + error) / truth, truth / (truth + error))
     assert figures["val_delta1"] == pytest.approx(((ratio < 1.25) & (ratio > 0)).mean())
     # The mean squared error is the best constant variance.
-    constants = [validation.figures(Sums(v, 1))["val_nll_constant"] for v in np.geomspace(1e-3, 10, 200)]
-    best = validation.figures(Sums((error**2).mean(), 1))["val_nll_constant"]
+    constants = [
+        validation.figures(Sums(torch.tensor([v, 1.0], dtype=torch.float64)))["val_nll_constant"]
+        for v in np.geomspace(1e-3, 10, 200)
+    ]
+    best = validation.figures(Sums(torch.tensor([(error**2).mean(), 1.0], dtype=torch.float64)))["val_nll_constant"]
     assert figures["val_nll_constant_best"] == pytest.approx(best)
     assert best <= min(constants)
     alone.update(DepthPrediction(predicted), depth, valid)
     assert "val_nll" not in alone.figures(Sums())
+
+
+def test_the_sums_of_training_steps_need_no_value_before_the_epoch_ends():
+    """A tensor of the device "meta" has no value to wait for."""
+    step = torch.zeros(2, dtype=torch.float64, device="meta")
+    assert Sums().plus(step).plus(step).values.device.type == "meta"
+    sums = Sums().plus(torch.tensor([3.0, 2.0])).plus(torch.tensor([1.0, 6.0]))
+    assert (sums.mean(), sums.pixels) == (0.5, 8.0)
+    assert math.isnan(Sums().mean())

@@ -107,8 +107,8 @@ class TrainingModule(pl.LightningModule):
         all_sums, world = self._over_processes(sums)
         if not math.isfinite(all_sums[0]):
             raise NonFiniteLossError(self._blame("loss", batch_idx, float(total.detach())))
-        self.residuals = self.residuals.plus(*all_sums[2:].tolist())
-        self.losses = self.losses.plus(*all_sums[:2].tolist())
+        self.residuals = self.residuals.plus(all_sums[2:])
+        self.losses = self.losses.plus(all_sums[:2])
         mean = all_sums[0] / all_sums[1].clamp(min=1)
         self.log("train_loss", mean.float(), prog_bar=True, batch_size=len(target))
         self.log("learning_rate", self.trainer.optimizers[0].param_groups[0]["lr"], batch_size=1)

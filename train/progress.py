@@ -22,20 +22,24 @@ FIGURES = ("val_nll", "val_nll_constant", "val_nll_constant_best", "val_delta1",
 VARIANCE_FLOOR = 1e-6
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sums:
-    """Sum of a value per pixel (for example of squared errors [m^2]), and the number of pixels."""
+    """Sum of a value per pixel (for example of squared errors [m^2]), and the number of pixels, on their device."""
 
-    total: float = 0.0
-    pixels: float = 0.0
+    values: Tensor | None = None  # [2] float64; None without pixels
 
-    def plus(self, total: float, pixels: float) -> Sums:
-        """The sums with more pixels."""
-        return Sums(self.total + total, self.pixels + pixels)
+    def plus(self, values: Tensor) -> Sums:
+        """The sums with more pixels [2]; does not wait for the device."""
+        return Sums(values if self.values is None else self.values + values)
+
+    @property
+    def pixels(self) -> float:
+        """The number of pixels."""
+        return 0.0 if self.values is None else float(self.values[1])
 
     def mean(self) -> float:
         """The mean over the pixels; NaN without pixels."""
-        return self.total / self.pixels if self.pixels else math.nan
+        return math.nan if self.values is None or not self.pixels else float(self.values[0]) / self.pixels
 
 
 class Validation:

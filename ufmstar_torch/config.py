@@ -18,7 +18,8 @@ UNSTATED_RANGE = 20.0
 # The paper's settings where the defaults differ from them (``UfMStarConfig.paper`` has the reasons), by dotted name.
 PAPER: Mapping[str, Any] = MappingProxyType({
     "segment.min_pixels": 2000, "segment.min_rows": 32, "segment.prune": "either", "segment.slope_focal": "camera",
-    "view_baseline": None, "regression": "neighbourhood", "unmeasured": "paper", "merge": None,
+    "segment.max_depth": 1000.0, "view_baseline": None, "regression": "neighbourhood", "unmeasured": "paper",
+    "merge": None,
 })  # fmt: skip
 
 
@@ -201,11 +202,13 @@ class MergeConfig(Checked):
         loss: loss per pixel up to which two Gaussians are joined
         share: share in its own points below which a Gaussian is dissolved in the others
         every: frames of a stream from one merging to the next
+        accelerators: merge on accelerators, too, where every frame then waits for the device
     """
 
     loss: float = number(2.0, "l_max", "nat", 0.0, 10.0, open_low=True)
     share: float = number(0.1, "s_min", "1", 0.0, 0.5)
     every: int = number(50, "n", "frames", 1)
+    accelerators: bool = False
 
 
 @dataclass(frozen=True)
@@ -233,8 +236,8 @@ class UfMStarConfig(Checked):
         variance_floor: smallest variance of a pixel
         add_aleatoric: add the network's aleatoric variance to the result
         add_epistemic: add the network's epistemic variance to the result
-        aleatoric_in_h: average the network's aleatoric variance over views in the Gaussians (the paper's H), and add
-            that average instead of the pixel's own
+        variances_in_h: average the network's variances, aleatoric and epistemic, over views in the Gaussians (the
+            paper's H), and add these averages instead of the pixel's own
         features: additional regressed quantities per Gaussian
         initial_capacity: slots for Gaussians at the start; the number grows as needed
         max_components: largest number of Gaussians, beyond which the farthest are dropped, then the oldest; null = no
@@ -274,7 +277,7 @@ class UfMStarConfig(Checked):
     add_epistemic: bool = True
 
     # State
-    aleatoric_in_h: bool = False
+    variances_in_h: bool = False
     features: int = number(0, "dim H - 1", "1", 0)
     initial_capacity: int = number(256, "K_0", "components", 1)
     max_components: int | None = number(None, "K_max", "components", 1)
@@ -304,10 +307,10 @@ class UfMStarConfig(Checked):
         for name in ("posterior", "confidence"):
             if getattr(self, name) is not None and self.anchors is None:
                 raise ValueError(f"UfMStarConfig.{name} needs anchors: set anchors=AnchorConfig() as well")
-        if self.aleatoric_in_h and (self.anchors is not None or not self.add_aleatoric):
+        if self.variances_in_h and (self.anchors is not None or not (self.add_aleatoric or self.add_epistemic)):
             raise ValueError(
-                "UfMStarConfig.aleatoric_in_h goes with add_aleatoric=True and without anchors (posterior=False; "
-                "--plain), got another setting"
+                "UfMStarConfig.variances_in_h goes with add_aleatoric=True or add_epistemic=True and without anchors "
+                "(posterior=False; --plain), got another setting"
             )
         require_bytes("UfMStarConfig.initial_capacity", self.initial_capacity * (_SLOT + 4 * self.entries))
 
@@ -321,6 +324,8 @@ class UfMStarConfig(Checked):
           rows; the default one that is below 200 pixels and below 16 rows. On four sequences that is 4 to 6 Gaussians
           over 55 to 85 % of the usable pixels here, 12 to 24 over 92 to 99 % by default, and ECE_delta of FastDepth's
           depth alone is .562 here and .382 by default (docs/results/accuracy.md).
+        - ``segment.max_depth``: 1 km here, farther than any depth in the paper's data sets; by default the largest
+          depth that the network states, or SPGF's 20 m.
         - ``segment.slope_focal``: SPGF's thresholds have the camera's own focal length here, by default the
           reference's, which made no difference on tours.
         - ``view_baseline``: every comparison counts here, and the first view counts as agreement; by default a
@@ -335,8 +340,12 @@ class UfMStarConfig(Checked):
 
     @property
     def entries(self) -> int:
-        """Regressed quantities per Gaussian beside m: ``features``, and with ``aleatoric_in_h`` A and 1."""
-        return self.features + 2 * self.aleatoric_in_h
+        """Regressed quantities per Gaussian beside m: ``features``, and with ``variances_in_h`` A, E and 1."""
+        return self.features + 3 * self.variances_in_h
+
+    def merges_on(self, device_type: str) -> bool:
+        """True if components are merged on a ``torch.device.type``."""
+        return self.merge is not None and (device_type == "cpu" or self.merge.accelerators)
 
     def within(self, max_depth: float | None, states_confidence: bool = False) -> UfMStarConfig:
         """The settings for a network that states its largest depth [m], for ``segment.max_depth``, or a confidence, for

@@ -130,7 +130,7 @@ class UfMStar(StatefulModule):
             confidence=confidence,
         )  # fmt: skip
         out, maps, quantiles = self._observe(frame)
-        maps |= {"epistemic": e} if self.config.aleatoric_in_h else {"aleatoric": a, "epistemic": e}
+        maps |= {} if self.config.variances_in_h else {"aleatoric": a, "epistemic": e}
         maps |= {"network_depth": depth, "measured": out.measured, "valid": frame.valid}
 
         def shaped(value: Tensor) -> Tensor:  # the argument may be [B, 1, H, W]
@@ -277,7 +277,7 @@ class UfMStar(StatefulModule):
             if value is not None and not used[name]:
                 raise ValueError(f"{name} must be None where UfMStarConfig.{name} is None, which switches it off")
         frame = check_frame(
-            depth, T, K, *maps, **view, feature_count=self.config.features, aleatoric_in_h=self.config.aleatoric_in_h,
+            depth, T, K, *maps, **view, feature_count=self.config.features, variances_in_h=self.config.variances_in_h,
             rotation_tolerance=self.config.rotation_tolerance, max_depth=self.config.segment.depth_limit,
             kernel=self._kernels(depth.device.type)[1].check,
         )  # fmt: skip

@@ -1,7 +1,7 @@
 """Measures energy per frame with zeus, or gives the reason why it cannot be measured. Nothing is estimated.
 
-Counters are refreshed tens of times a second at best, so a single call cannot be measured. A window repeats one part
-until it is long enough. Several windows per part, in alternating order, show the spread.
+Counters are refreshed tens of times a second at best, so a single call cannot be measured. A window runs one part on
+all its frames, and again until it is long enough. Several windows per part, in alternating order, show the spread.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def measure_energy(
         meter: reads the counters.
         work: by part, the unit whose meter counts ("gpu" or "cpu"), and one call per frame, which returns when its
             device has finished.
-        seconds: shortest window [s]; a window repeats the calls.
+        seconds: shortest window [s]; a window makes all calls once, and all of them again until it is long enough.
         windows: number of windows per part.
     """
     results: dict[Key, list[list[float]]] = {key: [] for key in work}
@@ -129,7 +129,7 @@ def _window(meter: EnergyMeter, calls: Sequence[Callable[[], object]], seconds: 
     def work() -> None:
         nonlocal frames
         start = time.perf_counter()
-        while not frames or time.perf_counter() - start < seconds:
+        while frames % len(calls) or not frames or time.perf_counter() - start < seconds:
             calls[frames % len(calls)]()
             frames += 1
 

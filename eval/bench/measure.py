@@ -2,14 +2,15 @@
 
 Each row has three costs: the network's depth alone, the network's uncertainty (a head, further members or samples),
 and the multiview step. Times come from the frames of one sequence (``parts``), energies from zeus (``energy``), memory
-from the stored tensors. A megabyte is 10^6 bytes, as in the paper: 100,000 points of 40 bytes are its 4.0 MB.
+from the stored tensors: parameters, without buffers, and the multiview state after the last frame and in the mean.
+A megabyte is 10^6 bytes, as in the paper: 100,000 points of 40 bytes are its 4.0 MB.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import islice
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
@@ -19,12 +20,13 @@ from ufmstar_torch.eval.bench.energy import CPU, GPU, Energy, EnergyMeter, diffe
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, timed_networks
 from ufmstar_torch.eval.bench.parts import ANCHORS, MULTIVIEW, SAMPLE, Part, TimedParts, inference_of, time_parts
 from ufmstar_torch.eval.bench.timing import CLOCKS, most_threads, paired_ratio, pinned_threads, spread
+from ufmstar_torch.eval.engine.evaluate import require_usable
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.run.files import write_json_atomic
 from ufmstar_torch.eval.run.machine import device_of, hardware, load_average, versions
-from ufmstar_torch.eval.sequences.frame import FrameSequence
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.suite.job import EvalJob
 
 EFFICIENCY = "efficiency.json"
@@ -36,8 +38,10 @@ Energies = Mapping[Part, Energy]
 class Plan:
     """The amount of measurements."""
 
-    frames: int = 40  # number of timed frames, after ``warm_up``
-    warm_up: int = 5  # number of frames before them, which are run but not counted
+    frames: int | None = None  # number of timed frames, after ``warm_up``; None = all that are selected
+    # Number of frames before them, which are run but not counted. If all frames are timed, these are the first ones,
+    # and the sequence begins again after them.
+    warm_up: int = 5
     threads: int | None = None  # of torch and numba on the CPU; None = all cores that this process may use
     seconds: float = 3.0  # shortest energy window [s]
     windows: int = 3  # energy windows per part
@@ -54,9 +58,11 @@ def measure(
     multiview_device: torch.device | str = "cpu",
     plan: Plan | None = None,
     meter: EnergyMeter | None = None,
+    selected: slice = slice(None),
 ) -> dict[str, Any]:
-    """Measure every row on the first frames of a sequence with images; plain values for JSON. A row whose base has no
-    network, or has one member where it needs several, is left out and named in the result.
+    """Measure every row on the selected frames of a sequence with images; plain values for JSON. Unusable frames are
+    left out, as in an evaluation. A row whose base has no network, or has one member where it needs several, is left
+    out and named in the result.
 
     Args:
         rows: without duplicates.
@@ -66,9 +72,10 @@ def measure(
         multiview_device: of UfM and UfM*; the paper runs them on the CPU.
         plan: amount of measurements; None = the defaults.
         meter: of energy; None = this machine's meters.
+        selected: which frames of the sequence.
 
     Raises:
-        ValueError: no row can be measured, or too few frames can be read.
+        ValueError: no row can be measured, or too few frames can be used.
     """
     plan = plan or Plan()
     plan = replace(plan, threads=plan.threads or most_threads())
@@ -80,16 +87,14 @@ def measure(
     on_gpu = next((d for d in (device, multiview_device) if d.type == "cuda"), None)
     meter = meter or EnergyMeter(None if on_gpu is None else on_gpu.index or 0)
     with pinned_threads(plan.threads or 1):
-        frames = list(islice(sequence.readable(lambda error: None), wanted := plan.warm_up + plan.frames))
-        if len(frames) < wanted:
-            raise ValueError(f"{sequence.name} has {len(frames)} readable frames, the plan needs {wanted}")
-        devices = {"device": device, "multiview_device": multiview_device}
-        parts = time_parts(
-            chosen, networks, frames, warm_up=plan.warm_up, samples=plan.samples, clock=CLOCKS[plan.clock], **devices
-        )
         units = dict.fromkeys((DEPTH, NETWORK), _unit(device)) | dict.fromkeys(
             (MULTIVIEW, SAMPLE), _unit(multiview_device)
         )
+        how: dict[str, Any] = {"device": device, "multiview_device": multiview_device, "samples": plan.samples}
+        parts_measured = (DEPTH, ONCE, EVERY, MULTIVIEW, SAMPLE)
+        how["metered"] = {part for part in parts_measured if _metered(units, part, meter)}
+        how["clock"] = CLOCKS[plan.clock]
+        parts = _timed(chosen, networks, sequence, range(len(sequence))[selected], plan, how)
         work = {part: (units.get(part[1], units[NETWORK]), calls) for part, calls in parts.calls.items()}
         energy = measure_energy(meter, work, seconds=plan.seconds, windows=plan.windows)
     gpu = None if on_gpu is None else torch.cuda.get_device_name(on_gpu)
@@ -97,7 +102,7 @@ def measure(
         "format": 1,
         "machine": {"hardware": hardware(), "versions": versions(), "load": load_average(), "gpu": gpu},
         "devices": {"networks": str(device), "multiview": str(multiview_device), "units": units},
-        "plan": asdict(plan),
+        "plan": asdict(plan) | {"frames": parts.frames, "whole": plan.frames is None},
         "sequence": {"name": sequence.name, "layout": sequence.layout},
         "power": {"missing": meter.missing},
         "map": parts.size,
@@ -107,13 +112,54 @@ def measure(
     }
 
 
+def _timed(
+    rows: Sequence[Row],
+    networks: Mapping[str, TimedNetwork],
+    sequence: FrameSequence,
+    indices: range,
+    plan: Plan,
+    how: Mapping[str, Any],
+) -> TimedParts:
+    """Time the parts of the rows on the frames of a plan. Raises ValueError: too few frames can be used."""
+
+    def usable() -> Iterator[Frame]:
+        return filter(_usable, sequence.readable(lambda error: None, indices))
+
+    needed = plan.warm_up + (plan.frames or 0)
+    if plan.frames is None:
+        first = list(islice(usable(), plan.warm_up))
+        parts = time_parts(rows, networks, chain(first, usable()), warm_up=len(first), restart=True, **how)
+        needed = 1
+    else:
+        parts = time_parts(rows, networks, islice(usable(), needed), warm_up=plan.warm_up, **how)
+        needed = plan.frames
+    if parts.frames < needed:
+        missing = f"{parts.frames + parts.warm_up} usable frames, the plan needs {plan.warm_up + needed}"
+        raise ValueError(f"{sequence.name} has {missing}")
+    return parts
+
+
+def _usable(frame: Frame) -> bool:
+    """True if the frame has an image, and a pose and intrinsics that UfM* can use."""
+    try:
+        require_usable(frame, (), tracked=True)
+    except FrameError:
+        return False
+    return True
+
+
+def _metered(units: Mapping[str, str], part: str, meter: EnergyMeter) -> bool:
+    """True if the part runs on a unit with a meter."""
+    return units.get(part, units[NETWORK]) not in meter.missing
+
+
 def measure_job(job: EvalJob, plan: Plan | None = None) -> None:
-    """Measure the rows on the sequences of an evaluation, and write their means to OUT/efficiency.json; the means of
-    the job's further architectures are under "further". UfM and UfM* run on the CPU, as in the paper. Sequences may
-    have fewer frames than the plan. The energy windows are divided among the sequences.
+    """Measure the rows on all selected frames of an evaluation's sequences, in a pass of its own after that of the
+    metrics, and write their means to OUT/efficiency.json; the means of the job's further architectures are under
+    "further". UfM and UfM* run on the CPU, as in the paper. The energy windows are divided among the sequences.
 
     Raises:
-        ValueError: no sequence can be opened, none has enough frames, or no row can be measured.
+        ValueError: no sequence can be opened, none has a usable frame, or no row can be measured.
         OSError: the file cannot be written.
     """
     plan = plan or Plan()
@@ -130,10 +176,8 @@ def _over_items(job: EvalJob, plan: Plan, choices: Mapping[str, NetworkChoice]) 
     failed = []
     for item in job.items:
         try:
-            sequence = item.open()
-            item_plan = replace(plan, frames=max(1, min(plan.frames, len(sequence) - plan.warm_up)))
-            result = measure(job.suite.rows, networks, sequence, device=device, plan=item_plan)
-            measured[item.dataset, item.sequence] = result
+            how: dict[str, Any] = {"device": device, "plan": plan, "selected": job.frames}
+            measured[item.dataset, item.sequence] = measure(job.suite.rows, networks, item.open(), **how)
         except (OSError, ValueError) as error:
             failed.append(f"{item.label}: {error}")
     if not measured:
@@ -142,18 +186,22 @@ def _over_items(job: EvalJob, plan: Plan, choices: Mapping[str, NetworkChoice]) 
 
 
 def over_sequences(measured: Mapping[tuple[str, str], Mapping[str, Any]]) -> dict[str, Any]:
-    """Average every number of the results of :func:`measure` over sequences, by (data set, sequence). "sequences" has
-    each sequence's gross energy of uncertainty [mJ], None if a part was not measured."""
+    """Average every number of the results of :func:`measure` over sequences, by (data set, sequence), but the plan's
+    frames, which are added. "sequences" has each sequence's gross energy [mJ] and memory [B], at the end, of
+    uncertainty by row; None if a part was not measured."""
     runs = list(measured.values())
     single = []
     for (dataset, name), run in measured.items():
-        energy = {}
+        energy, memory = {}, {}
         for row in run["rows"]:
+            network, state = row["memory"].get("network_uncertainty_bytes"), row["memory"]["multiview"]
+            memory[row["row"]] = None if network is None else network + (0 if state is None else state["bytes_end"])
             parts = [part for key, part in row["energy"].items() if key != DEPTH and "none" not in part]
             complete = all("gross" in part for part in parts)
             energy[row["row"]] = sum(max(0.0, p["gross"]["millijoules"]) for p in parts) if complete else None
-        single.append({"dataset": dataset, "sequence": name, "energy_mj": energy})
+        single.append({"dataset": dataset, "sequence": name, "energy_mj": energy, "memory_bytes": memory})
     mean: dict[str, Any] = _mean(runs)
+    mean["plan"] |= {"frames": sum(run["plan"]["frames"] for run in runs)}
     if len(runs) > 1:
         mean["sequence"] |= {"name": f"{len(runs)} sequences"}
     return mean | {"sequences": single}
@@ -164,6 +212,8 @@ def _mean(values: Sequence[Any]) -> Any:
     first = values[0]
     if isinstance(first, Mapping) and all(isinstance(v, Mapping) and v.keys() == first.keys() for v in values):
         return {name: _mean([value[name] for value in values]) for name in first}
+    if isinstance(first, list) and all(isinstance(v, list) and len(v) == len(first) for v in values):
+        return [_mean(each) for each in zip(*values, strict=True)]
     numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
     return sum(values) / len(values) if numbers and any(v != first for v in values) else first
 
@@ -253,13 +303,15 @@ def _energy_overhead(energies: Mapping[str, Energy]) -> dict[str, float] | None:
 
 
 def _memory(memory: Mapping[str, int] | None, state: Mapping[str, float] | None) -> dict[str, Any]:
-    """Bytes of the network for depth, of its uncertainty, and of the multiview state; the share of uncertainty."""
+    """Bytes of the network's parameters for depth and for its uncertainty, of its buffers, and of the multiview state;
+    the share of uncertainty, without buffers."""
     if memory is None:
         return {"multiview": state, "not_measurable": "the weights are not torch's tensors"}
     uncertainty = memory["uncertainty"] + (0 if state is None else state["bytes_end"])
     return {
         "depth_bytes": memory["depth"],
         "network_uncertainty_bytes": memory["uncertainty"],
+        "buffers_bytes": memory["buffers"],
         "multiview": state,
         "overhead_percent": overhead_percent(uncertainty, memory["depth"]),
     }

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -60,7 +61,8 @@ class TimedNetwork:
                 return prediction
             if part == EVERY:
                 return self._turns.every(x, intrinsics)
-            return self._turns.member(x, intrinsics, turn)
+            index = turn % (SAMPLES if self.base == "mc_dropout" else len(self.members))
+            return replace(self._turns.member(x, intrinsics, turn), member=index)
 
     def prepare(self, frame: Frame, device: torch.device) -> tuple[Tensor, Tensor]:
         """The networks' input of a frame, and its intrinsics, on a device. Raises FrameError: it has no image."""
@@ -68,21 +70,29 @@ class TimedNetwork:
         return self.preprocess(image_tensor(frame).to(device), K)
 
     def memory(self) -> dict[str, int] | None:
-        """Bytes of the weights and buffers of "depth" alone, and of the rest as "uncertainty"; None if the weights are
-        unknown (those of a wrapped function)."""
-        everything, alone = weight_bytes(*self.members), weight_bytes(self.depth)
+        """Bytes of the parameters of "depth" alone, of the rest as "uncertainty", and of all "buffers" (running means
+        and variances, which the paper does not count); None if they are unknown (those of a wrapped function)."""
+        everything, alone = parameter_bytes(*self.members), parameter_bytes(self.depth)
         if not everything:
             return None
-        return {"depth": alone, "uncertainty": 0 if self.base == "depth_only" else everything - alone}
+        uncertainty = 0 if self.base == "depth_only" else everything - alone
+        return {"depth": alone, "uncertainty": uncertainty, "buffers": buffer_bytes(*self.members)}
 
 
-def weight_bytes(*modules: nn.Module) -> int:
-    """Bytes of the parameters and buffers of modules, and of ONNX Runtime's files. Shared tensors count once."""
+def parameter_bytes(*modules: nn.Module) -> int:
+    """Bytes of the parameters of modules, and of ONNX Runtime's files. Shared tensors count once."""
     graphs = {m.path for module in modules for m in module.modules() if isinstance(m, OnnxNetwork)}
-    tensors = (t for module in modules for t in (*module.parameters(), *module.buffers()) if t.numel())
-    return sum({(t.data_ptr(), t.nbytes): t.nbytes for t in tensors}.values()) + sum(
-        Path(path).stat().st_size for path in graphs
-    )
+    files = sum(Path(path).stat().st_size for path in graphs)
+    return _bytes(t for module in modules for t in module.parameters()) + files
+
+
+def buffer_bytes(*modules: nn.Module) -> int:
+    """Bytes of the buffers of modules. Shared tensors count once."""
+    return _bytes(t for module in modules for t in module.buffers())
+
+
+def _bytes(tensors: Iterable[Tensor]) -> int:
+    return sum({(t.data_ptr(), t.nbytes): t.nbytes for t in tensors if t.numel()}.values())
 
 
 def timed_networks(sources: Mapping[str, DepthSource], rows: Sequence[Row] = ()) -> dict[str, TimedNetwork]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ import torch
 from numpy.typing import NDArray
 
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.eval.bench.cumulative import CounterLog, EnergyReadings, cumulative_costs, read_power
+from ufmstar_torch.eval.bench.energy import CPU, EnergyMeter
 from ufmstar_torch.eval.bench.quantise import quantise
 from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.engine.realtime import RealTime
@@ -67,7 +70,9 @@ class Contrast:
         return self.confident & (self.disagreement > limit)
 
 
-def run_onboard(out: Path, weights: Path, seconds: float, seed: int, progress: Report) -> dict[str, Any]:
+def run_onboard(
+    out: Path, weights: Path, seconds: float, seed: int, progress: Report, power: Path | None = None
+) -> dict[str, Any]:
     """Run live at 30 images/s in the rendered rooms of a seed, then evaluate the frames and draw the picture.
 
     Args:
@@ -76,6 +81,8 @@ def run_onboard(out: Path, weights: Path, seconds: float, seed: int, progress: R
         seconds: duration of the live run [s].
         seed: of the rooms.
         progress: receives the progress.
+        power: log of an external meter (``cumulative.read_power``), which must be complete when the run ends; None =
+            the computer's own counters, if there are any.
 
     Raises:
         FileNotFoundError, ValueError, ModuleNotFoundError: the network cannot be loaded or quantised.
@@ -90,7 +97,7 @@ def run_onboard(out: Path, weights: Path, seconds: float, seed: int, progress: R
     model = UncertainDepth(network, config, posterior=False, check_poses=0)
     summary = {
         "network": description,
-        "realtime": _live(model, sequence, seconds, progress),
+        **_live(model, sequence, seconds, progress, power),
         "load_average": load_average(),
     }
     contrasts = _contrasts(UncertainDepth(network, config, posterior=False, check_poses=0), sequence)
@@ -122,12 +129,17 @@ def _input(network: DepthNetwork, frame: Frame) -> torch.Tensor:
     return network.preprocess(image_tensor(frame), torch.from_numpy(frame.intrinsics)[None])[0]
 
 
-def _live(model: UncertainDepth, sequence: FrameSequence, seconds: float, progress: Report) -> dict[str, Any]:
-    """Feed the walk, forwards and backwards, at 30 images/s; the figures of :class:`RealTime`."""
+def _live(
+    model: UncertainDepth, sequence: FrameSequence, seconds: float, progress: Report, power: Path | None
+) -> dict[str, Any]:
+    """Feed the walk, forwards and backwards, at 30 images/s: "realtime", the figures of :class:`RealTime`, and "costs",
+    the cumulative ones."""
     frames, times, total = list(sequence), RealTime(model), round(seconds * FPS)
     there_and_back = [*range(len(frames)), *range(len(frames) - 2, 0, -1)]
 
-    with LiveDepth(model, times.take, frames[0].intrinsics) as live:
+    counters = _counters() if power is None else ""
+    logged = nullcontext() if isinstance(counters, str) else counters
+    with LiveDepth(model, times.take, frames[0].intrinsics) as live, logged:
         started = time.perf_counter()
         for n in range(total):
             time.sleep(max(0.0, started + n / FPS - time.perf_counter()))
@@ -138,7 +150,24 @@ def _live(model: UncertainDepth, sequence: FrameSequence, seconds: float, progre
                 progress(Progress("live", n, total))
         live.wait_idle()
         progress(Progress("live", total, total))
-    return times.summary(live.statistics)
+    readings = _logged(power) if power is not None else counters
+    readings = readings.readings if isinstance(readings, CounterLog) else readings
+    costs = cumulative_costs(times, readings) if len(times.finished) > 1 else {}
+    return {"realtime": times.summary(live.statistics), "costs": costs}
+
+
+def _counters() -> CounterLog | str:
+    """The log of this computer's counters, or why it has none."""
+    meter = EnergyMeter()
+    return meter.missing.get(CPU) or CounterLog(meter)
+
+
+def _logged(power: Path) -> EnergyReadings | str:
+    """The log of an external meter, or why it cannot be used: the other figures of the run remain."""
+    try:
+        return read_power(power, time.time() - time.perf_counter())
+    except (OSError, ValueError) as error:
+        return " ".join(str(error).split())
 
 
 def _contrasts(model: UncertainDepth, sequence: FrameSequence) -> list[Contrast]:

@@ -7,7 +7,7 @@ of a network's uncertainty is the difference of two calls on one frame.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -26,12 +26,14 @@ from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
+from ufmstar_torch.frames.image_check import reduced, shows_something
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.uncertain_depth import maps_of
 
 MULTIVIEW, SAMPLE = "multiview", "sample"
 # ``Setting.anchors`` that are measured: the name of their source of landmarks.
 ANCHORS = {"": None, "corners": "corners", "dense": "dense"}
+_INFERENCES = 40  # number of inferences that the meter repeats
 Part = tuple[str, str]  # the owner of a part, a base or a row by its label, and the part
 
 
@@ -79,16 +81,21 @@ class MultiviewStep:
         return {"bytes_end": state_bytes, "count_end": memory["count"], "smoothing_bytes": memory["smoothing_bytes"]}
 
 
+def _bare(frame: Frame) -> Frame:
+    """The frame without its maps."""
+    return replace(frame, image=None, depth=None, moving=None)
+
+
 class TimedParts:
     """The parts that were run on the frames, and their times. On odd frames the parts run in the reverse order, so that
     no part always follows the same one.
 
     Attributes:
         warm_up: frames at the beginning that are not counted.
-        calls: the parts that were run, one call per frame, which can be repeated in this order; each returns when its
-            device has finished.
+        calls: the parts to be repeated, one call per frame, in this order; each returns when its device has finished.
         staged: by row's label, the stages of UfM*.
-        memory: by row's label, the memory of the multiview step after the last frame.
+        memory: by row's label, the memory of the multiview step after the last frame, and "bytes_mean" over all counted
+            frames.
         size: of the depth maps, "224 x 224" [px].
     """
 
@@ -99,16 +106,23 @@ class TimedParts:
         self.memory: dict[str, dict[str, float]] = {}
         self._ms: dict[Part, list[float]] = {}
 
+    @property
+    def frames(self) -> int:
+        """The number of counted frames."""
+        return max(0, max(map(len, self._ms.values()), default=0) - self.warm_up)
+
     def ms(self, owner: str, part: str) -> list[float]:
         """Times of a part [ms], one per frame after the warm-up; empty if it was not run."""
         return self._ms.get((owner, part), [])[self.warm_up :]
 
-    def run(self, number: int, calls: Mapping[Part, Callable[[], Any]], device: torch.device) -> dict[Part, Any]:
-        """Time the parts of frame ``number`` on a device. Returns the parts' results."""
+    def run(
+        self, number: int, calls: Mapping[Part, Callable[[], Any]], device: torch.device, *, keep: bool
+    ) -> dict[Part, Any]:
+        """Time the parts of frame ``number`` on a device; ``keep`` the calls to repeat them. Returns their results."""
         results = {}
         for part in list(calls)[:: -1 if number % 2 else 1]:
             call = partial(_finish, calls[part], device)
-            self.calls.setdefault(part, []).append(call)
+            self.calls.setdefault(part, []).extend([call] if keep else [])
             synchronize(device)
             started = self._clock()
             results[part] = call()
@@ -131,16 +145,31 @@ def inference_of(row: Row) -> str:
 def time_parts(
     rows: Sequence[Row],
     networks: Mapping[str, TimedNetwork],
-    frames: Sequence[Frame],
+    frames: Iterable[Frame],
     *,
     warm_up: int,
     device: torch.device,
     multiview_device: torch.device,
+    restart: bool = False,
+    metered: Collection[str] = (DEPTH, ONCE, EVERY, MULTIVIEW, SAMPLE),
     samples: bool = False,
     clock: Clock = time.perf_counter,
 ) -> TimedParts:
-    """Run every part of every row on every frame. Arguments as ``measure.measure``; with ``samples``, the part
-    ``SAMPLE`` of UfM* without anchors, too; ``clock`` returns seconds. Raises FrameError: no image."""
+    """Run every part of every row on every frame.
+
+    Args:
+        rows, networks, device, multiview_device: as for ``measure.measure``.
+        frames: are read once.
+        warm_up: number of frames at the beginning that are not counted.
+        restart: True if the sequence begins again after them; the rows then forget them.
+        metered: parts whose calls are kept for the meter: of multiview steps those on every frame, of networks, whose
+            cost does not depend on the image, those on the first ``_INFERENCES`` frames.
+        samples: True to run the part ``SAMPLE`` of UfM* without anchors, too.
+        clock: returns seconds.
+
+    Raises:
+        FrameError: a frame has no image.
+    """
     parts, steps, sampled = TimedParts(warm_up, clock), dict[str, MultiviewStep](), dict[str, MultiviewStep]()
     forms = {row.method.base: {DEPTH} for row in rows}
     for row in rows:
@@ -151,7 +180,10 @@ def time_parts(
                 parts.staged[row.label] = StagedStep(twin.estimator.ufm, twin, multiview_device, clock)
                 if samples:
                     sampled[row.label] = MultiviewStep(row, multiview_device)
-    for turn, frame in enumerate(frames):
+    sizes: dict[str, list[float]] = {label: [] for label in steps}
+    for number, frame in enumerate(frames):
+        turn = number - warm_up if restart and number >= warm_up else number
+        repeated = not restart or number >= warm_up
         prepared = {base: networks[base].prepare(frame, device) for base in forms}
         inferences: dict[Part, Callable[[], DepthPrediction]] = {
             (base, form): partial(networks[base].predict, form, *prepared[base], turn=turn)
@@ -159,11 +191,15 @@ def time_parts(
             for form in (DEPTH, ONCE, EVERY)
             if form in needed
         }
-        maps, image = parts.run(turn, inferences, device), image_tensor(frame).to(multiview_device)
+        keep = repeated and turn < _INFERENCES and bool({DEPTH, ONCE, EVERY} & set(metered))
+        maps = parts.run(number, inferences, device, keep=keep)
+        image, bare = image_tensor(frame).to(multiview_device), _bare(frame)
+        informative = shows_something(reduced(image))
         inputs = {}
         for row in rows:
             base, K = row.method.base, prepared[row.method.base][1].cpu().double()
-            inputs[row.label] = image, frame, replace(maps[base, inference_of(row)], intrinsics=K)
+            prediction = replace(maps[base, inference_of(row)], intrinsics=K, informative=informative)
+            inputs[row.label] = image if row.setting.anchors else None, bare, prediction
         multiview: dict[Part, Callable[[], Any]] = {
             (label, MULTIVIEW): partial(step, *inputs[label], first=turn == 0) for label, step in steps.items()
         }
@@ -171,9 +207,15 @@ def time_parts(
             (label, SAMPLE): partial(step.sample, *inputs[label][1:], first=turn == 0)
             for label, step in sampled.items()
         }
-        parts.run(turn, multiview, multiview_device)
+        parts.run(number, multiview, multiview_device, keep=repeated and MULTIVIEW in metered)
         for label, staged in parts.staged.items():
-            staged(*inputs[label])
+            staged(*inputs[label], first=turn == 0)
+        if number >= warm_up:
+            for label, step in steps.items():
+                sizes[label].append(step.memory()["bytes_end"])
         parts.size = " x ".join(str(side) for side in next(iter(maps.values())).depth.shape[-2:])
-    parts.memory = {label: step.memory() for label, step in steps.items()}
+    parts.memory = {
+        label: step.memory() | {"bytes_mean": sum(sizes[label]) / max(1, len(sizes[label]))}
+        for label, step in steps.items()
+    }
     return parts

@@ -39,13 +39,12 @@ def time_streams(
         For every count "streams", "step" and, on CUDA, "graph" (:class:`~ufmstar_torch.runtime.capture.Captured`):
         times [ms] of one frame of all streams.
     """
-    config = UfMStarConfig(on_bad_frame="skip", initial_capacity=_SLOTS, max_components=_SLOTS, merge=None)
+    config = UfMStarConfig(on_bad_frame="skip", initial_capacity=_SLOTS, max_components=_SLOTS)
     lines = []
     with pinned_threads(plan.threads or 1):
-        frames = [
-            _step_inputs(network, frame, device)
-            for frame in islice(sequence.readable(lambda error: None), plan.warm_up + plan.frames)
-        ]
+        wanted = None if plan.frames is None else plan.warm_up + plan.frames
+        readable = islice(sequence.readable(lambda error: None), wanted)
+        frames = [_step_inputs(network, frame, device) for frame in readable]
         for count in counts:
             steps: dict[str, Callable[..., Any]] = {"step": UfMStar(config)}
             if device.type == "cuda":

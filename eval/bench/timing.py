@@ -82,10 +82,10 @@ class StagedStep:
         self.stages: dict[str, list[float]] = {name: [] for name in STAGES}
         module.observer = self
 
-    def __call__(self, *args: Any) -> Any:
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Run one step."""
         self._before = self._clock()
-        return self._step(*args)
+        return self._step(*args, **kwargs)
 
     def stage(self, name: str) -> None:
         """Record the time of the stage that has ended."""

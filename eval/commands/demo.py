@@ -17,6 +17,7 @@ from ufmstar_torch.eval.commands.options import File, Flag, MachineOptions, as_d
 from ufmstar_torch.eval.commands.terminal import Bars
 
 _WEIGHTS = ("weights", "demo.safetensors")
+_COSTS = "onboard_costs.png"
 _WALK = 150  # frames of a whole walk; the first --frames of them are used, so that consecutive frames overlap
 _ROOMS = {"unfamiliar": "hall", "familiar": "home"}  # style by data set
 
@@ -37,6 +38,8 @@ class DemoOptions(MachineOptions):
             FastDepth (.onnx).
         onboard: Run live, as on a small robot: one quantised network, 30 images/s, things of many sizes.
         seconds: With --onboard, walk this long [s].
+        power: With --onboard, take the energy from this log of an external power meter, a CSV file with the columns
+            time (seconds since 1970) and power (W) (default: the computer's own counters, if there are any).
         device: Run on cpu, cuda or cuda:N.
         threads: Use this many CPU threads (default: all cores, with --onboard all but one).
     """
@@ -48,6 +51,7 @@ class DemoOptions(MachineOptions):
     weights: File = None
     onboard: Flag = False
     seconds: float = 120.0
+    power: File = None
 
     def __post_init__(self) -> None:
         require_least(self, seed=0)
@@ -55,6 +59,8 @@ class DemoOptions(MachineOptions):
             raise ValueError(f"--frames must be 2 to {_WALK}, got {self.frames}")
         if not 1 <= self.seconds < float("inf"):
             raise ValueError(f"--seconds must be at least 1, got {self.seconds}")
+        if self.power is not None and not self.onboard:
+            raise ValueError("--power goes with --onboard")
         if self.onboard and self.device != "cpu":
             raise ValueError(f"--onboard runs on the CPU, got --device {self.device}")
 
@@ -95,6 +101,8 @@ def _words(options: DemoOptions, weights: Path) -> list[str]:
 def _onboard(options: DemoOptions, weights: Path) -> int:
     """Run ``--onboard``, write its folder, and print its table. Returns the exit code."""
     from ufmstar_torch.eval.bench.onboard import GRAPH, PICTURE, run_onboard
+    from ufmstar_torch.eval.report.figures_cost import draw_cumulative
+    from ufmstar_torch.eval.report.style import save_figure
     from ufmstar_torch.eval.report.text import onboard_table
     from ufmstar_torch.eval.run.files import to_json, write_json_atomic
     from ufmstar_torch.eval.run.folder import FolderKind, output_folder
@@ -102,9 +110,11 @@ def _onboard(options: DemoOptions, weights: Path) -> int:
 
     if options.threads is None:
         share_threads()
-    kind = FolderKind("ufmstar demo --onboard", "demo", "summary.json", (GRAPH, PICTURE))
+    kind = FolderKind("ufmstar demo --onboard", "demo", "summary.json", (GRAPH, PICTURE, _COSTS))
     with output_folder(options.out, kind, {}, overwrite=options.overwrite), Bars() as bars:
-        measured = run_onboard(options.out, weights, options.seconds, options.seed, bars.show)
+        measured = run_onboard(options.out, weights, options.seconds, options.seed, bars.show, options.power)
+        if measured["costs"]:
+            save_figure(draw_cumulative(measured["costs"]), options.out / _COSTS)
     settings = {name: value for name, value in as_dict(options).items() if name not in ("frames", "device")}
     about = {"program": kind.program, "out": str(options.out), "settings": settings}
     summary: dict[str, Any] = to_json(about | measured | {"hardware": hardware(), "versions": versions()})

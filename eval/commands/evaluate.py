@@ -21,7 +21,7 @@ from ufmstar_torch.eval.commands.options import (
     require_least,
 )
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-from ufmstar_torch.eval.methods.method import UFM_STAR
+from ufmstar_torch.eval.methods.method import NETWORKS, UFM_STAR
 from ufmstar_torch.eval.methods.setting import DEFAULTS, started
 from ufmstar_torch.eval.methods.suite import listing, suite_named
 from ufmstar_torch.eval.sequences.frame import parse_slice
@@ -132,7 +132,7 @@ class EvalOptions(MachineOptions):
         threads: Each process uses this many CPU threads (default: all cores, divided among --processes).
         processes: Run this many processes on this computer.
         scheduler: Run on the Dask cluster of this scheduler, tcp://HOST:8786, whose workers see the same files.
-        dry_run: Show rows and sequences, and stop.
+        dry_run: Show rows, sequences and what is missing, and stop; needs --suite alone.
     """
 
     USAGE: ClassVar[str] = (
@@ -152,7 +152,7 @@ class EvalOptions(MachineOptions):
         if self.what.list:
             return
         values = as_dict(self)
-        for name in ("suite", "root", "network", "out"):
+        for name in ("suite",) if self.dry_run else ("suite", "root", "network", "out"):
             if not values[name]:
                 raise ValueError(f"--{name} is missing; ufmstar eval --help, and --list for the suites")
         parse_slice(self.data.frames)
@@ -199,7 +199,7 @@ def job_from(options: EvalOptions) -> EvalJob:
         joined(data.root), sample=data.sequences, seed=data.seed, only=only, opening=options.opening.of_reader
     )
     return EvalJob(
-        suite=suite.with_bases(networks),
+        suite=suite.with_bases(networks) if networks else suite,
         networks=networks,
         further=tuple(further),
         items=tuple(items),
@@ -278,19 +278,36 @@ def _measure(job: EvalJob, threads: int | None) -> None:
         print(f"no {EFFICIENCY}: {' '.join(str(error).split())}")
 
 
+# What an evaluation needs beside its networks, by the option that is missing in a dry run.
+_MISSING = {
+    "root": "folders with sequences, [DATASET=]DIR, or tour:SEED for rendered rooms",
+    "out": "the folder for the results",
+}
+
+
 def _dry_run(options: EvalOptions) -> int:
-    """Print the rows with their networks, and the sequences with their number of frames."""
+    """Print the rows with their networks and needs, and the sequences with their number of frames."""
     import torch
 
-    job = job_from(options)
+    job, suite = job_from(options), suite_named(str(options.what.suite), options.what.base, options.what.ufm_preset)
     for base in job.unused:
         print(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")
     networks = job.load(torch.device("cpu"))
-    print(f"{job.suite.name}: {job.suite.title}\n{len(job.suite.rows)} rows:")
-    for row in job.suite.rows:
-        print(f"  {row.label}  [{networks[row.method.base].label}]")
+    rows = [*job.suite.rows, *(row for row in suite.rows if row not in job.suite.rows)]
+    print(f"{job.suite.name}: {job.suite.title}\n{len(rows)} rows:")
+    for row in rows:
+        network = networks.get(row.method.base)
+        print(f"  {row.label}  [{'no network' if network is None else network.label}]  needs {row.needs}")
     if job.missing_bases:
-        print(f"left out, without a --network: the rows of {', '.join(job.missing_bases)}")
+        print("left out, without a --network:")
+        for base in job.missing_bases:
+            print(f"  --network {base}=MODEL:FILE: {NETWORKS[base]}")
+    if job.suite.efficiency:
+        print("measures time, energy and memory: energy needs zeus and a meter (NVML, AMD SMI, RAPL, Jetson's rails)")
+    values = as_dict(options)
+    for name, words in _MISSING.items():
+        if not values[name]:
+            print(f"no --{name}: {words}")
     print(f"{len(job.items)} sequences:")
     total = 0
     for item in job.items:

@@ -89,7 +89,7 @@ def evaluate_sequence(
         named = {other.slug: other.method.name for other in references(row, rows)}
         judges.append(RowJudge(row, runners[-1], named, judge.bins, judge.plugins.metrics))
     tracked = any(row.setting.anchors in (CORNERS, DENSE) for row in rows)
-    check = partial(_check_frame, sources=sources.values(), tracked=tracked)
+    check = partial(require_usable, sources=sources.values(), tracked=tracked)
     shown = frame_progress(progress, len(indices))
     writer = None if examples is None else ExampleWriter(examples, len(indices), runners)
     stream = frame_results(sequence, indices, runners, cache=judge.store, device=judge.device, check=check, stop=stop)
@@ -107,7 +107,7 @@ def evaluate_sequence(
     return [replace(one, frames={**one.frames, "left_out_on_opening": opened}) for one in figures]
 
 
-def _check_frame(frame: Frame, sources: Collection[DepthSource], tracked: bool) -> None:
+def require_usable(frame: Frame, sources: Collection[DepthSource], tracked: bool) -> None:
     """Raises FrameError unless all sources, UfM* and, if anchors are ``tracked``, a tracker can use the frame."""
     if frame.image is None and (tracked or any(source.needs_image for source in sources)):
         raise FrameError(frame.name, "no image")

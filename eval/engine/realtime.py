@@ -21,7 +21,9 @@ class RealTime:
     as UfM*'s."""
 
     def __init__(self, model: UncertainDepth) -> None:
-        self.latency, self.compute, self.network = array("d"), array("d"), array("d")  # [s]
+        self.latency = array("d")  # [s]
+        # Times of each result [s]: begin, end of the last inference, and end.
+        self.started, self.predicted, self.finished = array("d"), array("d"), array("d")
         self.processor = array("d")  # [s] CPU time of the worker's thread between two results
         self._predicted = 0.0
         self._thread: float | None = None
@@ -37,8 +39,9 @@ class RealTime:
         """Add a result; call it in ``on_result``."""
         self._first, self._last = self._first or result.received, result.finished
         self.latency.append(result.latency)
-        self.compute.append(result.finished - result.started)
-        self.network.append(self._predicted - result.started)
+        self.started.append(result.started)
+        self.predicted.append(self._predicted)
+        self.finished.append(result.finished)
         if self._thread is not None:
             self.processor.append(thread_time() - self._thread)
         self._thread = thread_time()
@@ -48,7 +51,8 @@ class RealTime:
     def summary(self, statistics: LiveStatistics) -> dict[str, Any]:
         """Plain values: counts, results per second, latencies and times [ms], and memory [bytes]; None where nothing
         was measured."""
-        compute, network = np.array(self.compute), np.array(self.network)
+        compute = np.array(self.finished) - np.array(self.started)
+        network = np.array(self.predicted) - np.array(self.started)
         memory, seconds = resident_bytes(), self._last - self._first
         lost = sum(statistics.dropped.values()) + sum(statistics.skipped.values())
         return {

@@ -18,6 +18,15 @@ BASES = {
     "aleatoric": ("Aleatoric", "Aleatoric"),
     "depth_only": ("DepthOnly", "DepthOnly"),
 }
+# The network that a base needs.
+NETWORKS = {
+    "ensemble": "several networks that predict an aleatoric variance",
+    "mc_dropout": "a network with dropout in its decoder that predicts an aleatoric variance",
+    "batch_ensemble": "a BatchEnsemble that predicts an aleatoric variance",
+    "evidential": "a network with an evidential head",
+    "aleatoric": "a network that predicts an aleatoric variance",
+    "depth_only": "a depth network",
+}
 # Bases with several different passes on an image.
 MANY = ("ensemble", "mc_dropout", "batch_ensemble")
 # RELATIVE is a baseline that compares no views: sigma is the share RHO of the depth.

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.methods.method import UFM_STAR, Method
-from ufmstar_torch.eval.methods.setting import CORNERS, DEFAULT, Setting, configured, setting_from
+from ufmstar_torch.eval.methods.method import ALONE, NETWORKS, UFM_STAR, Method
+from ufmstar_torch.eval.methods.setting import CORNERS, DEFAULT, DENSE, TRUTH, Setting, configured, setting_from
 
 
 @dataclass(frozen=True)
@@ -24,12 +24,26 @@ class Row:
         method, setting = self.method, self.setting
         if setting.of_ufm_star and method.fusion != UFM_STAR:
             raise ValueError(f"row {method.name}: only UfM* has {', '.join(setting.of_ufm_star)}")
-        if setting.overrides.get("aleatoric_in_h") and not method.uses_aleatoric:
-            raise ValueError(f"row {method.name}: aleatoric_in_h needs a network that predicts an aleatoric variance")
+        if setting.overrides.get("variances_in_h") and not method.uses_aleatoric:
+            raise ValueError(f"row {method.name}: variances_in_h needs a network that predicts a variance")
         try:
             configured(setting)
         except ValueError as error:
             raise ValueError(f"row {method.name}: {error}") from error
+
+    @property
+    def needs(self) -> str:
+        """What the row needs: its network, poses, anchors and files; ground truth is needed by every row."""
+        setting, parts = self.setting, [f"{NETWORKS[self.method.base]} ({self.method.base})"]
+        if self.method.fusion != ALONE:
+            parts.append("poses")
+        if setting.anchors in (CORNERS, DENSE):
+            parts.append("OpenCV")
+        elif setting.anchors not in ("", TRUTH):
+            parts.append(f"{setting.anchors} in each sequence")
+        if setting.recalibration:
+            parts.append(setting.recalibration)
+        return ", ".join([*parts, "ground truth"])
 
     @property
     def slug(self) -> str:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
-import numpy as np
+import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, SumMetric, share
@@ -24,14 +23,13 @@ class Delta1(SumMetric):
 
     STATES = (("hits", COUNT), ("hits_ratio", COUNT), ("pixels", COUNT), ("with_truth", COUNT))
 
-    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
-        d, g = pixels.depths
-        with np.errstate(divide="ignore"):
-            ratio = np.maximum(d / g, g / d)
+    def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
+        chosen = pixels.depths
+        d, g = chosen
         return {
-            "hits": (np.abs(d - g) <= TOLERANCE * g).sum(),
-            "hits_ratio": ((d > 0) & (ratio < 1 + TOLERANCE)).sum(),
-            "pixels": len(d),
+            "hits": chosen.number((d - g).abs() <= TOLERANCE * g),
+            "hits_ratio": chosen.number((d > 0) & (torch.maximum(d / g, g / d) < 1 + TOLERANCE)),
+            "pixels": chosen.number(),
             "with_truth": pixels.with_truth.sum(),
         }
 
@@ -49,9 +47,9 @@ class AbsRel(SumMetric):
 
     STATES = (("total", SUM), ("pixels", COUNT))
 
-    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
+    def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
         d, g = pixels.depths
-        return {"total": (np.abs(d - g) / g).sum(), "pixels": len(d)}
+        return {"total": pixels.depths.total((d - g).abs() / g), "pixels": pixels.depths.number()}
 
     def compute(self) -> dict[str, Tensor]:
         return {"abs_rel": share(self.total, self.pixels)}
@@ -62,9 +60,9 @@ class RMSE(SumMetric):
 
     STATES = (("total", SUM), ("pixels", COUNT))
 
-    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
+    def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
         d, g = pixels.depths
-        return {"total": np.square(d - g).sum(), "pixels": len(d)}
+        return {"total": pixels.depths.total((d - g).square()), "pixels": pixels.depths.number()}
 
     def compute(self) -> dict[str, Tensor]:
         return {"rmse": share(self.total, self.pixels).sqrt()}

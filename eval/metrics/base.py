@@ -3,56 +3,110 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torchmetrics import Metric
 
-Array = NDArray[np.float64]
 COUNT, SUM = torch.int64, torch.float64  # kinds of states
+
+
+class Selection:
+    """The values of some pixels, flat and float64. On the CPU they are the selected ones alone. On other devices, where
+    their number is unknown without waiting, they are all pixels, with 1 where ``mask`` is False.
+
+    Args:
+        maps: [P] each.
+        mask: [P] True = selected.
+        complete: True if ``maps`` have the selected pixels alone; ``mask`` is not read then.
+    """
+
+    def __init__(self, maps: Sequence[Tensor], mask: Tensor, *, complete: bool = False) -> None:
+        self.mask: Tensor | None = None
+        if complete or _compacts(mask.device):
+            index = slice(None) if complete else mask.nonzero()[:, 0]
+            self.maps = tuple(value[index] for value in maps)
+        else:
+            self.maps = tuple(value.masked_fill(~mask, 1.0) for value in maps)
+            self.mask = mask
+
+    def __iter__(self) -> Iterator[Tensor]:
+        return iter(self.maps)
+
+    def where(self, condition: Tensor) -> Selection:
+        """The selected pixels with a condition [P] on their values."""
+        return Selection(self.maps, condition if self.mask is None else condition & self.mask)
+
+    def number(self, condition: Tensor | None = None) -> Tensor:
+        """[] int64 number of the selected pixels, or of those with a condition [P]."""
+        if condition is None:
+            return torch.tensor(len(self.maps[0])) if self.mask is None else self.mask.sum()
+        return (condition if self.mask is None else condition & self.mask).sum()
+
+    def total(self, value: Tensor) -> Tensor:
+        """[] sum of a value [P] over the selected pixels."""
+        return (value if self.mask is None else value.masked_fill(~self.mask, 0.0)).sum()
+
+    def histogram(self, index: Tensor, bins: int, value: Tensor | None = None) -> Tensor:
+        """[bins] by an index [P] in [0, bins): number of the selected pixels, or of those with a ``value`` of True, or
+        sum of their ``value`` [P]."""
+        if self.mask is None:
+            index, value = (index, value) if value is None or value.dtype != torch.bool else (index[value], None)
+            return torch.bincount(index, value, bins)
+        if value is None or value.dtype == torch.bool:
+            values = (self.mask if value is None else self.mask & value).long()
+        else:
+            values = value.masked_fill(~self.mask, 0.0)
+        return torch.zeros(bins, dtype=values.dtype, device=values.device).scatter_add_(0, index, values)
+
+
+def _compacts(device: torch.device) -> bool:
+    """True on the CPU, where selecting pixels needs no wait for a device."""
+    return device.type == "cpu"
 
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
-    """The pixels of one or more frames, flat on the CPU. Ground truth is valid if positive and finite, a depth if
-    finite, a variance if finite and not negative."""
+    """The pixels of one or more frames, flat and float64 on the maps' device. Ground truth is valid if positive and
+    finite, a depth if finite, a variance if finite and not negative."""
 
-    depth: Array  # [P] d [m]
-    variance: Array  # [P] v [m^2]; [0] without one
-    target: Array  # [P] g [m]
-    use: NDArray[np.bool_]  # [P] True = use
-    inlier: Array  # [P] variance of a mixture's inliers [m^2]; [0] without a mixture
-    outlier: Array  # [P] probability of an outlier; [0] without a mixture
-    level: Array  # [P] of the smallest central interval with the ground truth in it, NaN = none; [0] without intervals
+    depth: Tensor  # [P] d [m]
+    variance: Tensor  # [P] v [m^2]; [0] without one
+    target: Tensor  # [P] g [m]
+    use: Tensor  # [P] bool, True = use
+    inlier: Tensor  # [P] variance of a mixture's inliers [m^2]; [0] without a mixture
+    outlier: Tensor  # [P] probability of an outlier; [0] without a mixture
+    level: Tensor  # [P] of the smallest central interval with the ground truth in it, NaN = none; [0] without intervals
 
     @cached_property
-    def with_truth(self) -> NDArray[np.bool_]:
+    def with_truth(self) -> Tensor:
         """[P] True where there is ground truth."""
-        return self.use & (self.target > 0) & (self.target < np.inf)
+        return self.use & (self.target > 0) & (self.target < torch.inf)
 
     @cached_property
-    def predicted(self) -> NDArray[np.bool_]:
+    def predicted(self) -> Tensor:
         """[P] True where there are depth and variance."""
-        return self.use & np.isfinite(self.depth) & (self.variance >= 0) & (self.variance < np.inf)
+        return self.use & self.depth.isfinite() & (self.variance >= 0) & (self.variance < torch.inf)
 
     @cached_property
-    def depths(self) -> tuple[Array, Array]:
+    def depths(self) -> Selection:
         """d and g where both are valid."""
-        both = self.with_truth & np.isfinite(self.depth)
-        return self.depth[both], self.target[both]
+        return Selection((self.depth, self.target), self.with_truth & self.depth.isfinite())
 
     @cached_property
-    def judged(self) -> tuple[Array, Array, Array]:
+    def judged(self) -> Selection:
         """d, v and g where all are valid."""
-        every = self.with_truth & self.predicted
-        return self.depth[every], self.variance[every], self.target[every]
+        return Selection((self.depth, self.variance, self.target), self.with_truth & self.predicted)
+
+    @cached_property
+    def certain(self) -> Selection:
+        """d, v and g where all are valid and v > 0."""
+        return self.judged.where(self.judged.maps[1] > 0)
 
 
 class SumMetric(Metric):
@@ -61,16 +115,19 @@ class SumMetric(Metric):
     ``compute()`` returns the figures of all updates as float64 tensors by name: scalars and curves [B]. States reduce
     by addition: across processes (torchmetrics synchronises at ``compute``; pass ``sync_on_compute=False`` if every
     process has another sequence) and through ``merge_state``. Counts are int64 and exact; float64 sums depend on the
-    order of the updates in the last bits only. MPS has no float64: keep the metric on the CPU there.
+    order of the updates in the last bits only. ``update`` computes on the maps' device, without a transfer if the
+    metric is on it too (``.to(device)``). MPS has no float64: keep the maps on the CPU there.
 
     Attributes:
         OF_VARIANCE: the name, in messages, of a metric that needs a variance; "" if it needs depth alone.
         STATES: name, ``COUNT`` or ``SUM``, and sizes of the dimensions of each state; initially zeros.
+        CONSTANTS: tensors by name, as edges of bins, that move to the metric's device and are not saved.
         settings: of the instance; sums with other settings cannot be merged.
     """
 
     OF_VARIANCE: ClassVar[str] = ""
     STATES: tuple[tuple[Any, ...], ...] = ()
+    CONSTANTS: Mapping[str, Tensor] = MappingProxyType({})
     settings: Mapping[str, Any] = MappingProxyType({})
     is_differentiable = False
     full_state_update = False
@@ -86,6 +143,8 @@ class SumMetric(Metric):
         super().__init__(**kwargs)
         for name, kind, *shape in self.STATES:
             self.add_state(name, torch.zeros(shape, dtype=kind), dist_reduce_fx="sum", persistent=True)
+        for name, value in self.CONSTANTS.items():
+            self.register_buffer(name, value.clone(), persistent=False)
 
     @property
     def update_called(self) -> bool:
@@ -105,11 +164,12 @@ class SumMetric(Metric):
             raise ValueError(f"variance must be given: {judged}")
         for name, added in self.sums(pixels).items():
             state = getattr(self, name)
-            setattr(self, name, state + torch.as_tensor(added, dtype=state.dtype, device=state.device))
+            setattr(self, name, state + added.to(state.device, state.dtype))
 
     @abstractmethod
-    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
-        """The pixels' contribution to each state, by name; a missing state stays unchanged."""
+    def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
+        """The pixels' contribution to each state, by name; a missing state stays unchanged. On a GPU it must not wait
+        for a value, so it selects pixels by ``Selection``."""
 
     def merge_state(self, incoming_state: dict[str, Any] | Metric) -> None:
         """Add another metric's sums to this one's. Raises ValueError: the other metric has other settings."""
@@ -152,10 +212,12 @@ def flat_pixels(
         if name != "valid" and not torch.is_floating_point(value):
             raise ValueError(f"{name} must be floating point, got {value.dtype}")
 
-    def flat(value: Tensor | None) -> NDArray[Any]:
-        return np.zeros(0) if value is None else value.detach().to("cpu", torch.float64).flatten().numpy()
+    none = depth.new_zeros(0, dtype=torch.float64)
 
-    use = np.ones(depth.numel(), np.bool_) if valid is None else valid.cpu().flatten().numpy()
+    def flat(value: Tensor | None) -> Tensor:
+        return none if value is None else value.detach().to(torch.float64).flatten()
+
+    use = depth.new_ones(depth.numel(), dtype=torch.bool) if valid is None else valid.flatten()
     return Pixels(flat(depth), flat(variance), flat(target), use, flat(inlier), flat(outlier), flat(level))
 
 

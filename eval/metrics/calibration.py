@@ -6,9 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import torch
-from scipy.special import erf, ndtri
 from torch import Tensor
 
 from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, SumMetric, share
@@ -41,18 +39,19 @@ class ECEDelta(SumMetric):
         self.STATES = (("confidence", SUM, bins), ("accurate", COUNT, bins), ("pixels", COUNT, bins))
         super().__init__(**kwargs)
 
-    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
-        d, v, g = pixels.judged
+    def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
+        chosen = pixels.judged
+        d, v, g = chosen
         delta, bins = self.settings["delta"], self.settings["bins"]
         # Bin b is [b/B, (b+1)/B); a confidence of exactly 1, as of v = 0, belongs to the last.
-        sigma = np.sqrt(np.where(v > 0, v, 1.0))
-        confidence = np.where(v > 0, erf(delta * np.abs(d) / (math.sqrt(2.0) * sigma)), 1.0)
-        b = np.minimum((confidence * bins).astype(np.intp), bins - 1)
-        accurate = b[np.abs(g - d) <= delta * np.abs(d)]
+        sigma = torch.where(v > 0, v, 1.0).sqrt()
+        confidence = torch.where(v > 0, torch.erf(delta * d.abs() / (math.sqrt(2.0) * sigma)), 1.0)
+        b = (confidence * bins).long().clamp_max(bins - 1)
+        accurate = (g - d).abs() <= delta * d.abs()
         return {
-            "confidence": np.bincount(b, confidence, bins),
-            "accurate": np.bincount(accurate, minlength=bins),
-            "pixels": np.bincount(b, minlength=bins),
+            "confidence": chosen.histogram(b, bins, confidence),
+            "accurate": chosen.histogram(b, bins, accurate),
+            "pixels": chosen.histogram(b, bins),
         }
 
     def compute(self) -> dict[str, Tensor]:
@@ -90,18 +89,19 @@ class ECEQuantile(SumMetric):
         q = quantile_levels(10) if levels is None else torch.tensor(list(levels), dtype=torch.float64)
         if q.numel() == 0 or not bool(((q >= 0) & (q <= 1)).all() and (q.diff() > 0).all()):
             raise ValueError(f"levels must rise within [0, 1], got {levels}")
-        self.levels, self.settings = q, {"levels": q.tolist()}
+        self.settings = {"levels": q.tolist()}
+        self.CONSTANTS = {"levels": q, "quantiles": torch.special.ndtri(q)}
         self.STATES = (("at_or_below", COUNT, len(q)), ("pixels", COUNT))
         super().__init__(**kwargs)
 
-    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
-        d, v, g = pixels.judged
-        sigma = np.sqrt(np.where(v > 0, v, 1.0))
-        z = np.where(v > 0, (g - d) / sigma, np.where(g <= d, -np.inf, np.inf))
-        first = np.bincount(np.searchsorted(ndtri(self.levels.numpy()), z), minlength=len(self.levels) + 1)
-        return {"at_or_below": first.cumsum()[:-1], "pixels": len(z)}
+    def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
+        chosen = pixels.judged
+        d, v, g = chosen
+        sigma = torch.where(v > 0, v, 1.0).sqrt()
+        z = torch.where(v > 0, (g - d) / sigma, torch.where(g <= d, -torch.inf, torch.inf))
+        first = chosen.histogram(torch.searchsorted(self.quantiles, z), len(self.levels) + 1)
+        return {"at_or_below": first.cumsum(0)[:-1], "pixels": chosen.number()}
 
     def compute(self) -> dict[str, Tensor]:
-        levels = self.levels.to(self.pixels.device)
         observed = share(self.at_or_below, self.pixels)
-        return {"ece_q": (observed - levels).abs().mean(), "ece_q_levels": levels, "ece_q_observed": observed}
+        return {"ece_q": (observed - self.levels).abs().mean(), "ece_q_levels": self.levels, "ece_q_observed": observed}

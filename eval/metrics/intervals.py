@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from statistics import NormalDist
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import COUNT, Pixels, SumMetric, share
+from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, Selection, SumMetric, share
 
 LEVELS = (0.5, 0.9, 0.99)
 _PERCENT = 100  # classes of levels
@@ -32,12 +34,12 @@ class IntervalCoverage(SumMetric):
     OF_VARIANCE = "the coverage of intervals"
     STATES = (("levels", COUNT, _PERCENT),)
 
-    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
+    def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
         if not len(pixels.level):
             return {}
-        level = pixels.level[pixels.with_truth & np.isfinite(pixels.level)]
-        kind = np.ceil(level * _PERCENT - 1e-9).astype(np.intp) - 1
-        return {"levels": np.bincount(kind.clip(0, _PERCENT - 1), minlength=_PERCENT)}
+        chosen = Selection((pixels.level,), pixels.with_truth & pixels.level.isfinite())
+        kind = (chosen.maps[0] * _PERCENT - 1e-9).ceil().long() - 1
+        return {"levels": chosen.histogram(kind.clamp(0, _PERCENT - 1), _PERCENT)}
 
     def compute(self) -> dict[str, Tensor]:
         count = self.levels.sum()
@@ -45,8 +47,65 @@ class IntervalCoverage(SumMetric):
             return {}
         found = share(self.levels.cumsum(0), count)
         named = {f"coverage_{level:.0%}".rstrip("%"): found[round(level * _PERCENT) - 1] for level in LEVELS}
-        levels = torch.arange(1, _PERCENT + 1, dtype=torch.float64) / _PERCENT
+        levels = torch.arange(1, _PERCENT + 1, dtype=torch.float64, device=found.device) / _PERCENT
         return {**named, "coverage_levels": levels, "coverage_found": found}
+
+
+class Coverage(SumMetric):
+    """Share of the pixels whose ground truth lies in the central interval of N(d, v) of a level.
+
+    ``compute()``: ``coverage``, NaN without a pixel; it equals ``level`` for a calibrated variance.
+
+    Args:
+        level: probability of the interval, in (0, 1).
+    """
+
+    OF_VARIANCE = "the coverage"
+    STATES = (("covered", COUNT), ("pixels", COUNT))
+
+    def __init__(self, level: float = 0.9, **kwargs: Any) -> None:
+        self.half_width, self.settings = _half_width(level), {"level": level}
+        super().__init__(**kwargs)
+
+    def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
+        d, v, g = pixels.judged
+        covered = pixels.judged.number((g - d).square() <= self.half_width**2 * v)
+        return {"covered": covered, "pixels": pixels.judged.number()}
+
+    def compute(self) -> dict[str, Tensor]:
+        return {"coverage": share(self.covered, self.pixels)}
+
+
+class IntervalWidth(SumMetric):
+    """Mean width of the central interval of N(d, v) of a level, over the pixels with ground truth.
+
+    ``compute()``: ``interval_width`` [m], NaN without a pixel. Of two variances with the right :class:`Coverage`, the
+    one with the narrower intervals says more.
+
+    Args:
+        level: probability of the interval, in (0, 1).
+    """
+
+    OF_VARIANCE = "the width of intervals"
+    STATES = (("total", SUM), ("pixels", COUNT))
+
+    def __init__(self, level: float = 0.9, **kwargs: Any) -> None:
+        self.half_width, self.settings = _half_width(level), {"level": level}
+        super().__init__(**kwargs)
+
+    def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
+        _, v, _ = pixels.judged
+        return {"total": pixels.judged.total(2 * self.half_width * v.sqrt()), "pixels": pixels.judged.number()}
+
+    def compute(self) -> dict[str, Tensor]:
+        return {"interval_width": share(self.total, self.pixels)}
+
+
+def _half_width(level: float) -> float:
+    """Half the width of the central interval of N(0, 1). Raises ValueError: the level is not in (0, 1)."""
+    if not 0 < level < 1:
+        raise ValueError(f"level must lie in (0, 1), got {level}")
+    return NormalDist().inv_cdf(0.5 + level / 2)
 
 
 class GatedPixels(SumMetric):
@@ -64,29 +123,31 @@ class GatedPixels(SumMetric):
         *((name, COUNT, len(_GATES) + 1) for name in ("accurate", "with_level", "covered")),
     )
 
-    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
-        d, v, g = pixels.judged
-        error, gates = np.abs(d - g) / g, len(_GATES) + 1
-        with np.errstate(divide="ignore", invalid="ignore"):
-            gate = np.searchsorted(_GATES, np.sqrt(v) / d)  # d = 0 is beyond every gate
-        joint = gate * (len(_ERRORS) + 1) + np.searchsorted(_ERRORS, error)
+    CONSTANTS = MappingProxyType({"gates": torch.from_numpy(_GATES), "error_edges": torch.from_numpy(_ERRORS)})
+
+    def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
+        maps = (pixels.depth, pixels.variance, pixels.target, *([pixels.level] if len(pixels.level) else []))
+        chosen = Selection(maps, pixels.with_truth & pixels.predicted)
+        d, v, g, *levels = chosen
+        error, gates = (d - g).abs() / g, len(_GATES) + 1
+        gate = torch.searchsorted(self.gates, v.sqrt() / d)  # d = 0 is beyond every gate
+        joint = gate * (len(_ERRORS) + 1) + torch.searchsorted(self.error_edges, error)
         sums = {
-            "errors": np.bincount(joint, minlength=gates * (len(_ERRORS) + 1)).reshape(gates, -1),
-            "accurate": np.bincount(gate[error <= _DELTA], minlength=gates),
+            "errors": chosen.histogram(joint, gates * (len(_ERRORS) + 1)).reshape(gates, -1),
+            "accurate": chosen.histogram(gate, gates, error <= _DELTA),
         }
-        if len(pixels.level):
-            level = pixels.level[pixels.with_truth & pixels.predicted]
-            sums["with_level"] = np.bincount(gate[np.isfinite(level)], minlength=gates)
-            sums["covered"] = np.bincount(gate[level <= LEVELS[_MIDDLE]], minlength=gates)
+        for level in levels:
+            sums["with_level"] = chosen.histogram(gate, gates, level.isfinite())
+            sums["covered"] = chosen.histogram(gate, gates, level <= LEVELS[_MIDDLE])
         return sums
 
     def compute(self) -> dict[str, Tensor]:
         errors = self.errors.cumsum(0)[:-1]
         pixels = errors.sum(1)
-        median = _median(errors, torch.from_numpy(_ERRORS).log())
+        median = _median(errors, self.error_edges.log())
         accurate, with_level, covered = (x.cumsum(0)[:-1] for x in (self.accurate, self.with_level, self.covered))
         return {
-            "gate_threshold": torch.from_numpy(_GATES),
+            "gate_threshold": self.gates,
             "gate_kept": share(pixels, self.errors.sum()),
             "gate_error": median,
             "gate_delta1": share(accurate, pixels),
@@ -95,9 +156,9 @@ class GatedPixels(SumMetric):
 
 
 def _median(counts: Tensor, edges: Tensor) -> Tensor:
-    """[G] exp of the medians of G histograms [G, E + 1] between the logarithms ``edges`` [E], on the CPU; NaN without a
-    count. Values below the first and above the last edge count as these."""
-    below = counts.cpu().cumsum(1).double()
+    """[G] exp of the medians of G histograms [G, E + 1] between the logarithms ``edges`` [E]; NaN without a count.
+    Values below the first and above the last edge count as these."""
+    below = counts.cumsum(1).double()
     half = below[:, -1:] / 2
     kind = (below < half).sum(1, keepdim=True).clamp_max(len(edges))
     start, end = torch.cat([edges[:1], edges]), torch.cat([edges, edges[-1:]])

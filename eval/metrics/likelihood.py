@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from types import MappingProxyType
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import COUNT, SUM, Array, Pixels, SumMetric, share
+from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, Selection, SumMetric, share
 
 
-def gaussian_nll(d: Array, v: Array, g: Array) -> Array:
+def gaussian_nll(d: Tensor, v: Tensor, g: Tensor) -> Tensor:
     """(g - d)^2 / (2 v) + 0.5 ln(2 pi v), v > 0 [nats]."""
-    return np.square(g - d) / (2 * v) + 0.5 * np.log(2 * math.pi * v)
+    return (g - d).square() / (2 * v) + 0.5 * (2 * math.pi * v).log()
 
 
 class NLL(SumMetric):
@@ -29,9 +28,10 @@ class NLL(SumMetric):
     OF_VARIANCE = "NLL"
     STATES = (("total", SUM), ("pixels", COUNT), ("with_truth", COUNT))
 
-    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
-        d, v, g = (value[pixels.judged[1] > 0] for value in pixels.judged)
-        return {"total": gaussian_nll(d, v, g).sum(), "pixels": len(v), "with_truth": pixels.with_truth.sum()}
+    def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
+        chosen = pixels.certain
+        total = chosen.total(gaussian_nll(*chosen))
+        return {"total": total, "pixels": chosen.number(), "with_truth": pixels.with_truth.sum()}
 
     def compute(self) -> dict[str, Tensor]:
         left_out = share(self.with_truth - self.pixels, self.with_truth)
@@ -46,19 +46,20 @@ class EntropyHistogram(SumMetric):
     """
 
     OF_VARIANCE = "the entropy"
-    EDGES = torch.linspace(-8.0, 8.0, 65, dtype=torch.float64)
+    CONSTANTS = MappingProxyType({"edges": torch.linspace(-8.0, 8.0, 65, dtype=torch.float64)})
     STATES = (("counts", COUNT, 66), ("total", SUM), ("pixels", COUNT))
 
-    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
-        v = pixels.variance[pixels.predicted]
-        entropy = 0.5 * (math.log(2 * math.pi) + 1.0 + np.log(v[v > 0]))
-        counts = np.bincount(np.searchsorted(self.EDGES.numpy(), entropy, side="right"), minlength=66)
-        counts[0] += len(v) - len(entropy)
-        return {"counts": counts, "total": entropy.sum(), "pixels": len(entropy)}
+    def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
+        every = Selection((pixels.variance,), pixels.predicted)
+        chosen = every.where(every.maps[0] > 0)
+        entropy = 0.5 * (math.log(2 * math.pi) + 1.0 + chosen.maps[0].log())
+        counts = chosen.histogram(torch.searchsorted(self.edges, entropy, right=True), 66)
+        below = torch.nn.functional.pad((every.number() - chosen.number())[None], (0, 65))
+        return {"counts": counts + below.to(counts.device), "total": chosen.total(entropy), "pixels": chosen.number()}
 
     def compute(self) -> dict[str, Tensor]:
         return {
             "entropy": share(self.total, self.pixels),
             "entropy_counts": self.counts.double(),
-            "entropy_edges": self.EDGES.to(self.counts.device),
+            "entropy_edges": self.edges,
         }

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from types import MappingProxyType
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, SumMetric, share
+from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, Selection, SumMetric, share
 from ufmstar_torch.eval.metrics.calibration import quantile_levels
 
 _BINS, _DELTA = 10, 0.25
@@ -31,13 +31,15 @@ class Mixture(SumMetric):
         *((name, COUNT, _BINS) for name in ("accurate", "pixels", "at_or_below")),
     )
 
-    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
+    CONSTANTS = MappingProxyType({"levels": quantile_levels(_BINS)})
+
+    def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
         if not len(pixels.inlier):
             return {}
         maps = pixels.depth, pixels.variance, pixels.target, pixels.inlier, pixels.outlier
-        d, v, g, v1, p = (torch.from_numpy(x[pixels.with_truth & pixels.predicted]) for x in maps)
+        v1, p = pixels.inlier, pixels.outlier
         used = (v1 > 0) & v1.isfinite() & (p >= 0) & (p <= 1)
-        d, v, g, v1, p = (x[used] for x in (d, v, g, v1, p))
+        d, v, g, v1, p = chosen = Selection(maps, used & pixels.with_truth & pixels.predicted)
         parts = torch.stack([v1, torch.maximum((v - (1 - p) * v1) / p.clamp_min(1e-12), v1)])
         weight, sigma, error = torch.stack([1 - p, p]), parts.sqrt(), g - d
         log_density = -(error.square() / parts + (2 * torch.pi * parts).log()) / 2
@@ -45,13 +47,14 @@ class Mixture(SumMetric):
         below = (weight * torch.special.ndtr(error / sigma)).sum(0)
         bins = (confidence * _BINS).long().clamp_max(_BINS - 1)
         accurate = error.abs() <= _DELTA * d.abs()
+        first = chosen.histogram(torch.searchsorted(self.levels, below), _BINS + 1)
         return {
-            "total": -torch.logsumexp(weight.log() + log_density, 0).sum(),
-            "confidence": torch.bincount(bins, confidence, _BINS),
-            "pixels": torch.bincount(bins, minlength=_BINS),
-            "accurate": torch.bincount(bins[accurate], minlength=_BINS),
-            "at_or_below": (below[:, None] <= quantile_levels(_BINS)).sum(0),
-            "covered": ((below - 0.5).abs() <= _THREE_SIGMA / 2).sum(),
+            "total": -chosen.total(torch.logsumexp(weight.log() + log_density, 0)),
+            "confidence": chosen.histogram(bins, _BINS, confidence),
+            "pixels": chosen.histogram(bins, _BINS),
+            "accurate": chosen.histogram(bins, _BINS, accurate),
+            "at_or_below": first.cumsum(0)[:-1],
+            "covered": chosen.number((below - 0.5).abs() <= _THREE_SIGMA / 2),
         }
 
     def compute(self) -> dict[str, Tensor]:
@@ -63,6 +66,6 @@ class Mixture(SumMetric):
         return {
             "mixture_nll": share(self.total, count),
             "mixture_ece_delta": share(gap, count),
-            "mixture_ece_q": (observed - quantile_levels(_BINS)).abs().mean(),
+            "mixture_ece_q": (observed - self.levels).abs().mean(),
             "mixture_coverage": share(self.covered, count),
         }

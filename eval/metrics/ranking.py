@@ -9,14 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import COUNT, SUM, Array, Pixels, SumMetric
+from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, SumMetric
 from ufmstar_torch.eval.metrics.likelihood import gaussian_nll
 
 # Bins of the logarithm of variance or error; bins of each in their joint histogram (5.5 % in variance, 2 MB).
@@ -26,10 +23,10 @@ BINS, JOINT_BINS = 4096, 512
 LOW, HIGH = 1e-8, 1e4
 
 
-def log_bin(value: Array, bins: int) -> NDArray[np.intp]:
+def log_bin(value: Tensor, bins: int) -> Tensor:
     """Bins in [0, bins + 1] of values >= 0: 0 below ``LOW``, bins + 1 from ``HIGH`` on."""
-    index = np.log(np.maximum(value, LOW) / LOW) * (bins / math.log(HIGH / LOW))
-    return np.where(value < LOW, 0, np.minimum(index, bins).astype(np.intp) + 1)
+    index = (value.clamp_min(LOW) / LOW).log() * (bins / math.log(HIGH / LOW))
+    return torch.where(value < LOW, 0, index.clamp_max(bins).long() + 1)
 
 
 def mean_of_share(count: Tensor, total: Tensor, shares: Tensor) -> Tensor:
@@ -65,18 +62,19 @@ class Sparsification(SumMetric):
         *((name, SUM, BINS + 2) for name in ("squared", "relative", "sum_squared", "sum_relative")),
     )
 
-    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
+    def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
         d, v, g = pixels.judged
-        squared, relative = np.square(d - g), np.abs(d - g) / g
+        binned = pixels.judged.histogram
+        squared, relative = (d - g).square(), (d - g).abs() / g
         b, of_squared, of_relative = (log_bin(value, BINS) for value in (v, squared, relative))
         return {
-            "count": np.bincount(b, minlength=BINS + 2),
-            "squared": np.bincount(b, squared, BINS + 2),
-            "relative": np.bincount(b, relative, BINS + 2),
-            "count_squared": np.bincount(of_squared, minlength=BINS + 2),
-            "sum_squared": np.bincount(of_squared, squared, BINS + 2),
-            "count_relative": np.bincount(of_relative, minlength=BINS + 2),
-            "sum_relative": np.bincount(of_relative, relative, BINS + 2),
+            "count": binned(b, BINS + 2),
+            "squared": binned(b, BINS + 2, squared),
+            "relative": binned(b, BINS + 2, relative),
+            "count_squared": binned(of_squared, BINS + 2),
+            "sum_squared": binned(of_squared, BINS + 2, squared),
+            "count_relative": binned(of_relative, BINS + 2),
+            "sum_relative": binned(of_relative, BINS + 2, relative),
         }
 
     def compute(self) -> dict[str, Tensor]:
@@ -110,11 +108,11 @@ class SpearmanCorrelation(SumMetric):
     OF_VARIANCE = "Spearman's correlation"
     STATES = (("joint", COUNT, JOINT_BINS + 2, JOINT_BINS + 2),)
 
-    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
+    def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
         d, v, g = pixels.judged
         size = JOINT_BINS + 2
-        both = log_bin(v, JOINT_BINS) * size + log_bin(np.square(d - g), JOINT_BINS)
-        return {"joint": np.bincount(both, minlength=size * size).reshape(size, size)}
+        both = log_bin(v, JOINT_BINS) * size + log_bin((d - g).square(), JOINT_BINS)
+        return {"joint": pixels.judged.histogram(both, size * size).reshape(size, size)}
 
     def compute(self) -> dict[str, Tensor]:
         joint = self.joint.double()
@@ -140,10 +138,10 @@ class NLLByError(SumMetric):
     OF_VARIANCE = "NLL by error"
     STATES = (("count", COUNT, BINS + 2), ("nll", SUM, BINS + 2))
 
-    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
-        d, v, g = (value[pixels.judged[1] > 0] for value in pixels.judged)
-        b = log_bin(np.square(d - g), BINS)
-        return {"count": np.bincount(b, minlength=BINS + 2), "nll": np.bincount(b, gaussian_nll(d, v, g), BINS + 2)}
+    def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
+        d, v, g = chosen = pixels.certain
+        b = log_bin((d - g).square(), BINS)
+        return {"count": chosen.histogram(b, BINS + 2), "nll": chosen.histogram(b, BINS + 2, gaussian_nll(d, v, g))}
 
     def compute(self) -> dict[str, Tensor]:
         shares = torch.arange(1, 11, dtype=torch.float64, device=self.count.device) / 10

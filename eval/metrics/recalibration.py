@@ -12,12 +12,13 @@ from itertools import pairwise
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from ufmstar_torch.eval.metrics.base import Array
 from ufmstar_torch.eval.metrics.ranking import HIGH, LOW
 from ufmstar_torch.posterior.recalibrate import CONFIDENCE, Recalibration
 
+Array = NDArray[np.float64]
 # Levels at which the quantiles of |z| are compared with a standard normal variable's. The outer tenth is excluded:
 # gross errors of the depth would dominate the variance of all other pixels.
 LEVELS = np.arange(0.1, 0.91, 0.1)

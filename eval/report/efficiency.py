@@ -24,6 +24,8 @@ _COLUMNS = [
     *((unit, name) for unit in UNITS.values() for name in ("Latency [ms]", "Power [W]", "Energy [mJ]")),
     ("", "Energy overhead [%]"),
     *(("Memory", name) for name in ("DNN unc. [MB]", "MVD [MB]", "Overhead [%]")),
+    # Not in the paper.
+    *(("Memory", name) for name in ("MVD, mean [MB]", "DNN buffers [MB]")),
 ]
 _SMALLEST = 0.01  # less prints as "<0.01"
 
@@ -60,8 +62,9 @@ def _table(run: Mapping[str, Any], label: str) -> Table:
 def _paper_table(quoted: PaperTable) -> Table:
     """The paper's table 2 of one network, with our columns."""
     bases = list(dict.fromkeys(Method.parse(method).base for method in quoted.rows))
+    further = [Cell()] * (len(_COLUMNS) - len(quoted.columns))
     lines = [
-        (bases.index(Method.parse(method).base), method, [cells.get(column, Cell()) for column in quoted.columns])
+        (bases.index(Method.parse(method).base), method, [*(cells.get(c, Cell()) for c in quoted.columns), *further])
         for method, cells in quoted.rows.items()
     ]
     alone = f"Depth alone: {quoted.alone['latency_ms']} ms, {quoted.alone['memory_mb']} MB."
@@ -81,11 +84,13 @@ def _cells(row: Mapping[str, Any], units: Mapping[str, str]) -> list[Cell]:
     else:
         whole = any("not_separable" in part for part in row["energy"].values())
         cells.append(NOT_SEPARABLE if whole else NOT_MEASURABLE)
-    state = "" if memory["multiview"] is None else megabytes(memory["multiview"]["bytes_end"])
+    kinds = ("bytes_end", "bytes_mean")
+    end, mean = ("" if memory["multiview"] is None else megabytes(memory["multiview"][kind]) for kind in kinds)
     if "not_measurable" in memory:
-        cells += [NOT_MEASURABLE, state, NOT_MEASURABLE]
+        cells += [NOT_MEASURABLE, end, NOT_MEASURABLE, mean, NOT_MEASURABLE]
     else:
-        cells += [megabytes(memory["network_uncertainty_bytes"]), state, _percent(memory["overhead_percent"])]
+        overhead, buffers = _percent(memory["overhead_percent"]), megabytes(memory["buffers_bytes"])
+        cells += [megabytes(memory["network_uncertainty_bytes"]), end, overhead, mean, buffers]
     return list(map(Cell, cells))
 
 
@@ -156,5 +161,8 @@ def _notes(run: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], network: M
     notes += [f"Power and energy of the {unit} are {NOT_MEASURABLE}: {why}." for unit, why in missing.items()]
     gpu = "" if run["machine"]["gpu"] is None else f", and {run['machine']['gpu']}"
     machine = f"{run['machine']['hardware']['cpu']}, {count(plan['threads'], 'thread')}{gpu}"
-    notes.append(f"Medians of {plan['frames']} frames of {run['sequence']['name']}; {machine}.")
+    frames = f"all {plan['frames']} selected frames" if plan["whole"] else f"{plan['frames']} frames"
+    of = f"{frames} of {run['sequence']['name']}"
+    notes.append(f"Medians of {of}, measured in a pass of their own; {machine}.")
+    notes.append("Memory is that of parameters and, after the last frame, of the multiview state; buffers beside.")
     return [*notes, *(f"{method} is left out: {why}." for method, why in run["left_out"].items())]

@@ -17,12 +17,12 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import CORNERS, DEFAULTS, DENSE, TRUTH, default_of
 from ufmstar_torch.eval.report import names, style
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.means import mean_of
+from ufmstar_torch.eval.report.means import Mean, difference, mean_of
 from ufmstar_torch.eval.report.style import LineStyle
 from ufmstar_torch.eval.run.colours import FAINT
 from ufmstar_torch.eval.suite.record import Record
 
-COUNT = "anchor_count"
+COUNT, SKIP = "anchor_count", "skip"
 Rest = tuple[tuple[str, Any], ...]
 # Largest number of anchors of rows without ``anchor_count``.
 _COUNTS = {"": 0, CORNERS: TrackerConfig().max_points, TRUTH: TRUTH_COUNT}
@@ -114,12 +114,14 @@ _FIXED: dict[Rest, tuple[str, str]] = {
     (("anchors", TRUTH),): ("#222222", "*"),
 }
 _OTHERS = (("#117733", "h"), ("#88CCEE", "p"), ("#999933", "<"), ("#AA4499", ">"))
+_DASHED: Mapping[str, Any] = {"linestyle": "--", "linewidth": 1.4}
 # Beyond this mean NLL an axis is logarithmic: pixels with nearly no variance make the mean arbitrarily large.
 _HIGH = 50.0
 
 
 def draw_sweep(results: Results, base: str, name: str) -> Any:
-    """The figures over the values, with their confidence intervals."""
+    """The figures over the values, with their confidence intervals. Over skipped images, the first panel is the
+    paper's: the improvement in NLL over the network alone, with its zero line."""
     lines = [line for line in sweep_lines(results, base, name) if len(line.points) > 1 or not line.rest]
     alone = [line for line in lines if line.method == Method(base)][:1]
     fused = [line for line in lines if line.method.fusion != ALONE]
@@ -131,10 +133,20 @@ def draw_sweep(results: Results, base: str, name: str) -> Any:
     values = sorted({value for line in fused if len(line.points) > 1 for value in line.points})
     label, unit = names.SETTINGS.get(name, (names.setting_name(name), ""))
     title = f"{label[:1].upper()}{label[1:]}: {BASES[base][0]}, {names.count(len(results.sequences()), 'sequence')}"
-    figure = style.new_figure(4.0 * len(shown), 3.4, title)
-    for panel, quantity in zip(figure.subplots(1, len(shown)), shown, strict=True):
+    gains = {line: _gains(alone[0], line) for line in fused if len(line.points) > 1} if name == SKIP and alone else {}
+    figure = style.new_figure(4.0 * (len(shown) + bool(gains)), 3.4, title)
+    panels = list(figure.subplots(1, len(shown) + bool(gains)))
+    x_label = f"{label} [{unit}]" if unit else label
+    if gains:
+        panel = panels.pop(0)
+        for line, means in gains.items():
+            _draw_means(panel, means, styles[line])
+        panel.axhline(0, **_DASHED, color=FAINT, label=styles[alone[0]].name)
+        style.finish(panel, title=f"NLL of {styles[alone[0]].name} – NLL: improvement {names.HIGHER}", x=x_label)
+        _scale(panel, values)
+        style.name_lines(panel)
+    for panel, quantity in zip(panels, shown, strict=True):
         reached = [y for line, line_style in styles.items() for y in _draw_line(panel, line, line_style, quantity)]
-        x_label = f"{label} [{unit}]" if unit else label
         style.finish(panel, title=f"{quantity.heading}, mean over sequences", x=x_label)
         _scale(panel, values)
         # On a linear axis all other values would be on one line. Intervals of such means extend as far below 0.
@@ -147,23 +159,39 @@ def draw_sweep(results: Results, base: str, name: str) -> Any:
     return figure
 
 
-def _draw_line(axes: Any, line: SweepLine, line_style: LineStyle, quantity: names.Quantity) -> list[float]:
-    """Draw means over the values of a setting with their band; references are dashed, without a band. Returns the
-    means."""
-    means = {value: mean_of(records, quantity) for value, records in line.points.items()}
+def _gains(alone: SweepLine, line: SweepLine) -> dict[float, Mean]:
+    """NLL of the network alone minus NLL of a line, by the values that both have, paired by sequence."""
+    return {
+        value: difference(alone.points[value], records, names.NLL)
+        for value, records in line.points.items()
+        if value in alone.points
+    }
+
+
+def _draw_means(axes: Any, means: Mapping[float, Mean], line_style: LineStyle) -> list[float]:
+    """Draw means over the values of a setting with their band. Returns the means."""
     finite = [(x, mean.value, mean.half) for x, mean in means.items() if math.isfinite(mean.value)]
     if not finite:
         return []
     x, y, half = np.array(finite).T
-    dashed: dict[str, Any] = {"color": line_style.colour, "linestyle": "--", "linewidth": 1.4, "label": line_style.name}
-    if len(means) == 1:
-        axes.axhline(y[0], **dashed)
-    elif line.method.fusion == ALONE:
-        axes.plot(x, y, **dashed)
-    else:
-        axes.plot(x, y, **line_style.line)
-        axes.fill_between(x, y - half, y + half, color=line_style.colour, alpha=0.15, linewidth=0)
+    axes.plot(x, y, **line_style.line)
+    axes.fill_between(x, y - half, y + half, color=line_style.colour, alpha=0.15, linewidth=0)
     return list(y.tolist())
+
+
+def _draw_line(axes: Any, line: SweepLine, line_style: LineStyle, quantity: names.Quantity) -> list[float]:
+    """Draw means over the values of a setting with their band; references are dashed, without a band. Returns the
+    means."""
+    means = {value: mean_of(records, quantity) for value, records in line.points.items()}
+    if len(means) > 1 and line.method.fusion != ALONE:
+        return _draw_means(axes, means, line_style)
+    finite = {x: mean.value for x, mean in means.items() if math.isfinite(mean.value)}
+    dashed = {**_DASHED, "color": line_style.colour, "label": line_style.name}
+    if len(means) == 1 and finite:
+        axes.axhline(*finite.values(), **dashed)
+    elif finite:
+        axes.plot(*zip(*finite.items(), strict=True), **dashed)
+    return list(finite.values())
 
 
 def _scale(axes: Any, values: Sequence[float]) -> None:

@@ -1,4 +1,4 @@
-"""Means and paired differences over sequences, with 95 % confidence intervals if there are enough sequences."""
+"""Means and paired differences over sequences, with 95 % confidence intervals from two sequences on."""
 
 from __future__ import annotations
 
@@ -12,16 +12,21 @@ from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.names import Quantity
 from ufmstar_torch.eval.suite.record import Record
 
-# Smallest number of sequences for an interval: with fewer values, Student's interval depends on normality.
-MIN_SEQUENCES = 5
+# With fewer sequences, an interval is marked as wide: Student's interval of so few values depends on normality.
+FEW_SEQUENCES = 5
 
 
 class Mean(NamedTuple):
     """A mean over sequences."""
 
     value: float = math.nan  # without a sequence
-    half: float = math.nan  # half-width of its 95 % confidence interval, NaN below MIN_SEQUENCES
+    half: float = math.nan  # half-width of its 95 % confidence interval, NaN below two sequences
     sequences: int = 0  # number of sequences with the figure
+
+    @property
+    def wide(self) -> bool:
+        """True if the interval is one of few sequences."""
+        return 2 <= self.sequences < FEW_SEQUENCES
 
 
 def value_of(record: Record, key: str) -> float:
@@ -39,7 +44,7 @@ def mean_over(values: Iterable[float]) -> Mean:
 
     finite = [value for value in values if not math.isnan(value)]
     mean, half = mean_and_ci(finite)
-    return Mean(mean, half if len(finite) >= MIN_SEQUENCES else math.nan, len(finite))
+    return Mean(mean, half, len(finite))
 
 
 def mean_of(records: Iterable[Record], quantity: Quantity) -> Mean:

@@ -16,7 +16,7 @@ LOWER, HIGHER = "↓", "↑"  # the better direction
 class Quantity:
     """A figure, its name and unit in tables and figures."""
 
-    key: str  # of ``Record.values``: a figure, or "state.bytes_mean", "ms.network", "frames.done"
+    key: str  # of ``Record.values``: a figure, or "state.bytes_end", "ms.network", "frames.done"
     name: str
     decimals: int | None  # None = three significant digits
     better: str = ""  # "↓", "↑", or "" for neither
@@ -45,7 +45,7 @@ ENERGY = Quantity("energy_mj", "energy", None, LOWER, "mJ")
 MEMORY = Quantity("memory_mb", "memory", None, LOWER, "MB")
 
 # The paper's columns, those of other suites' tables, and further columns that are usual in the field.
-_STATE = Quantity("state.bytes_mean", "state", None, "", "MB", 1e-6)
+_STATE = Quantity("state.bytes_end", "state", None, "", "MB", 1e-6)  # after the last frame
 PAPERS = (Quantity("delta1", "δ₁", 3, HIGHER), NLL, ECE_DELTA, ECE_Q, _STATE)
 MAIN = (*PAPERS[:-1], AUSE, _STATE)
 EXTRA = (
@@ -62,6 +62,7 @@ EXTRA = (
     # Shares of UfM*'s frames: without a segment, and (after the first) without a match of a segment with a component.
     Quantity("frames.without_segment", "no segment", 1, "", "%", 100.0),
     Quantity("frames.without_match", "no match", 1, "", "%", 100.0),
+    Quantity("state.bytes_mean", "state, mean over frames", None, "", "MB", 1e-6),
     Quantity("ms.network", "network", 1, "", "ms"),
     Quantity("ms.uncertainty", "uncertainty", 1, "", "ms"),
 )
@@ -120,7 +121,7 @@ _WORDS = {
     ("ufm_preset", "paper"): "paper's settings",
     ("preprocess", "resize"): "whole frame",
     ("preprocess", "crop"): "NYU's crop",
-    ("aleatoric_in_h", True): "A in H",
+    ("variances_in_h", True): "A and E in H",
     ("posterior", True): "posterior",
 }
 # Displayed values.

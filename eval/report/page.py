@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.means import MIN_SEQUENCES
+from ufmstar_torch.eval.report.means import FEW_SEQUENCES
 from ufmstar_torch.eval.report.names import row_labels
 from ufmstar_torch.eval.report.pictures import Picture
-from ufmstar_torch.eval.report.table import Table
+from ufmstar_torch.eval.report.table import WIDE, Table
 from ufmstar_torch.eval.run.files import write_bytes_atomic
 
 PAGE = "report.html"
@@ -64,7 +64,8 @@ def write_page(
         pictures=[(picture, _embedded(results.out / "figures" / picture.file)) for picture in pictures],
         cost_figures=_figures(figures, COST),
         limits=limits(results, undrawn),
-        min_sequences=MIN_SEQUENCES,
+        few_sequences=FEW_SEQUENCES,
+        wide=WIDE,
         command=command(results.about),
         made=json.dumps(made, indent=1, ensure_ascii=False, default=str),
     )

@@ -14,6 +14,7 @@ import pandas as pd
 from ufmstar_torch.eval.report.means import Mean
 from ufmstar_torch.eval.report.names import LOWER, Quantity
 
+WIDE = " w"  # after an interval of few sequences
 # Smallest half-width of a printed interval, as in the paper.
 SMALL_INTERVAL = 0.01
 DASH = "–"
@@ -29,20 +30,21 @@ class Cell:
     half: str = ""
     bold: bool = False
     remark: str = ""
+    wide: bool = False
 
     @classmethod
     def of(cls, mean: Mean, quantity: Quantity, *, signed: bool = False) -> Cell:
         """A mean with its interval if its half-width is at least .01. A difference (``signed``) has an interval of any
-        width, and "better" or "worse" if the interval excludes 0."""
+        width, and "better" or "worse" if the interval excludes 0 and is not marked as wide."""
         if math.isnan(mean.value):
             return cls()
         decimals = significant(mean.value) if quantity.decimals is None else quantity.decimals
-        wide = mean.half >= SMALL_INTERVAL or (signed and mean.half > 0)
+        shown = mean.half >= SMALL_INTERVAL or (signed and mean.half > 0)
         remark = ""
-        if signed and quantity.better and abs(mean.value) > mean.half:
+        if signed and quantity.better and abs(mean.value) > mean.half and not mean.wide:
             remark = "better" if (mean.value < 0) == (quantity.better == LOWER) else "worse"
-        half = number(mean.half, decimals) if wide else ""
-        return cls(number(mean.value, decimals, signed=signed), half, remark=remark)
+        half = number(mean.half, decimals) if shown else ""
+        return cls(number(mean.value, decimals, signed=signed), half, remark=remark, wide=bool(half) and mean.wide)
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,7 @@ def markdown_text(text: str) -> str:
 def _markdown_cell(cell: Cell) -> str:
     value = cell.value.replace("<", "&lt;") or DASH
     value = f"**{value}**" if cell.bold else value
-    value = f"{value} ± {cell.half}" if cell.half else value
+    value = f"{value} ± {cell.half}{WIDE if cell.wide else ''}" if cell.half else value
     return f"{value} ({cell.remark})" if cell.remark else value
 
 
@@ -180,7 +182,8 @@ def _latex_cell(cell: Cell) -> str:
     if not cell.value or cell.value[0].isalpha():  # words instead of a number
         return (cell.value or DASH).translate(_LATEX)
     value = rf"\mathbf{{{cell.value}}}" if cell.bold else cell.value
-    text = f"${value} \\pm {cell.half}$" if cell.half else f"${value}$"
+    wide = rf"\,\mathrm{{{WIDE.strip()}}}" if cell.wide else ""
+    text = f"${value} \\pm {cell.half}{wide}$" if cell.half else f"${value}$"
     return f"{text} ({cell.remark.translate(_LATEX)})" if cell.remark else text
 
 

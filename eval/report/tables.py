@@ -14,7 +14,7 @@ from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.efficiency import efficiency_tables
 from ufmstar_torch.eval.report.means import (
-    MIN_SEQUENCES,
+    FEW_SEQUENCES,
     difference,
     mean_of,
     mean_over,
@@ -103,8 +103,8 @@ def difference_table(results: Results, dataset: str | None = None) -> Table:
                 lines.append((block, f"{labels[row]} – {labels[ours]}", (Cell(str(pairs)), *cells)))
     columns = [("", "sequences"), *(("", f"Δ {q.heading}") for q in DIFFERENCES)]
     note = (
-        "Mean over sequences of row – UfM* on the same sequence, with its 95 % confidence interval (from "
-        f"{MIN_SEQUENCES} sequences on); better and worse: beyond the interval."
+        "Mean over sequences of row – UfM* on the same sequence, with its 95 % confidence interval (w: wide, of fewer "
+        f"than {FEW_SEQUENCES} sequences); better and worse: beyond the interval, from {FEW_SEQUENCES} sequences on."
     )
     title = f"{results.title}, paired differences, {_where(results, dataset)}"
     return Table("differences", title, "Row – UfM*", frame_of(lines, columns), (note,))
@@ -120,19 +120,17 @@ def _means(records: Records, quantities: Iterable[Quantity], group: str = "") ->
 
 
 def _costs(efficiency: Mapping[str, Any], records: Records, group: str) -> Columns:
-    """Energy and memory of the rows' uncertainty: energy over the measured sequences, memory over all sequences; dashes
+    """Energy and memory of the rows' uncertainty over the measured sequences, as in the table of efficiency; dashes
     where nothing was measured."""
     measured = {line["row"]: line for line in efficiency.get("rows", ())}
     energy, memory = {}, {}
     for row, listed in records.items():
         if row.label in measured:
             keys = {(record.dataset, record.sequence) for record in listed}
-            energies = [one for one in efficiency.get("sequences", ()) if (one["dataset"], one["sequence"]) in keys]
-            joules = mean_over(v for one in energies if (v := one["energy_mj"].get(row.label)) is not None)
-            network = measured[row.label]["memory"].get("network_uncertainty_bytes")
-            sizes = () if network is None else (network + (r.state.get("bytes_mean") or 0.0) for r in listed)
-            energy[row] = Cell.of(joules, ENERGY)
-            memory[row] = Cell.of(mean_over(1e-6 * size for size in sizes), MEMORY)
+            runs = [one for one in efficiency.get("sequences", ()) if (one["dataset"], one["sequence"]) in keys]
+            joules, sizes = ([one[name].get(row.label) for one in runs] for name in ("energy_mj", "memory_bytes"))
+            energy[row] = Cell.of(mean_over(v for v in joules if v is not None), ENERGY)
+            memory[row] = Cell.of(mean_over(1e-6 * v for v in sizes if v is not None), MEMORY)
     return {(group, ENERGY): energy, (group, MEMORY): memory}
 
 
@@ -174,19 +172,19 @@ def _notes(results: Results, records: Records) -> list[str]:
     if words := shared_words(records):
         notes.append(f"Images of all rows: {words}, resized to the networks' input.")
     most = max(map(len, records.values()))
-    if most < MIN_SEQUENCES:
-        few = "One sequence" if most == 1 else f"{most} sequences, fewer than {MIN_SEQUENCES}"
-        return [*notes, f"{few}: no confidence intervals."]
-    intervals = "with 95 % confidence intervals (those below 0.01 are left out)"
-    return [*notes, f"Means over sequences, each counting the same, {intervals}."]
+    if most == 1:
+        return [*notes, "One sequence: no confidence intervals."]
+    intervals = "with 95 % confidence intervals (those below 0.01 are left out"
+    few = "" if most >= FEW_SEQUENCES else f"; w: wide, since Student's interval of {most} sequences rests on normality"
+    return [*notes, f"Means over sequences, each counting the same, {intervals}{few})."]
 
 
 def _cost_note(efficiency: Mapping[str, Any]) -> str:
     used = set(efficiency["devices"]["units"].values())
     missing = "; ".join(dict.fromkeys(why for unit, why in efficiency["power"]["missing"].items() if unit in used))
-    measured = f", energy on {len(efficiency.get('sequences', ()))} of them"
-    words = f"; energy is not measurable here: {missing}" if missing else measured
-    return f"Energy and memory are what uncertainty adds to depth alone, memory on all sequences{words}."
+    words = f"; energy is not measurable here: {missing}" if missing else ""
+    measured = f"on all selected frames of {count(len(efficiency.get('sequences', ())), 'sequence')}"
+    return f"Energy, and memory after the last frame, are what uncertainty adds to depth alone, {measured}{words}."
 
 
 # ---- files ----

@@ -187,7 +187,20 @@ def onboard_table(summary: Mapping[str, Any]) -> str:
             f"({100 * contrast['share']:.0f} % of the pixels; aleatoric sigma {m['aleatoric_sigma_high']} m, sqrt(M) "
             f"{m['disagreement_high']} m), {m['rmse_low']} m elsewhere"
         )
-    return "\n".join([*lines, f"{summary['out']}: summary.json{', onboard.png' if contrast else ''}"])
+    costs = summary.get("costs") or {}
+    if costs:
+        lines.append(_cost_line(costs))
+    files = ["summary.json", *(["onboard.png"] if contrast else []), *(["onboard_costs.png"] if costs else [])]
+    return "\n".join([*lines, f"{summary['out']}: {', '.join(files)}"])
+
+
+def _cost_line(costs: Mapping[str, Any]) -> str:
+    """The time and energy of the parts of a live run."""
+    seconds = ", ".join(f"{name} {number(values[-1])} s" for name, values in costs["seconds"].items())
+    if "joules" not in costs:
+        return f"time: {seconds}; energy is not measurable here: {costs['not_measurable']}"
+    joules = ", ".join(f"{name} {number(values[-1])} J" for name, values in costs["joules"].items())
+    return f"time: {seconds}; energy: {joules}"
 
 
 def realtime_table(summary: Mapping[str, Any]) -> str:

@@ -147,9 +147,10 @@ class FrameSequence:
         """All frames in order. Raises FrameError: a frame cannot be decoded."""
         return (self[index] for index in range(len(self)))
 
-    def readable(self, on_error: Callable[[FrameError], None]) -> Iterator[Frame]:
-        """The frames that can be decoded, in order; ``on_error`` gets the errors of the others."""
-        for index in range(len(self)):
+    def readable(self, on_error: Callable[[FrameError], None], indices: Iterable[int] | None = None) -> Iterator[Frame]:
+        """The frames at ``indices`` (None = all) that can be decoded, in order; ``on_error`` gets the errors of the
+        others."""
+        for index in range(len(self)) if indices is None else indices:
             try:
                 frame = self[index]
             except FrameError as error:

@@ -192,7 +192,7 @@ def check_frame(
     features: Array | None,
     *,
     feature_count: int,
-    aleatoric_in_h: bool = False,
+    variances_in_h: bool = False,
     rotation_tolerance: float,
     max_depth: float = DEPTH_RANGE[1],
     member: int | Tensor = 0,
@@ -203,7 +203,7 @@ def check_frame(
 
     Args:
         feature_count: F.
-        aleatoric_in_h: append A and 1 to the features.
+        variances_in_h: append A, E (0 where the network predicts none) and 1 to the features.
         rotation_tolerance: largest deviation of a pose's rotation from an orthogonal matrix.
         max_depth: farther pixels are not valid [m].
         member: index of the network, for all streams or [B].
@@ -212,7 +212,7 @@ def check_frame(
 
     Raises:
         TypeError: an argument is no tensor or has the wrong kind of dtype.
-        ValueError: an argument has the wrong shape or lies on another device than ``depth``, or ``aleatoric_in_h``
+        ValueError: an argument has the wrong shape or lies on another device than ``depth``, or ``variances_in_h``
             without ``aleatoric``.
     """
     depth = require_float("depth", as_tensor("depth", depth))
@@ -230,10 +230,11 @@ def check_frame(
 
     a, e = converted("aleatoric", aleatoric), converted("epistemic", epistemic)
     extra = _features(features, feature_count, plain)
-    if aleatoric_in_h:
-        if a is None:
-            raise ValueError("aleatoric must be given with config.aleatoric_in_h, which averages it over views")
-        in_h = torch.stack([_constant(a), torch.ones_like(plain)], 1)
+    if variances_in_h:
+        if a is None and e is None:
+            raise ValueError("aleatoric or epistemic must be given with config.variances_in_h, which averages them")
+        averaged = (torch.zeros_like(plain) if value is None else _constant(value) for value in (a, e))
+        in_h = torch.stack([*averaged, torch.ones_like(plain)], 1)
         extra = in_h if extra is None else torch.cat([extra, in_h], 1)
     T, K = _of_depth("pose", as_pose(pose), plain), _of_depth("intrinsics", as_intrinsics(intrinsics), plain)
     mask = None

@@ -235,6 +235,26 @@ def wasserstein_variance(mean: Tensor, covariance: Tensor, weight: Tensor) -> Te
     return ((weight * distances).sum(-1) / weight.sum(-1)).to(dtype)
 
 
+def pointwise_disagreement(points: Tensor) -> Tensor:
+    """m_p = tr Sigma, the spread of the views' estimates of one 3D point (section "Pointwise multiview disagreement").
+
+    Sigma is the sample covariance, 1/(J - 1) sum_j (X_j - mu) (X_j - mu)^T. UfM measures this; UfM* measures
+    :func:`wasserstein_variance` of regions.
+
+    Args:
+        points: [..., J, 3] estimates of the point from J views, in one frame [m].
+
+    Returns:
+        [...] in m^2.
+
+    Raises:
+        ValueError: fewer than two views.
+    """
+    if points.shape[-2] < 2:
+        raise ValueError(f"points must hold at least two views, [..., J, 3], got {tuple(points.shape)}")
+    return points.to(torch.float64).var(-2).sum(-1).to(points.dtype)
+
+
 def floor_covariance(covariance: Tensor, floor: Tensor) -> Tensor:
     """Covariances whose eigenvalues are at least ``floor``.
 

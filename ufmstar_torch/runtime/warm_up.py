@@ -66,7 +66,7 @@ def warm_up(
     pose = torch.eye(4)
     K = camera_of(size)
     features = depth.new_zeros(streams, config.features, height, width) if config.features else None
-    aleatoric = depth if config.aleatoric_in_h else None
+    aleatoric = depth if config.variances_in_h else None
     corner = depth[:, 0, :1]
     anchors = None
     if config.anchors is not None:

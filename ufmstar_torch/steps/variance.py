@@ -61,14 +61,15 @@ def network_variances_at(
 ) -> NetworkVariances:
     """A and E [B, H, W], or [B, n] at ``pixels``, whose regressed features are [..., F].
 
-    With ``config.aleatoric_in_h`` the last two features are the mixture's A and its weight share s; A is then that plus
-    (1 - s) times the pixel's A.
+    With ``config.variances_in_h`` the last three features are the mixture's A, E and weight share s; each of A and E is
+    then its mean over the mixture plus (1 - s) times the pixel's own.
     """
-    a, e = (None if value is None else at_pixels(value, pixels) for value in network_variances(frame, config))
-    if a is not None and config.aleatoric_in_h:
-        mixed, explained = features[..., -2:].unbind(-1)
-        a = mixed + (1 - explained) * a
-    return NetworkVariances(a, e)
+    values = [None if value is None else at_pixels(value, pixels) for value in network_variances(frame, config)]
+    if config.variances_in_h:
+        *means, explained = features[..., -3:].unbind(-1)
+        pairs = zip(values, means, strict=True)
+        values = [None if value is None else mean + (1 - explained) * value for value, mean in pairs]
+    return NetworkVariances(*values)
 
 
 def total_variance(
@@ -141,7 +142,7 @@ def corrected(
         learnt, posterior, of_posterior = correct(state.by_stream, frame, claimed, config)
         quantiles, state = posterior.pop("quantiles"), state.with_tensors(learnt)
         maps, counts = maps | posterior, counts | of_posterior
-    if config.merge is not None:
+    if config.merges_on(frame.depth.device.type):
         state, merged = merge.after_frame(state, frame, config, merging)
         counts |= merged
     if isinstance(mapped, Recalibration):
