@@ -58,6 +58,11 @@ def test_depth_and_std_are_the_posteriors_and_the_networks_stay_where_they_were(
         torch.testing.assert_close(out.std, out.variance.sqrt(), rtol=0, atol=0, equal_nan=True)
         torch.testing.assert_close(out.depth, same.depth, rtol=0, atol=0, equal_nan=True)
         assert torch.equal(out.prediction.depth, out.network_depth)
+        alone_again = out.ufm
+        assert torch.equal(alone_again.depth, out.network_depth)
+        assert torch.equal(alone_again.variance.nan_to_num(), out.ufm_variance.nan_to_num())
+        for mine, posterior in zip(out.posterior(), alone_again.posterior(), strict=True):
+            assert mine is posterior
     assert error(outs[-1].prediction.depth, walk()[-1]) == pytest.approx(BIAS - 1, abs=1e-3)
     assert error(outs[-1].depth, walk()[-1]) < 0.06
     assert not alone(caplog)
@@ -70,6 +75,8 @@ def test_without_the_posterior_it_is_ufm_star_alone():
         torch.testing.assert_close(out.variance, expected.variance, rtol=0, atol=0, equal_nan=True)
         assert torch.equal(out.depth, expected.depth)
         assert out.posterior_outlier is out.anchored is None
+        with pytest.raises(ValueError, match="posterior needs"):
+            out.posterior()
     assert model.landmarks is None
     anchored = UncertainDepth(TooFar(), posterior=False, anchors="corners")
     out = followed(anchored, frames=slice(4))[-1]

@@ -21,7 +21,13 @@ from ufmstar_torch.steps.regress import regress
 
 pytestmark = pytest.mark.numerics
 
-CONFIG = UfMStarConfig(merge=MergeConfig(loss=1.0, share=0.2), features=2, anchors=AnchorConfig())
+
+def merging(share: float, **settings: float) -> MergeConfig:
+    """Settings with another ``share``, which is a constant."""
+    return type("Merging", (MergeConfig,), {"share": share})(**settings)
+
+
+CONFIG = UfMStarConfig(merge=merging(0.2, loss=1.0), features=2, anchors=AnchorConfig())
 ALL = torch.tensor([True, True])
 
 
@@ -53,8 +59,8 @@ def one(mean: list[list[float]], spread: list[float], weight: list[float], m: li
     return empty.replace(**values, covariance=cov[None], compared=compared)
 
 
-def merge_one(m: GaussianMixture, **changes: float) -> GaussianMixture:
-    config = UfMStarConfig(merge=MergeConfig(**{"loss": 1.0, "share": 0.05} | changes))
+def merge_one(m: GaussianMixture, share: float = 0.05) -> GaussianMixture:
+    config = UfMStarConfig(merge=merging(share, loss=1.0))
     return merge(m, m.mean.new_zeros(*m.weight.shape, 0), torch.tensor([True]), config)[0]
 
 
@@ -82,7 +88,7 @@ def test_sums_over_the_mixture_stay(seed):
     before, sums = crowd(seed)
     after, merged_sums = merge(before, sums, ALL, CONFIG)
     assert int(after.components.sum()) < int(before.components.sum())
-    joined, _ = merge(before, sums, ALL, CONFIG.with_values({"merge.share": 0.0}))
+    joined, _ = merge(before, sums, ALL, CONFIG.replace(merge=merging(0.0, loss=1.0)))
 
     def zeroth(m: GaussianMixture) -> torch.Tensor:
         w, compared = m.weight[..., None], m.compared[..., None]
@@ -136,7 +142,7 @@ def test_the_map_stays_within_the_stated_bound_where_components_are_dissolved(se
     """At a dissolved component's points, a feature in [0, 1] changes by little more than the component's share. Joining
     is off."""
     before, _ = crowd(seed)
-    config = UfMStarConfig(merge=MergeConfig(loss=1e-9, share=0.05), features=2)
+    config = UfMStarConfig(merge=merging(0.05, loss=1e-9), features=2)
     after, _ = merge(before, before.mean.new_zeros(*before.weight.shape, 0), ALL, config)
     for b in range(2):
         gone = [k for k in range(12) if not (after.mean[b] == before.mean[b, k]).all(1).any()]

@@ -200,15 +200,15 @@ class MergeConfig(Checked):
 
     Attributes:
         loss: loss per pixel up to which two Gaussians are joined
-        share: share in its own points below which a Gaussian is dissolved in the others
         every: frames of a stream from one merging to the next
         accelerators: merge on accelerators, too, where every frame then waits for the device
     """
 
     loss: float = number(2.0, "l_max", "nat", 0.0, 10.0, open_low=True)
-    share: float = number(0.1, "s_min", "1", 0.0, 0.5)
     every: int = number(50, "n", "frames", 1)
     accelerators: bool = False
+    # s_min [1]: share in its own points below which a Gaussian is dissolved in the others
+    share: ClassVar[float] = 0.1
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -167,6 +167,7 @@ class UncertaintyOutput:
         prediction: the network's output, for "full" the predictive mean with mean A and E over the members; None for a
             module without networks.
         member: index of the network that was run; None if all were, or none.
+        corrected: of a result that :attr:`ufm` returned, the one with the posterior; else None.
     """
 
     depth: Tensor
@@ -178,6 +179,7 @@ class UncertaintyOutput:
     current_cam: GaussianMixture | None = None
     prediction: DepthPrediction | None = None
     member: int | None = None
+    corrected: UncertaintyOutput | None = None
 
     def __getattr__(self, name: str) -> Any:
         """A map by its name, or None."""
@@ -197,6 +199,22 @@ class UncertaintyOutput:
     def std(self) -> Tensor:
         """sqrt(variance) [m]."""
         return self.variance.sqrt()
+
+    @property
+    def ufm(self) -> UncertaintyOutput:
+        """The result of UfM* alone: the network's depth with the variance V, and the same maps."""
+        return replace(self, depth=self.network_depth, variance=self.ufm_variance, corrected=self)
+
+    def posterior(self) -> tuple[Tensor, Tensor]:
+        """The posterior's depth [m] and variance [m^2].
+
+        Raises:
+            ValueError: without ``config.posterior``.
+        """
+        best = self if self.corrected is None else self.corrected
+        if best.posterior_outlier is None:
+            raise ValueError("posterior needs UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())")
+        return best.depth, best.variance
 
     @property
     def intrinsics(self) -> Tensor:
