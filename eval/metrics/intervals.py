@@ -64,12 +64,12 @@ class Coverage(SumMetric):
     STATES = (("covered", COUNT), ("pixels", COUNT))
 
     def __init__(self, level: float = 0.9, **kwargs: Any) -> None:
-        self.half, self.settings = _half_width(level), {"level": level}
+        self.half_width, self.settings = _half_width(level), {"level": level}
         super().__init__(**kwargs)
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
         d, v, g = pixels.judged
-        covered = pixels.judged.number((g - d).square() <= self.half**2 * v)
+        covered = pixels.judged.number((g - d).square() <= self.half_width**2 * v)
         return {"covered": covered, "pixels": pixels.judged.number()}
 
     def compute(self) -> dict[str, Tensor]:
@@ -90,12 +90,12 @@ class IntervalWidth(SumMetric):
     STATES = (("total", SUM), ("pixels", COUNT))
 
     def __init__(self, level: float = 0.9, **kwargs: Any) -> None:
-        self.half, self.settings = _half_width(level), {"level": level}
+        self.half_width, self.settings = _half_width(level), {"level": level}
         super().__init__(**kwargs)
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
         _, v, _ = pixels.judged
-        return {"total": pixels.judged.total(2 * self.half * v.sqrt()), "pixels": pixels.judged.number()}
+        return {"total": pixels.judged.total(2 * self.half_width * v.sqrt()), "pixels": pixels.judged.number()}
 
     def compute(self) -> dict[str, Tensor]:
         return {"interval_width": share(self.total, self.pixels)}
