@@ -2,7 +2,7 @@
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: install test test-all lint types package bench clean
+.PHONY: install test test-all lint flat types site package bench clean
 
 install:
 	python3 -m venv $(VENV)
@@ -18,11 +18,18 @@ lint:
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-# Type checkers cannot follow setuptools' package-dir map: check a flat copy. setuptools never removes modules from build/lib.
-types:
+# Type checkers and the reference cannot follow setuptools' package-dir map: they read a flat copy. setuptools never
+# removes modules from build/lib.
+flat:
 	rm -rf build/flat build/lib
 	$(BIN)/pip install --quiet --no-deps --target build/flat .
+
+types: flat
 	$(BIN)/mypy build/flat/ufmstar_torch
+
+# The documentation, in build/site; a warning is an error.
+site: flat
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
 # The wheel and the sdist, each installed over the editable package, imported from elsewhere, and taken back.
 package:

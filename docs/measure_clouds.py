@@ -7,6 +7,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +16,16 @@ from scipy.spatial import cKDTree
 _KINDS = {"float": "<f4", "double": "<f8", "uchar": "|u1"}
 
 
-def read_points(path: Path) -> NDArray[np.float64]:
-    """[P, 3] the points of a cloud of ``ufmstar export`` [m]."""
+def read_vertices(path: Path) -> NDArray[Any]:
+    """[P] the vertices of a cloud of ``ufmstar export``, by the names of their properties."""
     head, body = path.read_bytes().split(b"end_header\n", 1)
     properties = [line.split()[1:] for line in head.decode().splitlines() if line.startswith("property")]
-    table = np.frombuffer(body, [(name, _KINDS[kind]) for kind, name in properties])
+    return np.frombuffer(body, [(name, _KINDS[kind]) for kind, name in properties])
+
+
+def read_points(path: Path) -> NDArray[np.float64]:
+    """[P, 3] the points of a cloud of ``ufmstar export`` [m]."""
+    table = read_vertices(path)
     return np.stack([table[axis] for axis in "xyz"], axis=-1).astype(np.float64)
 
 

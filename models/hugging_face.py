@@ -7,6 +7,7 @@ must agree. ``transformers`` initialises missing weights randomly; this module r
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from pickle import UnpicklingError
@@ -16,6 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ufmstar_torch.files.limits import MOST_BYTES
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models.alignment import KINDS, AlignedNetwork, Alignment
 from ufmstar_torch.models.checkpoints import DAMAGE, CheckpointError, some
@@ -25,6 +27,7 @@ from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.runtime.checked import Checked, number
 from ufmstar_torch.runtime.optional import optional
 
+MOST_LAYERS = 1000  # of a model
 _LINEAR, _CUBIC = 2, 3  # Pillow's numbers, which the configurations use
 # The supported architectures, and whether they always predict metric depth. Others, such as models with a second input,
 # raise.
@@ -317,6 +320,42 @@ def read_checkpoint(name_or_dir: str | Path, revision: str | None = None, local_
     return Checkpoint(name, read["config.json"], read.get(processor_file, {}), options)
 
 
+def _require_size(checkpoint: Checkpoint, dtype: torch.dtype) -> None:
+    """Raises CheckpointError: the configuration of a directory states a model that is much larger than its weights, or
+    than the limit of layers; it is built without memory, on the device "meta"."""
+    from transformers import CONFIG_MAPPING, AutoModelForDepthEstimation
+
+    folder = Path(checkpoint.name)
+    if not folder.is_dir() or checkpoint.model_type not in CONFIG_MAPPING:
+        return  # the hub's own files, or another loader's error
+    layers = [value for key, value in _numbers(checkpoint.config) if "layers" in key or "depths" in key]
+    if max(layers, default=0) > MOST_LAYERS:
+        raise CheckpointError(
+            f"{checkpoint.name}: config.json states {max(layers)} layers, at most {MOST_LAYERS} can be"
+        )
+    try:
+        with torch.device("meta"):
+            config = CONFIG_MAPPING[checkpoint.model_type].from_dict(checkpoint.config)
+            model: nn.Module = AutoModelForDepthEstimation.from_config(config, dtype=dtype)
+    except (*DAMAGE, NotImplementedError):
+        return  # the loader's message names the fault
+    size = sum(tensor.nbytes for tensor in (*model.parameters(), *model.buffers()))
+    stored = sum(file.stat().st_size for file in folder.iterdir() if file.suffix in (".safetensors", ".bin"))
+    if size > max(MOST_BYTES, 4 * stored):  # 4: weights in 8 bits
+        stated = f"a model of {size:,} bytes, its weights have {stored:,}"
+        raise CheckpointError(f"{checkpoint.name}: config.json states {stated}: the files do not belong together")
+
+
+def _numbers(config: Any, key: str = "") -> Iterator[tuple[str, int]]:
+    """The whole numbers in a configuration, with the names of their innermost keys."""
+    if isinstance(config, int) and not isinstance(config, bool):
+        yield key, config
+    for name, value in config.items() if isinstance(config, dict) else ():
+        yield from _numbers(value, str(name))
+    for value in config if isinstance(config, list) else ():
+        yield from _numbers(value, key)
+
+
 def _load_model(checkpoint: Checkpoint, dtype: torch.dtype, allow_missing: tuple[str, ...]) -> nn.Module:
     """Load the model with all weights of the checkpoint, on the CPU, or with random ones (empty ``options``). Raises
     CheckpointError: not a depth model, damaged, or with missing, misshapen or non-finite weights; the message names the
@@ -330,6 +369,7 @@ def _load_model(checkpoint: Checkpoint, dtype: torch.dtype, allow_missing: tuple
             CONFIG_MAPPING[checkpoint.model_type].from_dict(checkpoint.config), dtype=dtype
         )
         return untrained.eval()
+    _require_size(checkpoint, dtype)
     try:
         model, report = AutoModelForDepthEstimation.from_pretrained(
             checkpoint.name, dtype=dtype, output_loading_info=True, **checkpoint.options

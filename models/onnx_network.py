@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models.network import DeclaredNetwork, require_image
+from ufmstar_torch.models.onnx_sizes import require_sizes
 from ufmstar_torch.models.outputs import PlainSpec, ProgramSpec
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.runtime.checked import choice
@@ -218,6 +219,7 @@ def open_session(path: str, threads: int, providers: tuple[str, ...]) -> Inferen
         raise FileNotFoundError(f"no ONNX file {path}")
     if absent := [p for p in providers if p not in ort.get_available_providers()]:
         raise ValueError(f"providers {absent} are not available; this ONNX Runtime has {ort.get_available_providers()}")
+    require_sizes(path)
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     # Spinning threads would occupy the cores between two runs.

@@ -211,7 +211,7 @@ class ProgramSpec(Checked):
     """
 
     outputs: OutputSpec = field(metadata={"section": OutputSpec, "optional": False})
-    preprocess: Preprocess | None = section(Preprocess, optional=True)
+    preprocess: Preprocess | None = section(Preprocess, optional=True, on=False)
     takes_intrinsics: bool = False
 
     @classmethod

@@ -64,7 +64,7 @@ class NetworkSpec(Checked):
     members: int = number(1, "N", "networks", 1, MOST_MEMBERS)
     size: tuple[int, int] = (224, 224)
     preprocess: str = choice("nyu", "resize")
-    module: ModuleSpec | None = section(ModuleSpec, optional=True)
+    module: ModuleSpec | None = section(ModuleSpec, optional=True, on=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import resource
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,7 @@ from hypothesis import settings
 THREADS = int(os.environ.setdefault("OMP_NUM_THREADS", "1"))
 
 CORE = Path(__file__).resolve().parents[1] / "ufmstar_torch"
+PROCESSOR, MOST_SECONDS = "processor_seconds", 20
 MAX_WORKERS = 4  # each takes up to 3 GB
 COMPILE = Path(__file__).with_name("compile_kernels.py")
 COMPILERS: pytest.StashKey[list[subprocess.Popen[bytes]]] = pytest.StashKey()
@@ -59,6 +62,30 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     torch = sys.modules.get("torch")
     if torch is not None and torch.get_num_threads() != THREADS:
         torch.set_num_threads(THREADS)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
+    """Note the processor time of a test and of the processes that it starts, which other load hardly changes."""
+    before = _processor_seconds()
+    try:
+        return (yield)
+    finally:
+        item.user_properties.append((PROCESSOR, _processor_seconds() - before))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """List the tests that need more processor time than a test should."""
+    reports = [report for outcome in ("passed", "failed") for report in terminalreporter.stats.get(outcome, [])]
+    seconds = {report.nodeid: dict(report.user_properties).get(PROCESSOR, 0.0) for report in reports}
+    for name, value in sorted(seconds.items(), key=lambda item: -item[1]):
+        if value > MOST_SECONDS:
+            terminalreporter.write_line(f"{value:.0f} s of processor time, more than {MOST_SECONDS}: {name}")
+
+
+def _processor_seconds() -> float:
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(one.ru_utime + one.ru_stime for one in used)
 
 
 def _names_files(config: pytest.Config) -> bool:

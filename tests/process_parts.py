@@ -14,6 +14,18 @@ import numpy as np
 from ufmstar_torch.eval.sequences.frame import Entry, make_sequence
 
 
+def acting(folder, truth, *acts):
+    """The words of an evaluation of sequences a, b, ... with these actions; ``truth`` is the option of its network."""
+    folder.mkdir()
+    roots = [folder / f"{name}.act" for name in "abcd"[: len(acts)]]
+    for root, act in zip(roots, acts, strict=True):
+        root.write_text(act)
+    (folder / "alone.toml").write_text('[[rows]]\nmethods = ["DepthOnly"]\n')
+    words = ["--suite", folder / "alone.toml", "--plugin", __file__, "--network", truth]
+    words += ["--root", *(f"d={root}" for root in roots), "--threads", 1, "--no-report", "--out", folder / "out"]
+    return [str(word) for word in words]
+
+
 class Acting:
     LOOKED_FOR = "a file *.act"
     detect = staticmethod(lambda path: path.suffix == ".act")

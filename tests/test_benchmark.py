@@ -109,8 +109,8 @@ def test_a_tiny_run_from_end_to_end(tmp_path, capsys):
     for row in rows.values():
         assert row["latency"]["multiview"]["count"] == row["ratios_to_depth"]["multiview"]["count"] == 2
         assert row["latency"]["multiview"]["min_ms"] > 0
-    assert plain["stages"].keys() == {"stages", "stages_total", "beside_the_paper"}
-    assert 0 < plain["stages"]["beside_the_paper"]["median"] < 1
+    assert plain["stages"].keys() == {"stages", "stages_total", "beyond_the_paper"}
+    assert 0 < plain["stages"]["beyond_the_paper"]["median"] < 1
     assert plain["sample"]["ratio_to_step"]["count"] == plain["sample"]["latency"]["count"] == 2
     sizes = [row["memory"]["multiview"]["bytes_end"] for row in (plain, corners, posterior)]
     assert sizes == sorted(sizes), "landmarks and the posterior add to the mixture's memory"

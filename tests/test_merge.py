@@ -21,7 +21,7 @@ from ufmstar_torch.steps.regress import regress
 
 pytestmark = pytest.mark.numerics
 
-CONFIG = UfMStarConfig(merge=MergeConfig(share=0.2), features=2, anchors=AnchorConfig())
+CONFIG = UfMStarConfig(merge=MergeConfig(loss=1.0, share=0.2), features=2, anchors=AnchorConfig())
 ALL = torch.tensor([True, True])
 
 
@@ -54,7 +54,7 @@ def one(mean: list[list[float]], spread: list[float], weight: list[float], m: li
 
 
 def merge_one(m: GaussianMixture, **changes: float) -> GaussianMixture:
-    config = UfMStarConfig(merge=MergeConfig(**changes))
+    config = UfMStarConfig(merge=MergeConfig(**{"loss": 1.0, "share": 0.05} | changes))
     return merge(m, m.mean.new_zeros(*m.weight.shape, 0), torch.tensor([True]), config)[0]
 
 
@@ -223,3 +223,45 @@ def test_pairs_beyond_the_first_room_are_found():
     )
     assert torch.equal(found.components, expected.components)
     torch.testing.assert_close(found.mean, expected.mean, rtol=1e-10, atol=1e-12)
+
+
+def test_components_far_from_the_camera_are_left_as_they_are():
+    m, sums = crowd(3, 60)
+    n = int(m.components.min())
+    m, sums = GaussianMixture(**{name: v[:, :n] for name, v in m.tensors().items()}), sums[:, :n]
+    both = GaussianMixture(**{name: torch.cat([v, v], 1) for name, v in m.tensors().items()})
+    far, twice = both.mean.clone(), torch.cat([sums, sums], 1)
+    far[:, :n, 0] += 1000.0  # another room, whose slots come first
+    both, near = both.replace(mean=far), torch.arange(2 * n).expand(2, -1) >= n
+    found, found_sums = merge(both, twice, ALL, CONFIG, near=near)
+    expected, _ = merge(m, sums, ALL, CONFIG)
+    for b in range(2):
+        k = int(expected.components[b])
+        assert int(found.components[b]) == n + k < 2 * n
+        for name, value in found.tensors().items():
+            assert torch.equal(value[b, :n], both.tensors()[name][b, :n]), name
+            assert torch.equal(value[b, n : n + k], expected.tensors()[name][b, :k]), name
+        torch.testing.assert_close(found_sums[b, : n + k].sum(0), twice[b].sum(0))
+
+
+def test_a_module_leaves_another_room_as_it_is():
+    config = UfMStarConfig(merge=MergeConfig(every=6, loss=10.0), view_baseline=None, eta=0.01)
+    depth, K = torch.full((1, 48, 64), 2.0), torch.tensor([[40.0, 0, 31.5], [0, 40.0, 23.5], [0, 0, 1]])
+    ufm, pose = UfMStar(config), torch.eye(4, dtype=torch.float64)
+    rooms = []
+    for i in range(6):
+        pose[0, 3] = 0.5 * i + (100.0 if i > 2 else 0.0)
+        ufm(depth, pose[None].clone(), K)
+        rooms.append(ufm.mixture)
+    before, after = (m.mean[0, : int(m.components[0])] for m in (rooms[2], rooms[5]))
+    assert len(before) > 1, "the first room has something to merge"
+    assert torch.equal(after[after[:, 0] < 50], before)
+    assert int((after[:, 0] > 50).sum()) == 1, "the second room was merged"
+
+
+def test_merging_is_on_by_default_on_the_cpu_alone():
+    default, paper = UfMStarConfig(), UfMStarConfig.paper()
+    assert [default.merges_on(kind) for kind in ("cpu", "cuda", "meta")] == [True, False, False]
+    assert UfMStarConfig(merge=MergeConfig(accelerators=True)).merges_on("cuda")
+    assert not paper.merges_on("cpu")
+    assert paper.merge is None

@@ -19,7 +19,7 @@ ASSUMED = {
 @pytest.mark.parametrize("unmeasured", ASSUMED)
 def test_pixels_that_were_seen_once(ufmstar, tmp_path, unmeasured):
     out = tmp_path / "out"
-    words = ("run", "tour:1?frames=3&size=48x64", *QUICK, "--ufm.unmeasured", unmeasured, "--out", str(out))
+    words = ("run", "tour:1?frames=3&size=48x64", *QUICK, "--set", f"unmeasured={unmeasured}", "--out", str(out))
     code, printed, _ = ufmstar(*words)
     assert code == 0
     assert re.search(rf"^\d+% of the pixels were seen once; {ASSUMED[unmeasured]}$", printed, re.MULTILINE)

@@ -22,7 +22,7 @@ from ufmstar_torch import cli
 from ufmstar_torch.eval.run.scale import network_scale
 from ufmstar_torch.eval.sequences import FrameError, find_sequences, open_sequence
 from ufmstar_torch.eval.sequences.colmap import read_landmarks
-from ufmstar_torch.eval.sequences.images import full_scale, grey_bytes, read_color, read_depth
+from ufmstar_torch.eval.sequences.images import full_scale, grey_bytes, listed_file, read_color, read_depth
 from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
 from ufmstar_torch.eval.sequences.video import Video
 
@@ -500,3 +500,31 @@ def test_16_bit_colours_in_png_messages(tmp_path):
     with warnings.catch_warnings():
         image = open_sequence(tmp_path / "walk")[0].image
     np.testing.assert_array_equal(image, np.repeat(grey_bytes(values, 65535)[..., None], 3, axis=2))
+
+
+@pytest.mark.parametrize(
+    "listed",
+    [
+        "images\\{}", ".\\images\\{}", "C:\\walk\\images\\{}", "C:/Users/me/walk/images/{}", "/home/me/walk/images/{}",
+        "../walk/images/{}", "..\\..\\elsewhere\\images\\{}", "file:///home/me/walk/images/{}",
+        "\\\\server\\walk\\images\\{}",
+    ],
+)  # fmt: skip
+def test_paths_of_other_computers_are_found_by_their_end(tmp_path, listed):
+    images, names = tmp_path / "walk" / "images", ["a.png", "b.png"]
+    images.mkdir(parents=True)
+    for name in names:
+        (images / name).write_bytes(b"")
+        assert listed_file(tmp_path / "walk", listed.format(name)) == images / name
+
+
+@pytest.mark.parametrize(
+    "listed", ["{}/secret.png", "../secret.png", "../../secret.png", "..", "/", "file://{}/secret.png"]
+)
+def test_a_listed_path_never_leaves_the_recording(tmp_path, listed):
+    (tmp_path / "secret.png").write_bytes(b"")
+    walk = tmp_path / "walk"
+    walk.mkdir()
+    found = listed_file(walk, listed.format(tmp_path))
+    assert not found.is_file()
+    assert found.is_relative_to(walk)

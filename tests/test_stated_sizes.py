@@ -18,7 +18,7 @@ from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.frame import FrameError, parse_size
 from ufmstar_torch.eval.sequences.images import image_size, read_color, read_depth
 from ufmstar_torch.files.limits import MOST_BYTES, MOST_PIXELS
-from ufmstar_torch.models import CheckpointError, NetworkSpec, OnnxNetwork, Preprocess, load_trained
+from ufmstar_torch.models import CheckpointError, NetworkSpec, OnnxNetwork, Preprocess, from_hugging_face, load_trained
 from ufmstar_torch.models.checkpoints import load_state_dict_file
 
 LIMIT = r"more than the limit of [\d,]+"
@@ -131,3 +131,46 @@ def test_an_array(tmp_path):
         np.lib.format.write_array_header_1_0(file, header)
     with pytest.raises(FrameError, match=LIMIT):
         read_depth(tmp_path / "d.npy")
+
+
+@pytest.mark.parametrize("kind", ["ConstantOfShape", "Expand", "Tile"])
+def test_a_tensor_inside_an_onnx_graph(tmp_path, kind):
+    """ONNX Runtime would fold the constant when it opens the file."""
+    onnx = pytest.importorskip("onnx")
+    from onnx import TensorProto, helper, numpy_helper
+
+    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, 8, 8])
+    depth = helper.make_tensor_value_info("depth", TensorProto.FLOAT, None)
+    large = numpy_helper.from_array(np.array([1, 1, 40_000, 40_000], np.int64), "large")
+    one = numpy_helper.from_array(np.ones((1, 1, 1, 1), np.float32), "one")
+    inputs = ["large"] if kind == "ConstantOfShape" else ["one", "large"]
+    nodes = [
+        helper.make_node(kind, inputs, ["huge"]),
+        helper.make_node("ReduceMax", ["huge"], ["most"], keepdims=1),
+        helper.make_node("Mul", ["image", "most"], ["depth"]),
+    ]
+    graph = helper.make_graph(nodes, "g", [image], [depth], initializer=[large, one])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), tmp_path / "n.onnx")
+    with pytest.raises(
+        ValueError, match=rf"n\.onnx: the tensor 'huge' of the graph would take 6,400,000,000 .*{LIMIT}"
+    ):
+        OnnxNetwork(tmp_path / "n.onnx", {"outputs": {"kind": "metric"}})
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"fusion_hidden_size": 40_000}, "config.json states a model of [0-9,]+ bytes, its weights have [0-9,]+"),
+        ({"backbone_config": {"num_hidden_layers": 10**9}}, "states 1000000000 layers, at most 1000 can be"),
+    ],
+)
+def test_a_configuration_of_transformers(tmp_path, changes, match):
+    """The weights of the file fill a part of what the configuration states; the rest would be allocated."""
+    depth_anything_files = pytest.importorskip("depth_anything_files")
+    folder = depth_anything_files.write_depth_anything(tmp_path, "metric")
+    config = json.loads((folder / "config.json").read_text())
+    for key, value in changes.items():
+        config[key] = config[key] | value if isinstance(value, dict) else value
+    (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(CheckpointError, match=match):
+        from_hugging_face(folder)

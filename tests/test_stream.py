@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from runs import Brightness, networks
 from tiny_suite import CPU
 
 from ufmstar_torch import UfMStarConfig
-from ufmstar_torch.eval.engine.estimators import Alone, Gaussians
+from ufmstar_torch.eval.engine.estimators import Alone, Gaussians, output_of
 from ufmstar_torch.eval.engine.maps import own_depth
 from ufmstar_torch.eval.engine.predictions import PredictionCache
 from ufmstar_torch.eval.engine.progress import frame_progress
@@ -134,3 +135,12 @@ def test_predictions_of_a_cache_give_the_same_bits_and_run_no_network(sequence, 
             np.testing.assert_array_equal(other.rows["row"].map(name), one.rows["row"].map(name))
         assert "network" in one.rows["row"].ms
         assert "network" not in other.rows["row"].ms
+
+
+def test_the_output_of_a_method_other_than_ufm_star():
+    depth, valid = torch.ones(1, 2, 2), torch.tensor([[[True, True], [True, False]]])
+    out = output_of(depth, 0.1 * depth, valid, aleatoric=0.2 * depth, epistemic=None)
+    assert out.variance.isnan().equal(~valid)
+    assert out.maps.keys() == {"aleatoric"}
+    assert (int(out.statistics.valid_pixels[0]), int(out.statistics.components[0])) == (3, 0)
+    assert output_of(depth, None, valid).variance.isnan().all()

@@ -10,34 +10,35 @@ import sys
 import threading
 import time
 from contextlib import contextmanager
+from pathlib import Path
 
-import process_parts
 import pytest
+from process_parts import acting
 from tiny_suite import TRUTH, job_on, stored_results
 
 from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.suite import tasks
-from ufmstar_torch.eval.suite.tasks import evaluate_suite
+from ufmstar_torch.eval.suite.tasks import dask_cluster, evaluate_suite
 
 pytest.importorskip("distributed")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 
 @contextmanager
-def cluster(folder, workers=2):
+def cluster(folder, threads="1"):
     """A scheduler and its workers in processes of their own: the address, and the scheduler's process."""
     file, running = folder / "scheduler.json", []
     quiet = {"DASK_LOGGING__DISTRIBUTED": "critical", **os.environ}
 
     def begin(kind, *words):
         command = [sys.executable, "-P", "-m", f"distributed.cli.{kind}", "--no-dashboard", "--scheduler-file", file]
-        running.append(subprocess.Popen([*map(str, command), *words], env=quiet, stderr=subprocess.DEVNULL))
+        running.append(subprocess.Popen([*map(str, command), *words], env=quiet, stderr=subprocess.DEVNULL, cwd="/"))
 
     try:
         begin("dask_scheduler", "--port", "0", "--host", "127.0.0.1")
         until(file.exists)
-        for _ in range(workers):
-            begin("dask_worker", "--no-nanny", "--nthreads", "1", "--death-timeout", "60")
+        for _ in range(2):
+            begin("dask_worker", "--no-nanny", "--nthreads", threads, "--death-timeout", "60")
         yield json.loads(file.read_text())["address"], running[0]
     finally:
         for process in running:
@@ -54,17 +55,6 @@ def until(condition):
     raise AssertionError("it did not happen within five minutes")
 
 
-def acting(folder, **acts):
-    """A job on sequences with the actions of process_parts.py."""
-    folder.mkdir()
-    for name, act in acts.items():
-        (folder / f"{name}.act").write_text(act)
-    (folder / "alone.toml").write_text('[[rows]]\nmethods = ["DepthOnly"]\n')
-    words = ["--suite", folder / "alone.toml", "--plugin", process_parts.__file__, "--network", TRUTH]
-    words += ["--root", *(f"d={folder / name}.act" for name in acts), "--out", folder / "out"]
-    return job_from(read([str(word) for word in words]))
-
-
 def workers_at(folder, name):
     """The ids of the processes that have opened a sequence."""
     return [int(path.suffix[1:]) for path in folder.glob(f"{name}.[0-9]*")]
@@ -75,18 +65,21 @@ def in_thread(job, address):
     result, lines = [], []
 
     def work():
-        result.append((evaluate_suite(job, scheduler=address, threads=1, report=lines.append), lines))
+        with dask_cluster(address) as workers:
+            result.append((evaluate_suite(job, workers, threads=1, report=lines.append), lines))
 
     thread = threading.Thread(target=work)
     thread.start()
     return thread, result
 
 
-def test_two_workers_give_the_bits_of_one_process(rooms, tmp_path):
-    alone, shared = job_on(rooms, tmp_path / "alone"), job_on(rooms, tmp_path / "shared")
+def test_two_workers_give_the_bits_of_one_process(rooms, tmp_path, monkeypatch):
+    """Each has two threads and another working folder."""
+    monkeypatch.chdir(tmp_path)
+    alone, shared = job_on(rooms, tmp_path / "alone"), job_on(rooms, Path("shared"))
     shown = []
-    with cluster(tmp_path) as (address, _):
-        outcome = evaluate_suite(shared, scheduler=address, threads=1, progress=shown.append)
+    with cluster(tmp_path, "2") as (address, _), dask_cluster(address) as workers:
+        outcome = evaluate_suite(shared, workers, threads=1, progress=shown.append)
     assert (outcome.finished, outcome.stopped, dict(outcome.failed)) == (True, False, {})
     assert [(now.done, now.total) for now in shown] == [(1, 3), (2, 3), (3, 3)]
     evaluate_suite(alone)
@@ -97,7 +90,7 @@ def test_two_workers_give_the_bits_of_one_process(rooms, tmp_path):
 
 def test_another_worker_takes_over_from_a_killed_one(tmp_path):
     folder = tmp_path / "acts"
-    job = acting(folder, a="hold", b="go", c="go")
+    job = job_from(read(acting(folder, TRUTH, "hold", "go", "go")))
     with cluster(tmp_path) as (address, _):
         thread, result = in_thread(job, address)
         until(lambda: workers_at(folder, "a"))
@@ -113,7 +106,7 @@ def test_another_worker_takes_over_from_a_killed_one(tmp_path):
 def test_a_lost_scheduler_ends_the_evaluation_and_finished_records_remain(tmp_path, monkeypatch):
     monkeypatch.setattr(tasks, "_CONNECT_SECONDS", 2)
     folder = tmp_path / "acts"
-    job = acting(folder, a="go", b="hold", c="hold")
+    job = job_from(read(acting(folder, TRUTH, "go", "hold", "hold")))
     with cluster(tmp_path) as (address, scheduler):
         thread, result = in_thread(job, address)
         until(lambda: list(folder.glob("out/records/d/a/*.json")) and workers_at(folder, "b"))
@@ -125,8 +118,8 @@ def test_a_lost_scheduler_ends_the_evaluation_and_finished_records_remain(tmp_pa
     assert "processes were lost" in lines[-1]
     assert "d/b" in lines[-1]
     assert stored_results(job.out) == before != {}
-    with pytest.raises(OSError, match="Timed out"):
-        evaluate_suite(job, scheduler=address, resume=True)
+    with pytest.raises(OSError, match="Timed out"), dask_cluster(address):
+        pass
     (folder / "release").touch()
     assert evaluate_suite(job, resume=True).finished
     assert len(stored_results(job.out)) == 3

@@ -9,15 +9,15 @@ import time
 from pathlib import Path
 
 import forked
-import process_parts
 import pytest
 import torch
+from process_parts import acting
 from tiny_suite import NAMES, TRUTH, stored_results
 from trainings import SPEC
 
 from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.run import machine
-from ufmstar_torch.eval.suite.tasks import evaluate_suite
+from ufmstar_torch.eval.suite.tasks import evaluate_suite, process_pool
 from ufmstar_torch.models.spec import build_network
 from ufmstar_torch.models.trained import save_trained
 
@@ -36,7 +36,8 @@ def test_one_process_and_two_give_the_same_bits(rooms, tmp_path):
     words += ["--root", f"rooms={rooms}", "--examples", "0", "--out"]
     one, two = (job_from(read([*words, str(tmp_path / name)])) for name in ("one", "two"))
     lines, shown = list[str](), []
-    outcome = evaluate_suite(two, processes=2, threads=1, report=lines.append, progress=shown.append)
+    with process_pool(2) as pool:
+        outcome = evaluate_suite(two, pool, threads=1, report=lines.append, progress=shown.append)
     assert (outcome.finished, outcome.stopped, dict(outcome.failed)) == (True, False, {})
     assert sorted(line.partition(":")[0] for line in lines) == [f"rooms/{name}" for name in NAMES]
     assert [(now.stage, now.done, now.total) for now in shown] == [("sequences", done, 3) for done in (1, 2, 3)]
@@ -56,18 +57,6 @@ def is_alive(number):
         return False
 
 
-def acting(folder, *acts):
-    """The command of an evaluation in two processes, on sequences a, b, ... with the actions of process_parts.py."""
-    folder.mkdir()
-    roots = [folder / f"{name}.act" for name in "abcd"[: len(acts)]]
-    for root, act in zip(roots, acts, strict=True):
-        root.write_text(act)
-    (folder / "alone.toml").write_text('[[rows]]\nmethods = ["DepthOnly"]\n')
-    words = ["--suite", folder / "alone.toml", "--plugin", process_parts.__file__, "--network", TRUTH]
-    words += ["--root", *(f"d={root}" for root in roots), "--processes", 2, "--threads", 1, "--no-report"]
-    return [str(word) for word in (*words, "--out", folder / "out")]
-
-
 def at_work(folder):
     """The ids of the processes that have opened a sequence."""
     return {int(path.suffix[1:]) for path in folder.glob("*.[0-9]*")}
@@ -76,21 +65,22 @@ def at_work(folder):
 def in_two(words, stop=lambda: False):
     """Run an evaluation in two processes: whether it finished, and its output lines."""
     lines: list[str] = []
-    return evaluate_suite(job_from(read(words)), processes=2, threads=1, stop=stop, report=lines.append).finished, lines
+    with process_pool(2) as pool:
+        return evaluate_suite(job_from(read(words)), pool, threads=1, stop=stop, report=lines.append).finished, lines
 
 
 @pytest.mark.slow
 def test_processes_end_in_good_order_by_a_stop_by_an_error_and_by_a_kill(tmp_path, monkeypatch):
     monkeypatch.setattr(multiprocessing, "get_context", lambda _: forked.CONTEXT)  # the other tests here spawn
     with pytest.raises(RuntimeError, match=r"d/c: TypeError: a mistake"):
-        in_two(acting(tmp_path / "a", "go", "wait", "fail"))
+        in_two(acting(tmp_path / "a", TRUTH, "go", "wait", "fail"))
     assert len(list(tmp_path.glob("a/out/records/*/*/DepthOnly.json"))) == 1, "finished records remain"
-    finished, lines = in_two(acting(tmp_path / "b", "go", "wait", "kill"))
+    finished, lines = in_two(acting(tmp_path / "b", TRUTH, "go", "wait", "kill"))
     assert (finished, lines[0].partition(":")[0]) == (False, "d/a")
     assert len(lines) == 2
     assert "processes were lost (killed for want of memory" in lines[1]
     assert "at one of d/b, d/c; finished rows remain" in lines[1]
-    words = acting(tmp_path / "c", "wait", "wait", "go")
+    words = acting(tmp_path / "c", TRUTH, "wait", "wait", "go")
     assert in_two(words, stop=lambda: len(at_work(tmp_path / "c")) == 2) == (False, [])
     assert not any(is_alive(number) for folder in tmp_path.iterdir() for number in at_work(folder))
 
@@ -98,7 +88,16 @@ def test_processes_end_in_good_order_by_a_stop_by_an_error_and_by_a_kill(tmp_pat
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_processes_end_with_a_parent_that_is_killed(tmp_path):
-    words = [sys.executable, "-P", "-m", "ufmstar_torch.cli", "eval", *acting(tmp_path / "a", "wait", "wait")]
+    words = [
+        sys.executable,
+        "-P",
+        "-m",
+        "ufmstar_torch.cli",
+        "eval",
+        *acting(tmp_path / "a", TRUTH, "wait", "wait"),
+        "--processes",
+        "2",
+    ]
     parent = subprocess.Popen(words)
     try:
         while len(at_work(tmp_path / "a")) < 2:

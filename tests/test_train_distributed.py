@@ -29,38 +29,17 @@ def command(job):
     """The command line of a job on two processes."""
     r, n = job.recipe, job.recipe.network
     words = ["--preset", "fastdepth-aleatoric", "--data", "sequences", "--root", *job.data.paths]
-    words += [
-        "--set",
-        f"data.part={job.data.part}",
-        "--set",
-        f"data.validation_part={job.data.validation_part}",
-        "--out",
-        str(job.settings.out),
-    ]
-    words += [
-        "--set",
-        f"network.widths={n.widths}",
-        "--set",
-        "network.norm=false",
-        "--set",
-        f"network.positive={n.positive}",
-    ]
-    words += ["--set", f"network.dropout={n.dropout}"]
-    words += ["--set", f"network.size={list(n.size)}", "--set", f"network.preprocess={n.preprocess}"]
-    for name in ("epochs", "batch_size", "learning_rate", "average", "clip", "warmup_steps"):
+    words += ["--out", str(job.settings.out)]
+    settings = {"data.part": job.data.part, "data.validation_part": job.data.validation_part}
+    settings |= {"network.widths": n.widths, "network.norm": "false", "network.positive": n.positive}
+    settings |= {"network.dropout": n.dropout, "network.size": list(n.size), "network.preprocess": n.preprocess}
+    settings |= {"average": r.average, "clip": r.clip, "warmup_steps": r.warmup_steps}
+    settings |= {"session.log_every": 1, "session.strategy": "ddp"}
+    words += [f"--set={name}={value}" for name, value in settings.items()]
+    for name in ("epochs", "batch_size", "learning_rate"):
         words += [f"--{name.replace('_', '-')}", str(getattr(r, name))]
-    words += ["--set", "session.log_every=1", "--no-progress", "--no-tensorboard", "--accelerator", "cpu"]
-    return [
-        sys.executable,
-        "-m",
-        "ufmstar_torch.cli",
-        "train",
-        *words,
-        "--devices",
-        "2",
-        "--set",
-        "session.strategy=ddp",
-    ]
+    words += ["--no-progress", "--no-tensorboard", "--accelerator", "cpu"]
+    return [sys.executable, "-m", "ufmstar_torch.cli", "train", *words, "--devices", "2"]
 
 
 def losses(out):

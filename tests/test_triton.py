@@ -90,7 +90,9 @@ def test_capture_keeps_the_state_in_place(monkeypatch):
         KernelInterface, "__getitem__", lambda kernel, grid: launched.append(kernel.fn.__name__) or launch(kernel, grid)
     )
 
-    config = UfMStarConfig(segment=SPGF, backend="triton", on_bad_frame="skip", initial_capacity=16, max_components=16)
+    config = UfMStarConfig(
+        segment=SPGF, backend="triton", on_bad_frame="skip", initial_capacity=16, max_components=16, merge=None
+    )
     inputs = [frame[:3] for frame in walks(1, 2, SIZE)]
     ufm, plain = UfMStar(config), UfMStar(config)
     captured = Captured(ufm, *inputs[0], record=lambda run: run)

@@ -85,7 +85,7 @@ def cases() -> dict[str, Callable[[], object]]:
     def device(streams: int = 2, **settings: Any) -> None:
         depth = torch.full((streams, *(SIZE if streams > 1 else (1, 1))), 2.0)
         kernels = select_kernels("triton", "cuda")
-        chosen = UfMStarConfig(features=1, **settings)
+        chosen = UfMStarConfig(features=1, merge=None, **settings)
         frame = check_frame(
             depth, torch.eye(4), K[:streams], None, None, None, depth[:, None], feature_count=1, rotation_tolerance=0.01
         )

@@ -8,18 +8,8 @@ from dataclasses import Field, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, Literal
 
-from ufmstar_torch.eval.commands.options import (
-    Count,
-    File,
-    Flag,
-    Number,
-    Repeated,
-    Text,
-    Texts,
-    UsageError,
-    assigned,
-    parse,
-)
+from ufmstar_torch.eval.commands.errors import UsageError
+from ufmstar_torch.eval.commands.options import Count, File, Flag, Number, Repeated, Text, Texts, assigned, parse
 from ufmstar_torch.models.spec import NetworkSpec
 from ufmstar_torch.train.augment import AugmentationConfig
 from ufmstar_torch.train.data_config import DataConfig

@@ -40,7 +40,8 @@ Without the correction (--plain), a constant deviation was better calibrated on 
 commands:
 {commands}
 
-ufmstar COMMAND --help shows a command's options, ufmstar --version the version.
+ufmstar COMMAND --help shows a command's options, ufmstar --version the version, and
+ufmstar --version --system versions and hardware for a report of a problem.
 """
 # Errors of a network, a file or a full disk, printed as one line; --debug adds the traceback.
 _FAILURES = (ImportError, MemoryError, OSError, RuntimeError, TypeError, ValueError)
@@ -60,19 +61,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         commands = "\n".join(f"  {name:13}{purpose}" for name, (_, purpose) in COMMANDS.items())
         print(_HELP.format(commands=commands), end="")
         return OK if words else USAGE
-    if words == ["--version"]:
+    if words[0] == "--version" and words[1:] in ([], ["--system"]):
         from ufmstar_torch import __version__
 
-        print(__version__)
+        print(__version__ if words == ["--version"] else _system())
         return OK
     if words[0] not in COMMANDS:
         return _end(f"ufmstar: no command {words[0]!r}, there are {', '.join(COMMANDS)}", USAGE)
     return _run(words[0], words[1:])
 
 
+def _system() -> str:
+    """Versions and hardware, a line each."""
+    from ufmstar_torch.eval.run.machine import system
+
+    return "\n".join(f"{name:22} {value}" for name, value in system().items())
+
+
 def _run(name: str, words: Sequence[str]) -> int:
     """Import the command, parse its options, and run it; convert errors to one line and an exit code."""
-    from ufmstar_torch.eval.commands.options import UsageError
+    from ufmstar_torch.eval.commands.errors import UsageError
 
     debug = "--debug" in words
     try:

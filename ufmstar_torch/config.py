@@ -19,6 +19,7 @@ UNSTATED_RANGE = 20.0
 PAPER: Mapping[str, Any] = MappingProxyType({
     "segment.min_pixels": 2000, "segment.min_rows": 32, "segment.prune": "either", "segment.slope_focal": "camera",
     "segment.max_depth": 1000.0, "view_baseline": None, "regression": "neighbourhood", "unmeasured": "paper",
+    "merge": None,
 })  # fmt: skip
 
 
@@ -201,11 +202,13 @@ class MergeConfig(Checked):
         loss: loss per pixel up to which two Gaussians are joined
         share: share in its own points below which a Gaussian is dissolved in the others
         every: frames of a stream from one merging to the next
+        accelerators: merge on accelerators, too, where every frame then waits for the device
     """
 
-    loss: float = number(1.0, "l_max", "nat", 0.0, 10.0, open_low=True)
-    share: float = number(0.05, "s_min", "1", 0.0, 0.5)
+    loss: float = number(2.0, "l_max", "nat", 0.0, 10.0, open_low=True)
+    share: float = number(0.1, "s_min", "1", 0.0, 0.5)
     every: int = number(50, "n", "frames", 1)
+    accelerators: bool = False
 
 
 @dataclass(frozen=True)
@@ -284,9 +287,9 @@ class UfMStarConfig(Checked):
     backend: str = choice("auto", "torch", "numba", "triton")
 
     # Not in the paper
-    anchors: AnchorConfig | None = section(AnchorConfig, optional=True)
-    confidence: ConfidenceConfig | None = section(ConfidenceConfig, optional=True)
-    posterior: PosteriorConfig | None = section(PosteriorConfig, optional=True)
+    anchors: AnchorConfig | None = section(AnchorConfig, optional=True, on=False)
+    confidence: ConfidenceConfig | None = section(ConfidenceConfig, optional=True, on=False)
+    posterior: PosteriorConfig | None = section(PosteriorConfig, optional=True, on=False)
     merge: MergeConfig | None = section(MergeConfig, optional=True)
 
     # Constants: the paper's neighbourhood, and a bound far above the rounding of poses in text files.
@@ -330,6 +333,8 @@ class UfMStarConfig(Checked):
         - ``regression``: over the Gaussians within .1 m here, or .5 m where there are none; by default over all, the
           sum that this approximates to save time, which was calibrated better.
         - ``unmeasured``: a surface that no two views compared reads as 0 here, as a share of its depth by default.
+        - ``merge``: Gaussians are only added here; by default those that overlap are joined every 50 frames, which
+          changes ECE_delta by at most .004 (docs/results/speed.md).
         """
         return cls().with_values(PAPER)
 
@@ -337,6 +342,10 @@ class UfMStarConfig(Checked):
     def entries(self) -> int:
         """Regressed quantities per Gaussian beside m: ``features``, and with ``variances_in_h`` A, E and 1."""
         return self.features + 3 * self.variances_in_h
+
+    def merges_on(self, device_type: str) -> bool:
+        """True if components are merged on a ``torch.device.type``."""
+        return self.merge is not None and (device_type == "cpu" or self.merge.accelerators)
 
     def within(self, max_depth: float | None, states_confidence: bool = False) -> UfMStarConfig:
         """The settings for a network that states its largest depth [m], for ``segment.max_depth``, or a confidence, for

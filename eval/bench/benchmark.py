@@ -141,9 +141,9 @@ def _lines(result: Mapping[str, Any]) -> list[str]:
             lines.append(f"stages of {row['row']}: " + ", ".join(f"{n} {t['median_ms']:.2f}" for n, t in stages))
         if (sample := row["sample"]) is not None:
             times, ratio = sample["latency"], sample["ratio_to_step"]["median"]
-            further = row["stages"]["beside_the_paper"]["median"]
+            share = row["stages"]["beyond_the_paper"]["median"]
             lines.append(f"mean over 1,000 pixels {times['median_ms']:.2f} ms, x step {ratio:.3f}; ")
-            lines[-1] += f"check and average, which the paper does not have, x step {further:.3f}"
+            lines[-1] += f"check and average, which the paper does not have, x step {share:.3f}"
     for line in result["streams"]:
         forms = (f"{name} {line[name]['median_ms']:.2f} ms" for name in ("step", "graph") if name in line)
         lines.append(f"{line['streams']} streams at once: {', '.join(forms)}")

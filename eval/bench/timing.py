@@ -103,5 +103,5 @@ class StagedStep:
         return {
             "stages": {name: spread(times[warm_up:]) for name, times in self.stages.items()},
             "stages_total": spread(np.sum(list(self.stages.values()), axis=0)[warm_up:]),
-            "beside_the_paper": paired_ratio(*(times[warm_up:].tolist() for times in self._shares())),
+            "beyond_the_paper": paired_ratio(*(times[warm_up:].tolist() for times in self._shares())),
         }

@@ -5,7 +5,8 @@ from __future__ import annotations
 import sys
 
 from ufmstar_torch.eval.bench.settings import BenchSettings
-from ufmstar_torch.eval.commands.options import reader, usage_errors
+from ufmstar_torch.eval.commands.errors import usage_errors
+from ufmstar_torch.eval.commands.options import reader
 
 read = reader(BenchSettings, "ufmstar bench")
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
+from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import OpeningOptions
-from ufmstar_torch.eval.commands.options import Flag, Positional, reader, usage_errors
+from ufmstar_torch.eval.commands.options import Flag, Positional, reader
 
 # With one of these options the path is one sequence, whatever is below its folder.
 _OF_ONE = ("trajectory", "images", "drive")

@@ -12,7 +12,8 @@ from typing import Any
 
 from ufmstar_torch import models
 from ufmstar_torch.eval.commands import evaluate
-from ufmstar_torch.eval.commands.options import File, Flag, MachineOptions, as_dict, reader, require_least, usage_errors
+from ufmstar_torch.eval.commands.errors import usage_errors
+from ufmstar_torch.eval.commands.options import File, Flag, MachineOptions, as_dict, reader, require_least
 from ufmstar_torch.eval.commands.terminal import Bars
 
 _WEIGHTS = ("weights", "demo.safetensors")

@@ -5,8 +5,9 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import OpeningOptions
 from ufmstar_torch.eval.commands.options import (
     Count,
@@ -18,17 +19,16 @@ from ufmstar_torch.eval.commands.options import (
     joined,
     reader,
     require_least,
-    usage_errors,
 )
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.methods.method import NETWORKS, UFM_STAR
 from ufmstar_torch.eval.methods.setting import DEFAULTS, started
 from ufmstar_torch.eval.methods.suite import listing, suite_named
 from ufmstar_torch.eval.sequences.frame import parse_slice
-from ufmstar_torch.eval.suite.job import EvalJob, require_methods, with_recalibrations
-from ufmstar_torch.eval.suite.record import ResultsError
-from ufmstar_torch.eval.suite.tasks import EvalOutcome
-from ufmstar_torch.eval.suite.work_items import find_work, read_names
+
+if TYPE_CHECKING:
+    from ufmstar_torch.eval.suite.job import EvalJob
+    from ufmstar_torch.eval.suite.tasks import EvalOutcome
 
 # Options that are fields of a job with the same name.
 _OF_JOB = ("device", "bins", "examples", "samples", "runtime", "precision")
@@ -178,7 +178,8 @@ def job_from(options: EvalOptions) -> EvalJob:
     """The job of the options. Opens no sequence. Raises FileNotFoundError, ValueError: a file does not exist, options
     contradict each other, a base is named twice, no row has a network, or there is no sequence."""
     from ufmstar_torch.eval.engine.load import NetworkChoice
-    from ufmstar_torch.eval.suite.job import EvalJob
+    from ufmstar_torch.eval.suite.job import EvalJob, require_methods, with_recalibrations
+    from ufmstar_torch.eval.suite.work_items import find_work, read_names
 
     what, data, output, values = options.what, options.data, options.output, as_dict(options)
     suite = with_recalibrations(suite_named(str(what.suite), what.base, what.ufm_preset), joined(what.recalibration))
@@ -213,10 +214,9 @@ def job_from(options: EvalOptions) -> EvalJob:
 
 def _evaluate(options: EvalOptions) -> int:
     from ufmstar_torch.eval.engine.warm_up import warm_up_command
-    from ufmstar_torch.eval.suite.tasks import evaluate_suite
+    from ufmstar_torch.eval.suite.tasks import evaluate_suite, executor_of
 
     how: dict[str, Any] = {"resume": options.output.resume, "overwrite": options.output.overwrite}
-    how |= {"processes": options.processes, "scheduler": options.scheduler, "threads": options.threads}
     with Bars() as bars, stop_signals(bars.say) as stop:
         job = job_from(options)
         for base in job.unused:
@@ -228,7 +228,8 @@ def _evaluate(options: EvalOptions) -> int:
             warm_up_command(config, bars.show, anchors)
         if sys.stderr.isatty():
             how["progress"] = bars.show
-        outcome = evaluate_suite(job, **how, stop=stop, report=bars.say)
+        with executor_of(options.processes, options.scheduler, job.device) as executor:
+            outcome = evaluate_suite(job, executor, threads=options.threads, **how, stop=stop, report=bars.say)
     return _report(job, outcome, options)
 
 
@@ -237,6 +238,7 @@ def _report(job: EvalJob, outcome: EvalOutcome, options: EvalOptions) -> int:
     from ufmstar_torch.eval.report.data import load_results
     from ufmstar_torch.eval.report.text import summary, written
     from ufmstar_torch.eval.report.write import write_report
+    from ufmstar_torch.eval.suite.record import ResultsError
 
     try:
         print(summary(load_results(job.out, with_sums=False)))

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import OpeningOptions
-from ufmstar_torch.eval.commands.options import Positional, Text, reader, require_positive, usage_errors
+from ufmstar_torch.eval.commands.options import Positional, Text, reader, require_positive
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,6 +14,7 @@ from time import monotonic
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from ufmstar_torch.eval.commands.depth import NetworkOptions, PosteriorOptions
+from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import OpeningOptions
 from ufmstar_torch.eval.commands.options import (
     File,
@@ -23,7 +24,6 @@ from ufmstar_torch.eval.commands.options import (
     reader,
     require_least,
     require_positive,
-    usage_errors,
 )
 from ufmstar_torch.eval.commands.terminal import Bars
 from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics

@@ -15,7 +15,7 @@ import re
 import tomllib
 from argparse import ArgumentError, ArgumentParser
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stderr, suppress
+from contextlib import redirect_stderr, suppress
 from dataclasses import dataclass, fields, is_dataclass
 from io import StringIO
 from pathlib import Path
@@ -44,19 +44,6 @@ Number = Annotated[float | None, arg(metavar="X", **_plain)]
 Texts = Annotated[tuple[str, ...], arg(metavar="TEXT...", **_plain)]
 Repeated = Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="TEXT", **_plain)]  # one text each time
 Words = Annotated[UseAppendAction[tuple[tuple[str, ...], ...]], arg(metavar="TEXT...", **_plain)]  # or several
-
-
-class UsageError(Exception):
-    """A mistake of the user; the message is one line with the reason."""
-
-
-@contextmanager
-def usage_errors(*kinds: type[Exception]) -> Iterator[None]:
-    """Convert errors of these kinds to :class:`UsageError`."""
-    try:
-        yield
-    except kinds as error:
-        raise UsageError(error) from error
 
 
 @dataclass(frozen=True, kw_only=True)

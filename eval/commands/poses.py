@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-from ufmstar_torch.eval.commands.options import Count, Flag, Number, Positional, Text, Texts, reader, usage_errors
+from ufmstar_torch.eval.commands.errors import usage_errors
+from ufmstar_torch.eval.commands.options import Count, Flag, Number, Positional, Text, Texts, reader
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.sequences.frame import parse_slice
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics, read_intrinsics

@@ -5,24 +5,17 @@ from __future__ import annotations
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.depth import OWN_DEPTH
-from ufmstar_torch.eval.commands.options import Count, Flag, Positional, Texts, reader, require_least, usage_errors
+from ufmstar_torch.eval.commands.errors import usage_errors
+from ufmstar_torch.eval.commands.options import Count, Flag, Positional, Texts, reader, require_least
 from ufmstar_torch.eval.commands.run import StreamOptions, job_from
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-from ufmstar_torch.eval.engine.progress import frame_progress
-from ufmstar_torch.eval.engine.stream import Stopped, frame_results
-from ufmstar_torch.eval.run.depth_check import DepthCheck
-from ufmstar_torch.eval.run.files import write_bytes_atomic, write_json_atomic
-from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
-from ufmstar_torch.eval.run.machine import share_threads
-from ufmstar_torch.eval.run.panels import contact_sheet
-from ufmstar_torch.eval.run.pictures import SHEET
-from ufmstar_torch.eval.run.rank import ImageScores, require_part
-from ufmstar_torch.eval.run.run import warm_up_job
-from ufmstar_torch.frames.warnings import LOGGER
+
+if TYPE_CHECKING:
+    from ufmstar_torch.eval.run.rank import ImageScores
 
 SCORES, SETTINGS = "scores.csv", "rank.json"
 _SHOWN = 10  # lines of the printed table
@@ -78,6 +71,9 @@ read = reader(RankOptions, "ufmstar rank")
 
 def main(options: RankOptions) -> int:
     """Score the sequences, and write table and pictures; the exit code."""
+    from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
+    from ufmstar_torch.eval.run.machine import share_threads
+    from ufmstar_torch.eval.run.pictures import SHEET
 
     if options.threads is None:
         share_threads()
@@ -91,7 +87,12 @@ def main(options: RankOptions) -> int:
 
 def _scores(options: RankOptions) -> ImageScores:
     """Stream the sequences."""
-    from ufmstar_torch.eval.run.rank import ImageScores
+    from ufmstar_torch.eval.engine.progress import frame_progress
+    from ufmstar_torch.eval.engine.stream import Stopped, frame_results
+    from ufmstar_torch.eval.run.depth_check import DepthCheck
+    from ufmstar_torch.eval.run.rank import ImageScores, require_part
+    from ufmstar_torch.eval.run.run import warm_up_job
+    from ufmstar_torch.frames.warnings import LOGGER
 
     scores, source = ImageScores(options.by, options.measured), None
     with Bars() as bars, stop_signals(bars.say) as stop:
@@ -125,6 +126,9 @@ def _write(options: RankOptions, scores: ImageScores) -> int:
 
     from ufmstar_torch.eval.report.table import csv_text
     from ufmstar_torch.eval.report.text import aligned
+    from ufmstar_torch.eval.run.files import write_bytes_atomic, write_json_atomic
+    from ufmstar_torch.eval.run.panels import contact_sheet
+    from ufmstar_torch.eval.run.pictures import SHEET
 
     out, chosen = Path(options.out), scores.chosen(options.count, diverse=options.diverse)
     rest = sorted(set(range(len(scores.images))) - set(chosen))

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from ufmstar_torch.eval.commands.options import Flag, Positional, reader, usage_errors
+from ufmstar_torch.eval.commands.errors import usage_errors
+from ufmstar_torch.eval.commands.options import Flag, Positional, reader
 
 
 @dataclass(frozen=True, kw_only=True)

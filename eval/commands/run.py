@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.depth import SECTIONS, MapOptions, NetworkOptions, PosteriorOptions, UfMOptions
+from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import OpeningOptions
-from ufmstar_torch.eval.commands.options import Flag, MachineOptions, Positional, Text, as_dict, reader, usage_errors
+from ufmstar_torch.eval.commands.options import Flag, MachineOptions, Positional, Text, as_dict, reader
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_slice
 
@@ -66,7 +67,7 @@ class RunOptions(StreamOptions):
 
     Attributes:
         sequence: The folder of the sequence, or a video file, or tour:SEED for rendered rooms.
-        out: Write everything to this folder.
+        out: Write everything to this folder; after an interruption, the same command computes the rest.
         overwrite: Replace another run in --out; the predictions in its cache are kept.
         no_video: Leave preview.mp4 out.
         no_sheet: Leave contact_sheet.png out.

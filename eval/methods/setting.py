@@ -169,9 +169,9 @@ def default_of(name: str, preset: str = DEFAULTS) -> Any:
     """
     if name in _OWN:
         return getattr(DEFAULT, name)
-    # The row's ``anchors`` and ``posterior`` switch their sections on; merging is off by default.
+    # The row's ``anchors`` and ``posterior`` switch their sections on; the paper's preset switches merging off.
     on = started(preset, anchors=True, posterior=True).replace(confidence=ConfidenceConfig())
-    off = dict.fromkeys(flat(MergeConfig().to_dict(), "merge."))
+    off = dict.fromkeys(flat(MergeConfig().to_dict(), "merge.")) if on.merge is None else {}
     values = flat(on.to_dict()) | off
     if inner := [other for other in values if other.startswith(f"{name}.")]:
         raise ValueError(f"setting {name!r} is a group: name one of its values, as {inner[0]}")

@@ -85,7 +85,7 @@ def run_table(summary: Mapping[str, Any]) -> str:
 
 def _unmeasured_line(summary: Mapping[str, Any]) -> str:
     """The share of pixels without two views to compare, and what UfM* assumes there."""
-    ufm = summary["settings"].get("ufm", {})
+    ufm = summary["settings"].get("set", {})
     assumed = {
         "relative": f"is assumed, {ufm.get('unmeasured_relative', math.nan):.0%} of the depth",
         "paper": "is assumed to be 0, as in the paper",

@@ -11,19 +11,23 @@ from typing import Any
 # Distributions by their name in a report.
 _PACKAGES = {"ufmstar_torch": "ufmstar-torch", "torch": "torch", "numba": "numba", "numpy": "numpy"}
 _PACKAGES |= {"torchvision": "torchvision", "llvmlite": "llvmlite", "onnxruntime": "onnxruntime"}
+# Distributions that only a report of a problem names.
+_FURTHER = ("opencv-python-headless", "transformers", "safetensors", "lightning", "pycolmap", "rosbags", "rerun-sdk")
 # Environment variables that change the time of parallel loops, especially under other load.
 _ENVIRONMENT = ("OMP_NUM_THREADS", "OMP_WAIT_POLICY", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "NUMBA_THREADING_LAYER")
 
 
 def versions() -> dict[str, str | None]:
     """Versions of the packages on which results depend, and of Python; None = not installed."""
-    installed: dict[str, str | None] = {}
-    for name, distribution in _PACKAGES.items():
-        try:
-            installed[name] = version(distribution)
-        except PackageNotFoundError:
-            installed[name] = None
+    installed = {name: _installed(distribution) for name, distribution in _PACKAGES.items()}
     return {**installed, "python": platform.python_version()}
+
+
+def _installed(distribution: str) -> str | None:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return None
 
 
 def hardware() -> dict[str, Any]:
@@ -34,6 +38,24 @@ def hardware() -> dict[str, Any]:
         "machine": platform.machine(),
         "platform": platform.platform(),
         "environment": {name: os.environ.get(name) for name in _ENVIRONMENT},
+    }
+
+
+def system() -> dict[str, str]:
+    """Versions and hardware in words, for a report of a problem; no names of files or users."""
+    import torch
+
+    packages = {**versions(), **{name: _installed(name) for name in _FURTHER}}
+    gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else None
+    return {
+        **{name: value or "not installed" for name, value in packages.items()},
+        "system": platform.platform(),
+        "processor": f"{cpu_model()}, {available_cores()} cores",
+        "memory": "unknown" if memory is None else f"{memory / 2**30:.0f} GiB",
+        "GPU": f"{', '.join(gpus)} (CUDA {torch.version.cuda})" if gpus else "none that torch can use",
+        "vectors": torch.backends.cpu.get_cpu_capability(),
+        **{name: value for name, value in hardware()["environment"].items() if value is not None},
     }
 
 

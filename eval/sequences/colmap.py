@@ -23,7 +23,7 @@ from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_image, pair_depth
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.generic import depth_folder, listed_times
-from ufmstar_torch.eval.sequences.images import depth_loader, listed_path, natural_key
+from ufmstar_torch.eval.sequences.images import depth_loader, listed_file, listed_path, natural_key
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.poses import numbered_lines, poses_from_columns
@@ -78,7 +78,7 @@ def read(path: Path, options: Options) -> FrameSequence:
         lenses[name] = cameras[view.camera]
         load_depth = depth_loader(depth_of.get(name), options.truth_scale)
         time = None if times is None else float(times[number])
-        frames.append(frame_of_image(name, folder / view.name, load_depth, _pose(view, model), time))
+        frames.append(frame_of_image(name, listed_file(folder, view.name), load_depth, _pose(view, model), time))
     metric = _metric(root) and model == root / MODELS / "0"
     return assemble("colmap", path, frames, lenses, options, metric=metric)
 

@@ -19,7 +19,7 @@ import numpy as np
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_image
 from ufmstar_torch.eval.sequences.frame import FrameSequence, Size
-from ufmstar_torch.eval.sequences.images import first_image_size, listed_path
+from ufmstar_torch.eval.sequences.images import first_image_size, listed_file
 from ufmstar_torch.eval.sequences.lens import FISHEYE, Lens
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import csv_rows, number, read_matrix, trajectory_of
@@ -45,7 +45,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     assert folder is not None
     images, frames = [], []
     for words, where in csv_rows(folder / "data.csv"):
-        images.append(folder / "data" / listed_path(words[1] if len(words) > 1 else f"{words[0]}.png"))
+        images.append(listed_file(folder / "data", words[1] if len(words) > 1 else f"{words[0]}.png"))
         time = number(words[0], where) * _NANOSECOND
         frames.append(frame_of_image(images[-1].stem, images[-1], timestamp=time))
     lens = _lens(folder / "sensor.yaml", first_image_size(images))

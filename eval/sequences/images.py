@@ -33,6 +33,7 @@ _BROKEN_IMAGE = (OSError, SyntaxError, ValueError, EOFError, Image.Decompression
 SCALE_KEY = "depth_scale"
 # Bit depth, colour type, compression, filter and interlacing, from a PNG's header.
 _SIGNATURE, _RGB = b"\x89PNG\r\n\x1a\n", bytes((8, 2, 0, 0, 0))
+_ELSEWHERE = re.compile(r"[A-Za-z]:|file:")  # a drive of Windows, a scheme
 _MILLIMETRE = 1e-3
 # Largest values of images of 8, 10, 12, 14 and 16 bits, which are all stored in 16 bits.
 _FULL_SCALES = (255, 1023, 4095, 16383, 65535)
@@ -173,6 +174,20 @@ def is_sidecar(path: Path) -> bool:
 def listed_path(text: str) -> Path:
     """The path that a text file states, also if a program on Windows wrote it with backslashes."""
     return Path(text.replace("\\", "/"))
+
+
+def listed_file(folder: Path, text: str | Path) -> Path:
+    """The file below ``folder`` that a text file names; it need not exist.
+
+    A path outside of the folder is never used. Where another computer's path is listed (absolute, with a drive or a
+    scheme, or with ".."), the longest end of it that is a file below the folder counts.
+    """
+    path = listed_path(str(text))
+    parts = [part for part in path.parts if part not in ("/", "//", "..") and not _ELSEWHERE.fullmatch(part)]
+    if len(parts) == len(path.parts):
+        return folder / path
+    ends = (folder.joinpath(*parts[start:]) for start in range(len(parts)))
+    return next((end for end in ends if end.is_file()), folder.joinpath(*parts[-1:]))
 
 
 def natural_key(path: Path) -> list[tuple[int, int, str]]:

@@ -27,6 +27,7 @@ from ufmstar_torch.eval.sequences.images import (
     depth_loader,
     image_size,
     is_sidecar,
+    listed_file,
     listed_path,
     read_color,
 )
@@ -78,7 +79,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     short = len({image.stem for image in paths}) == len(paths)
     for frame, image in zip(frames, paths, strict=True):
         name = image.stem if short else str(image.with_suffix("")).strip("/").replace("/", "__")
-        whole = file.parent / image  # may lack the suffix, as in NeRF's synthetic scenes
+        whole = listed_file(file.parent, image)  # may lack the suffix, as in NeRF's synthetic scenes
         candidates = (whole, *(whole.with_name(whole.name + suffix) for suffix in IMAGE_SUFFIXES))
         image_file = next((path for path in candidates if path.is_file()), None)
         if image_file is None:
@@ -90,7 +91,7 @@ def read(path: Path, options: Options) -> FrameSequence:
             entries.append(Skipped(name, "the image's header cannot be read"))
             continue
         depth = None if _SIGMA in frame else frame.get("depth_file_path")
-        load_depth = depth_loader(file.parent / listed_path(depth), scale, scale) if isinstance(depth, str) else None
+        load_depth = depth_loader(listed_file(file.parent, depth), scale, scale) if isinstance(depth, str) else None
         entries.append(Entry(name, _pose(frame, offset, file), partial(read_color, image_file), load_depth))
     if any(_SIGMA in frame for frame in frames):
         LOGGER.warning("%s: no ground truth: its depth is a prediction, with a sigma beside it", file)

@@ -15,7 +15,7 @@ import numpy as np
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_image
 from ufmstar_torch.eval.sequences.frame import FrameSequence
-from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size, listed_path
+from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size, listed_file, listed_path
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, with_camera_files
 from ufmstar_torch.eval.sequences.poses import associate, numbered_lines, read_trajectory
@@ -46,11 +46,11 @@ def read(path: Path, options: Options) -> FrameSequence:
     depth_files = _paired_depth(path, times, options.max_time_difference)
     loaders = [depth_loader(depth_files.get(i), options.truth_scale, SCALE) for i in range(len(files))]
     frames = [
-        frame_of_image(Path(file).stem, path / file, load_depth, timestamp=float(time))
+        frame_of_image(Path(file).stem, listed_file(path, file), load_depth, timestamp=float(time))
         for file, load_depth, time in zip(files, loaders, times, strict=True)
     ]
     lens = _LENSES[_robot(path)] if options.intrinsics is None else None
-    size = first_image_size(path / file for file in files) or _NATIVE_SIZE
+    size = first_image_size(listed_file(path, file) for file in files) or _NATIVE_SIZE
     read_poses = partial(read_trajectory, path / "groundtruth.txt")
     return assemble("tum", path, frames, lens, options, size=size, read_poses=read_poses)
 
@@ -77,7 +77,8 @@ def _paired_depth(path: Path, color_times: np.ndarray, max_difference: float) ->
         return {}
     depth_times, depth_files = read_file_list(path / "depth.txt")
     pairs = associate(color_times, depth_times, max_difference)
-    return {i: path / depth_files[j] for i, j in pairs.items() if (path / depth_files[j]).is_file()}
+    found = {i: listed_file(path, depth_files[j]) for i, j in pairs.items()}
+    return {i: file for i, file in found.items() if file.is_file()}
 
 
 def _robot(path: Path) -> str:

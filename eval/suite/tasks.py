@@ -15,9 +15,10 @@ import signal
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, ProcessPoolExecutor, wait
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from threading import Thread
+from pathlib import Path
+from threading import Lock, Thread
 from typing import Any
 
 import torch
@@ -51,9 +52,8 @@ class EvalOutcome:
 
 def evaluate_suite(
     job: EvalJob,
+    executor: Executor | None = None,
     *,
-    processes: int = 1,
-    scheduler: str | None = None,
     threads: int | None = None,
     resume: bool = False,
     overwrite: bool = False,
@@ -65,10 +65,10 @@ def evaluate_suite(
 
     Args:
         job: the evaluation.
-        processes: number of processes on this computer.
-        scheduler: address of a Dask scheduler, "tcp://HOST:8786", whose workers evaluate the sequences instead. They
-            need this package, and all files under the paths that they have here.
-        threads: CPU threads of each process; None = all cores divided among the processes, on a cluster its own choice.
+        executor: of the sequences, such as :func:`process_pool` or :func:`dask_cluster`; None = this process. Its
+            processes need this package, and all files and the working folder under the paths that they have here.
+            Each evaluates one sequence at a time, whatever its number of threads.
+        threads: CPU threads of each process of the executor; None = its own choice.
         resume, overwrite: see ``evaluation_folder``.
         stop: called before every frame; True ends the work.
         report: receives a line for every finished sequence.
@@ -77,22 +77,16 @@ def evaluate_suite(
 
     Raises:
         FolderError, FileNotFoundError, ValueError, ImportError: the work cannot begin.
-        CacheError, OSError: a file cannot be written; or the scheduler does not answer.
+        CacheError, OSError: a file cannot be written.
         RuntimeError: the task of a sequence failed; the message names it.
     """
-    here = processes == 1 and scheduler is None
-    device = torch.device(device_of(job.device, 0) if here else "cpu")
+    device = torch.device(device_of(job.device, 0) if executor is None else "cpu")
     networks, folder = job.load(device), job.folder
     with evaluation_folder(job.out, job.about(networks), resume=resume, overwrite=overwrite), warned_once():
-        if here:
+        if executor is None:
             finished = _one_by_one(job, job.judge(networks, device), stop, report, progress)
-        elif scheduler is None:
-            threads = threads or max(1, available_cores() // processes)
-            with process_pool(processes, job.device) as executor:
-                finished = _on_executor(executor, job, threads, stop, report, progress)
         else:
-            with dask_cluster(scheduler) as executor:
-                finished = _on_executor(executor, job, threads, stop, report, progress)
+            finished = _on_executor(executor, job, threads, stop, report, progress)
     failed, labels = folder.failures(), {(item.dataset, item.sequence): item.label for item in job.items}
     return EvalOutcome(finished, stop(), {labels[where]: failed[where] for where in labels.keys() & failed})
 
@@ -111,22 +105,37 @@ def _one_by_one(job: EvalJob, judge: Judge, stop: Stop, report: Report, progress
 
 
 @contextmanager
-def process_pool(count: int, device: str) -> Iterator[Executor]:
-    """Processes of this computer. For "cuda", each uses the next GPU in turn; all end with this process."""
+def executor_of(processes: int, scheduler: str | None, device: str) -> Iterator[Executor | None]:
+    """The executor of a command's options; None for one process, this one. Raises as :func:`dask_cluster`."""
+    if scheduler is not None:
+        with dask_cluster(scheduler) as cluster:
+            yield cluster
+    elif processes > 1:
+        with process_pool(processes, device) as pool:
+            yield pool
+    else:
+        yield None
+
+
+@contextmanager
+def process_pool(count: int, device: str = "cpu") -> Iterator[Executor]:
+    """Processes of this computer, which divide its cores, and the GPUs of "cuda"; they end with this process."""
     method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
     context = multiprocessing.get_context(method)
     context.set_forkserver_preload([__name__])
     numbers = context.SimpleQueue()
     for number in range(count):
         numbers.put(number)
-    with ProcessPoolExecutor(count, context, _begin, (numbers, device)) as pool:
+    threads = max(1, available_cores() // count)
+    with ProcessPoolExecutor(count, context, _begin, (numbers, device, threads)) as pool:
         yield pool
 
 
-def _begin(numbers: Any, device: str) -> None:
+def _begin(numbers: Any, device: str, threads: int) -> None:
     """Prepare a process of the pool."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal also signals the parent, which stops the tasks
     Thread(target=_end_with_parent, daemon=True).start()
+    torch.set_num_threads(threads)
     if device == "cuda":
         torch.cuda.set_device(device_of(device, numbers.get()))
 
@@ -140,8 +149,8 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def dask_cluster(address: str) -> Iterator[Executor]:
-    """The workers of a Dask scheduler. Raises ModuleNotFoundError: Dask is not installed; OSError: no scheduler
-    answers."""
+    """The workers of the Dask scheduler at "tcp://HOST:8786". Raises ModuleNotFoundError: Dask is not installed;
+    OSError: no scheduler answers."""
     distributed = optional("distributed", "--scheduler needs Dask", "'ufmstar-torch[cluster]'")
     with distributed.Client(address, timeout=_CONNECT_SECONDS, set_as_default=False) as client:
         yield client.get_executor(pure=False)
@@ -160,8 +169,8 @@ def _on_executor(
 ) -> bool:
     """Evaluate the sequences on an executor, a task each. Returns True if all tasks ended. Raises RuntimeError: a task
     failed; the others end after their current frame."""
-    folder, total = job.folder, len(job.items)
-    stop_file, content = job.out / STOP, pickle.dumps((job, threads))
+    folder, total, stop_file = job.folder, len(job.items), job.out.absolute() / STOP
+    content = pickle.dumps((replace(job, out=job.out.absolute()), threads, Path.cwd()))
     stop_file.unlink(missing_ok=True)  # of a process that was killed
     running = {executor.submit(evaluate_task, content, item): item for item in job.items}
     lost, failure = False, None
@@ -192,25 +201,33 @@ def _on_executor(
 
 
 def evaluate_task(content: bytes, item: WorkItem) -> str:
-    """Evaluate a sequence in a process of an executor; ``content`` is the pickled job and its number of threads, or
-    None. Returns and raises as ``evaluate_item``."""
-    job, threads = pickle.loads(content)
+    """Evaluate a sequence in a process of an executor. Returns and raises as ``evaluate_item``.
+
+    Args:
+        content: the pickled job, with an absolute output folder, its number of threads (None = unchanged), and the
+            folder to which other paths are relative.
+        item: the sequence.
+    """
+    job, threads, folder = pickle.loads(content)
     stop_file = job.out / STOP
     if stop_file.exists():
         raise Stopped
     if threads is not None:
         torch.set_num_threads(threads)
-    return evaluate_item(job, item, _judge(content), stop=stop_file.exists)
+    judge, lock = _judge(content)
+    with lock:
+        os.chdir(folder)
+        return evaluate_item(job, item, judge, stop=stop_file.exists)
 
 
 @lru_cache(maxsize=1)
-def _judge(content: bytes) -> Judge:
-    """The judge of a pickled job, loaded once in every process."""
-    job, _ = pickle.loads(content)
+def _judge(content: bytes) -> tuple[Judge, Lock]:
+    """The judge of a pickled job, loaded once in every process, and the lock of the thread that uses it."""
+    job, _, folder = pickle.loads(content)
+    os.chdir(folder)
     logging.getLogger("ufmstar_torch").addFilter(_once())
     device = torch.device(job.device)
-    judge: Judge = job.judge(job.load(device), device)
-    return judge
+    return job.judge(job.load(device), device), Lock()
 
 
 def _once() -> Callable[[logging.LogRecord], bool]:

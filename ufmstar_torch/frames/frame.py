@@ -233,8 +233,8 @@ def check_frame(
     if variances_in_h:
         if a is None and e is None:
             raise ValueError("aleatoric or epistemic must be given with config.variances_in_h, which averages them")
-        variances = [torch.zeros_like(plain) if value is None else _constant(value) for value in (a, e)]
-        in_h = torch.stack([*variances, torch.ones_like(plain)], 1)
+        averaged = (torch.zeros_like(plain) if value is None else _constant(value) for value in (a, e))
+        in_h = torch.stack([*averaged, torch.ones_like(plain)], 1)
         extra = in_h if extra is None else torch.cat([extra, in_h], 1)
     T, K = _of_depth("pose", as_pose(pose), plain), _of_depth("intrinsics", as_intrinsics(intrinsics), plain)
     mask = None

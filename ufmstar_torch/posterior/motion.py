@@ -88,13 +88,17 @@ def probability(
 @fast
 def _mean_around(value, log_depth, out):
     rows, cols = value.shape
+    window = np.empty((2 * _HALF + 1, 2 * _HALF + 1))
+    for i in range(-_HALF, _HALF + 1):
+        for j in range(-_HALF, _HALF + 1):
+            window[i + _HALF, j + _HALF] = math.exp(-(i * i + j * j) / (2 * _SIGMA * _SIGMA))
     for r in range(rows):
         for c in range(cols):
             total = weights = 0.0
             for i in range(max(r - _HALF, 0), min(r + _HALF + 1, rows)):
                 for j in range(max(c - _HALF, 0), min(c + _HALF + 1, cols)):
                     jump = (log_depth[i, j] - log_depth[r, c]) / _CONTRAST
-                    w = math.exp(-((i - r) ** 2 + (j - c) ** 2) / (2 * _SIGMA * _SIGMA)) / (1 + jump * jump)
+                    w = window[i - r + _HALF, j - c + _HALF] / (1 + jump * jump)
                     total += w * value[i, j]
                     weights += w
             out[r, c] = total / weights

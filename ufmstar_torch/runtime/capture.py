@@ -43,7 +43,7 @@ class Captured:
         *,
         record: Callable[[Callable[[], None]], Callable[[], None]] | None = None,
     ) -> None:
-        _require_fixed(ufm)
+        _require_fixed(ufm, depth.device.type)
         if record is None and depth.device.type != "cuda":
             raise ValueError(f"depth must lie on a CUDA device to be captured, got {depth.device}")
         frame = (depth, pose, intrinsics, aleatoric, epistemic, valid)
@@ -124,7 +124,7 @@ def _shape(value: Tensor | None) -> str:
     return "None" if value is None else str(tuple(value.shape))
 
 
-def _require_fixed(ufm: UfMStar) -> None:
+def _require_fixed(ufm: UfMStar, device_type: str) -> None:
     """Raise a ValueError unless a step has constant shapes and reads nothing from the device."""
     config = ufm.config
     limit = config.max_components
@@ -138,7 +138,7 @@ def _require_fixed(ufm: UfMStar) -> None:
             config.anchors is not None
             or config.overlap_weighted
             or config.regression != "exact"
-            or config.merge is not None
+            or config.merges_on(device_type)
         ),
         "disagreement='w2'": config.disagreement != "w2",
         "no features": bool(config.entries),

@@ -40,10 +40,10 @@ def choice(default: str | int, *others: str | int) -> Any:
     return field(default=default, metadata={"choices": (default, *others)})
 
 
-def section(kind: type[Checked], *, optional: bool = False) -> Any:
-    """A field with nested settings: ``kind()`` by default, or None with ``optional``."""
+def section(kind: type[Checked], *, optional: bool = False, on: bool = True) -> Any:
+    """A field with nested settings: ``kind()`` by default, None unless ``on``; ``optional`` allows None."""
     metadata = {"section": kind, "optional": optional}
-    return field(default=None, metadata=metadata) if optional else field(default_factory=kind, metadata=metadata)
+    return field(default_factory=kind, metadata=metadata) if on else field(default=None, metadata=metadata)
 
 
 class Checked:

@@ -39,12 +39,15 @@ from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.frame import FrameInput
+from ufmstar_torch.gaussians.camera import relative_pose
 from ufmstar_torch.gaussians.fixed_order import total
 from ufmstar_torch.gaussians.gaussian import cholesky3, floor_covariance, inverse_lower3, storage_floor
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.gaussians.state import UfMStarState
 from ufmstar_torch.steps.regress import shares
 
+# Components are merged within this multiple of the frame's largest depth from the camera: those in view, and around.
+_NEAR = 2.0
 # Most pairs, or points x components, evaluated at a time: bounds the temporary memory to some 100 MB.
 _CHUNK = 2**19
 # Cubature points mu +- sqrt(3) L e_i, which have the component's mean and covariance.
@@ -61,14 +64,17 @@ def after_frame(
     state: UfMStarState, frame: FrameInput, config: UfMStarConfig, kernels: MergeKernels | None = None
 ) -> tuple[UfMStarState, dict[str, Tensor]]:
     """Merge the streams that are due after a frame, and count the components."""
-    state = merged(state, frame.fault == 0, config, kernels)
-    alone = state.mixture.valid & (state.views == 0)
-    return state, {"components": state.mixture.components, "single_view": alone.sum(1)}
+    after = merged(state, frame.fault == 0, config, kernels, frame)
+    if after is state:
+        return state, {}
+    mixture = after.mixture
+    return after, {"components": mixture.components, "single_view": (mixture.valid & (mixture.views == 0)).sum(1)}
 
 
 def merged(
-    state: UfMStarState, fine: Tensor, config: UfMStarConfig, kernels: MergeKernels | None = None
-) -> UfMStarState:
+    state: UfMStarState, fine: Tensor, config: UfMStarConfig, kernels: MergeKernels | None = None,
+    frame: FrameInput | None = None,
+) -> UfMStarState:  # fmt: skip
     """The state after a frame, with the streams merged whose frame count is a multiple of ``merge.every``.
 
     Args:
@@ -76,24 +82,32 @@ def merged(
         fine: [B] True where the frame was used.
         config: with ``merge``.
         kernels: as :func:`merge`.
+        frame: components beyond ``_NEAR`` times its largest depth from the camera are left as they are, so that a
+            merging takes as long in a building as in a room; None = all are merged.
 
     Checking which streams are due synchronises with an accelerator.
     """
     assert config.merge is not None
     if state.mean.device.type == "meta":
         return state
-    due = fine & (state.frames % config.merge.every == 0)
-    if not bool(due.any()):
+    frames, every = zip(fine.tolist(), state.frames.tolist(), strict=True), config.merge.every
+    if not any(due := [used and number % every == 0 for used, number in frames]):
         return state
     sums = torch.cat([state.mean.new_zeros(*state.weight.shape, 0), *state.by_component.values()], -1)
-    mixture, sums = merge(state.mixture, sums, due, config, kernels)
+    near = None
+    if frame is not None:
+        centre = relative_pose(frame.T_world_cam, state.T_world_first)[1]
+        distance = (state.mean.double() - centre[:, None]).square().sum(-1).sqrt()
+        near = distance <= _NEAR * frame.depth.amax((1, 2))[:, None]
+    mixture, sums = merge(state.mixture, sums, torch.tensor(due), config, kernels, near)
     parts = sums.split([value.shape[-1] for value in state.by_component.values()], -1) if state.by_component else ()
     return state.with_tensors(mixture.tensors() | dict(zip(state.by_component, parts, strict=True)))
 
 
 def merge(
-    mixture: GaussianMixture, sums: Tensor, due: Tensor, config: UfMStarConfig, kernels: MergeKernels | None = None
-) -> tuple[GaussianMixture, Tensor]:
+    mixture: GaussianMixture, sums: Tensor, due: Tensor, config: UfMStarConfig, kernels: MergeKernels | None = None,
+    near: Tensor | None = None,
+) -> tuple[GaussianMixture, Tensor]:  # fmt: skip
     """Join, then dissolve; the remaining components move up and keep their order.
 
     Args:
@@ -102,6 +116,7 @@ def merge(
         due: [B] True for the streams to merge; the others are unchanged.
         config: ``merge``, which is not None, and ``prior_weight``.
         kernels: implementation of each part; None = the reference.
+        near: [B, K] True for the components to merge, which then follow the others; None = all.
 
     Returns:
         The mixture [B, K] and the sums. Components that neither joined nor received anything are unchanged to the last
@@ -114,11 +129,13 @@ def merge(
     for b in due.nonzero().flatten().tolist():
         n = int(mixture.components[b])
         before = {name: v[b, :n].double() if v.is_floating_point() else v[b, :n] for name, v in every.items()}
-        joined = join(before, config.merge.loss, mixture.covariance.dtype, kernels)
-        reduced = dissolve(joined, config, kernels)
-        for name, value in reduced.items():
+        chosen = torch.ones(n, dtype=torch.bool, device=sums.device) if near is None else near[b, :n]
+        chosen_ones = {name: value[chosen] for name, value in before.items()}
+        joined = join(chosen_ones, config.merge.loss, mixture.covariance.dtype, kernels)
+        for name, value in dissolve(joined, config, kernels).items():
+            retained = torch.cat([before[name][~chosen], value])
             after[name][b] = 0
-            after[name][b, : len(value)] = value.to(after[name].dtype)
+            after[name][b, : len(retained)] = retained.to(after[name].dtype)
     sums = after.pop("sums")
     return GaussianMixture(**after), sums
 

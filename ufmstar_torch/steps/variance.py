@@ -142,7 +142,7 @@ def corrected(
         learnt, posterior, of_posterior = correct(state.by_stream, frame, claimed, config)
         quantiles, state = posterior.pop("quantiles"), state.with_tensors(learnt)
         maps, counts = maps | posterior, counts | of_posterior
-    if config.merge is not None:
+    if config.merges_on(frame.depth.device.type):
         state, merged = merge.after_frame(state, frame, config, merging)
         counts |= merged
     if isinstance(mapped, Recalibration):

@@ -129,7 +129,7 @@ class DeviceStep:
             dropped = out.statistics.dropped + self._lost
             out = replace(out, statistics=replace(out.statistics, dropped=dropped))
         self._waiting, self._last_mean, self._lost = waiting, updated.mean, None
-        return updated if config.merge is None else self.settled(updated, config), out
+        return self.settled(updated, config) if config.merges_on(frame.depth.device.type) else updated, out
 
     def settled(self, state: UfMStarState, config: UfMStarConfig) -> UfMStarState:
         """Append the pending components to the state; synchronises with the device."""
