@@ -41,6 +41,9 @@ class PosteriorConfig(Checked):
         between: initial value of the scale of y over surfaces, beyond the shared scale
         near: standard deviation of the Gaussian window of the local scale
         widest: upper limit of the variance of y
+        farthest: factor between depth and truth beyond which errors do not count in a variance
+        pixel_field, pixel_roughness, pixel_unseen, pixel_steepness: factors on the parts of the variance at a pixel, as
+            pixels do not lie on the texture on which anchors do
         edge_contrast: difference of log d between a node and a pixel at which the node's weight is halved
     """
 
@@ -69,6 +72,11 @@ class PosteriorConfig(Checked):
     between: float = number(0.2, "s_0", "1", 0.0, open_low=True)
     near: float = number(0.05, "r_1", "width", 0.0, open_low=True)
     widest: float = number(2.0, "v_2", "1", 0.0, 4.0, open_low=True)
+    farthest: float = number(6.5, "F", "1", 1.0, 100.0, open_low=True)
+    pixel_field: float = number(0.17, "a_0", "1", 0.0, open_low=True)
+    pixel_roughness: float = number(21.0, "a_1", "1", 0.0, open_low=True)
+    pixel_unseen: float = number(0.55, "a_2", "1", 0.0)
+    pixel_steepness: float = number(2.3, "a_3", "1", 0.0)
     edge_contrast: float = number(0.1, "delta", "1", 0.0, open_low=True)
 
     @property
