@@ -275,9 +275,9 @@ def y_variance(shape, node, y, noise, used, centre):
 
 
 def second_moment(p, variance, offset, wide, unmeasured=0.0):
-    """E[(e^n - 1)^2] for |n| up to log 6.5, n normal, or with the probability p of n - offset; a larger limit before
+    """E[(e^n - 1)^2] for |n| up to log 6, n normal, or with the probability p of n - offset; a larger limit before
     the first anchor."""
-    limit, moments = math.log(6.5) / max(1 - unmeasured, 0.05), []
+    limit, moments = math.log(6) / max(1 - unmeasured, 0.05), []
     for v, o in ((min(variance, 2), 0.0), (wide, min(max(offset, -limit), limit))):
         sigma = math.sqrt(v)
         mass, first, second = (

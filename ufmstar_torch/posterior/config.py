@@ -72,7 +72,7 @@ class PosteriorConfig(Checked):
     between: float = number(0.2, "s_0", "1", 0.0, open_low=True)
     near: float = number(0.05, "r_1", "width", 0.0, open_low=True)
     widest: float = number(2.0, "v_2", "1", 0.0, 4.0, open_low=True)
-    farthest: float = number(6.5, "F", "1", 1.0, 100.0, open_low=True)
+    farthest: float = number(6.0, "F", "1", 1.0, 100.0, open_low=True)
     pixel_field: float = number(0.17, "a_0", "1", 0.0, open_low=True)
     pixel_roughness: float = number(21.0, "a_1", "1", 0.0, open_low=True)
     pixel_unseen: float = number(0.55, "a_2", "1", 0.0)
