@@ -190,20 +190,20 @@ def update(state, depth, claimed, pixel, g, variance, motion=None):
         above = MEMORY * above + (1 - MEMORY) * prior * value + new[name][0]
         after["sums"][name] = [min(max(above, low * below), high * below), below]
     HX = design(X, np.arange(n), n)
-    spread = np.einsum("ij,jk,ik->i", HX, C, HX) + ratio(after, "roughness") + away * ratio(after, "unseen")
-    scale = local_scale(logs.shape, node, z2, noise, np.ones(N, bool))
-    spread = scale * (spread * inlier_factor(after, away) + steepness(logs.shape, mean[FEATURES:]))
+    field, unseen = np.einsum("ij,jk,ik->i", HX, C, HX), away * ratio(after, "unseen")
+    scale, steep = local_scale(logs.shape, node, z2, noise, np.ones(N, bool)), steepness(logs.shape, mean[FEATURES:])
+    unmeasured = min(C[0, 0] / PRIOR[0], 1) ** 2
+    spread = scale * at_pixels(inlier_factor(after, away), field, ratio(after, "roughness"), unseen, steep, unmeasured)
     offset, share = HX[:, 4:] @ mean[4:], away / REACH
     around = y_variance(logs.shape, node, y, noise, np.ones(N, bool), mean[0])
     p = np.minimum(ratio(after, "wrong") * wrong_factor(share, scale), 0.5)
-    wide = [elsewhere(*each) for each in zip(around, away * ratio(after, "unseen"), strict=True)]
-    unmeasured = min(C[0, 0] / PRIOR[0], 1) ** 2
+    wide = [elsewhere(*each) for each in zip(around, unseen, strict=True)]
     p = np.where(p < 0.1, p + unmeasured * (0.1 - p), p)
     wide = [each + unmeasured * (2 - each) for each in wide]
     if motion is not None:
         p = 1 - (1 - p) * (1 - moving(motion, depth.shape, logs, offset, share, ratio(after, "between")))
-    alone = [second_moment(0.0, *each) for each in zip(spread, offset, wide, strict=True)]
-    spread = [second_moment(*each) for each in zip(p, spread, offset, wide, strict=True)]
+    alone = [second_moment(0.0, *each, unmeasured) for each in zip(spread, offset, wide, strict=True)]
+    spread = [second_moment(*each, unmeasured) for each in zip(p, spread, offset, wide, strict=True)]
     posterior, variance, outlier = read(depth, np.nan_to_num(claimed), logs, mean[:4], offset, spread, p, share)
     _, inlier, _ = read(depth, 0 * depth, logs, mean[:4], offset, alone, p, share)
     return after, posterior, variance, inlier, outlier
@@ -274,12 +274,27 @@ def y_variance(shape, node, y, noise, used, centre):
     return out.ravel()
 
 
-def second_moment(p, variance, offset, wide):
-    """E[(e^n - 1)^2], n normal, or with the probability p of n - offset; e^-offset at most 100."""
-    moments = []
-    for v, q in ((min(variance, 2), 1), (wide, min(math.exp(-offset), 100))):
-        moments.append(q * q * math.exp(2 * v) - 2 * q * math.exp(v / 2) + 1)
+def second_moment(p, variance, offset, wide, unmeasured=0.0):
+    """E[(e^n - 1)^2] for |n| up to log 6, n normal, or with the probability p of n - offset; a larger limit before
+    the first anchor."""
+    limit, moments = math.log(6) / max(1 - unmeasured, 0.05), []
+    for v, o in ((min(variance, 2), 0.0), (wide, min(max(offset, -limit), limit))):
+        sigma = math.sqrt(v)
+        mass, first, second = (
+            normal_cdf((o + limit) / sigma - k * sigma) - normal_cdf((o - limit) / sigma - k * sigma) for k in range(3)
+        )
+        square = math.exp(2 * v - 2 * o) * second - 2 * math.exp(v / 2 - o) * first + mass
+        moments.append(max(square / mass, 0))
     return (1 - p) * moments[0] + p * moments[1]
+
+
+def normal_cdf(x):
+    return math.erfc(-x / math.sqrt(2)) / 2
+
+
+def at_pixels(factor, field, roughness, unseen, steep, unmeasured=0.0):
+    """Variance of y at pixels, before the local scale."""
+    return factor * ((0.17 + 0.83 * unmeasured) * field + 21 * roughness + 0.55 * unseen) + 2.3 * steep
 
 
 def steepness(shape, f):
@@ -331,8 +346,9 @@ def discs(state, logs, Q, mean0, H, y, weight, noise, z2, node, u, v, measured, 
     final = [second_moment(*each) for each in zip(p, inlier_variance, offset, beyond, strict=True)]
     scores = []
     for i in np.nonzero(held)[0]:
-        at_pixel = factor[i] * (var[i] + ratio(state, "roughness") + away[i] * ratio(state, "unseen"))
-        at_pixel = scale[i] * (at_pixel + measured[i] + steepness(logs.shape, mean[FEATURES:])[node[i]])
+        steep, unseen = steepness(logs.shape, mean[FEATURES:])[node[i]], away[i] * ratio(state, "unseen")
+        at_pixel = at_pixels(factor[i], var[i], ratio(state, "roughness"), unseen, steep)
+        at_pixel = scale[i] * (at_pixel + measured[i])
         total, alone = (second_moment(q, at_pixel, offset[i], beyond[i] + measured[i]) for q in (p[i], 0.0))
         mixture = [(1 - p[i], 1.0, alone), (p[i], 1.0, max((total - (1 - p[i]) * alone) / p[i], alone))]
         scores.append(abs(interval.standard(mixture, math.exp(error[i]))))

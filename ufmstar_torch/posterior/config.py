@@ -69,6 +69,14 @@ class PosteriorConfig(Checked):
     near: ClassVar[float] = 0.05
     # v_2 [1]: upper limit of the variance of y
     widest: ClassVar[float] = 2.0
+    # F [1]: factor between depth and truth beyond which errors do not count in a variance
+    farthest: ClassVar[float] = 6.0
+    # a_0 to a_3 [1]: factors on the parts of the variance at a pixel, as pixels do not lie on the texture on which
+    # anchors do
+    pixel_field: ClassVar[float] = 0.17
+    pixel_roughness: ClassVar[float] = 21.0
+    pixel_unseen: ClassVar[float] = 0.55
+    pixel_steepness: ClassVar[float] = 2.3
     # delta [1]: difference of log d between a node and a pixel at which the node's weight is halved
     edge_contrast: ClassVar[float] = 0.1
     # sigma_b [1]: standard deviation of b's constant before the first anchor

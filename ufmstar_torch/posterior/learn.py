@@ -20,6 +20,7 @@ from ufmstar_torch.posterior.scene import (
     MOST_WRONG,
     LeftOut,
     Scene,
+    at_pixels,
     away_from,
     elsewhere_variance,
     inlier_factor,
@@ -81,7 +82,8 @@ def _of_discs(
     unseen = away * running.ratios["unseen"]
     wide = elsewhere_variance(config, spread_around(scene, rest, b[0])[node], unseen)
     scale, factor = local_scale(scene, left_out, rest)[node], inlier_factor(running, away)
-    inlier_variance = factor * (variance + noise + unseen) + steepness(scene.grid, field.offset)[node]
+    steep = steepness(scene.grid, field.offset)[node]
+    inlier_variance = factor * (variance + noise + unseen) + steep
     inlier_variance, more_wrong = scale * inlier_variance, wrong_factor(config, away, scale)
     p = np.minimum(running.ratios["wrong"] * more_wrong, MOST_WRONG)
     z2 = error**2 / inlier_variance - (error + offset) ** 2 / (noise + wide)
@@ -97,7 +99,7 @@ def _of_discs(
     added = {name: (float(above.sum()), float(below.sum())) for name, (above, below) in sums.items()}
     # At a pixel there is neither an anchor's blur nor its part in ``alone``, only the noise of its measurement.
     measured = scene.stated[held_out] - config.alone / len(scene.stated)
-    at_pixel = factor * (variance + running.ratios["roughness"] + unseen) + steepness(scene.grid, field.offset)[node]
+    at_pixel = at_pixels(config, factor, variance, running.ratios["roughness"], unseen, steep)
     moments = second_moments(config, scale * (at_pixel + measured), p, offset, wide + measured)
     scores = np.stack([score(error, p, *moments), image_weights(away, area, everywhere)])
     return _of_pairs(scene, node, np.stack([error, variance, away, noise]), running) | added, scores

@@ -7,12 +7,15 @@ two nodes differ: across a depth edge, the network may err by another factor.
 from __future__ import annotations
 
 import functools
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch.special import ndtr
 
-from ufmstar_torch.posterior.cells import LARGEST, features, local_variance, ranges
+from ufmstar_torch.posterior.cells import features, local_variance, ranges
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.field import Field, Observed, Prior, at, conditioned, distance
 from ufmstar_torch.posterior.running import Floats, Running
@@ -21,6 +24,10 @@ from ufmstar_torch.posterior.running import Floats, Running
 SIDE = 28
 # Least divisor 1 - w v of a leave-one-out residual: it is 0 for a single anchor.
 LEAST_LEFT = 0.05
+# Least measured share, a divisor.
+LEAST_MEASURED = 0.05
+# Least variance of y whose distribution is computed.
+LEAST_VARIANCE = 1e-12
 # Largest probability that the local correction does not hold.
 MOST_WRONG = 0.5
 
@@ -223,11 +230,16 @@ def wrong_factor(config: PosteriorConfig, away: Floats, scale: Floats) -> Floats
     return factor
 
 
-def misscaled(config: PosteriorConfig, variance: float, p: Floats, wide: Floats) -> tuple[Floats, Floats]:
+def unmeasured(config: PosteriorConfig, variance: float) -> float:
+    """Share in [0, 1] of the prior that is left: the squared share of the ``variance`` of b's constant in that before
+    the first anchor."""
+    return min(variance / config.prior_sigma**2, 1.0) ** 2
+
+
+def misscaled(config: PosteriorConfig, share: float, p: Floats, wide: Floats) -> tuple[Floats, Floats]:
     """The probabilities [n] of another surface and the variances [n] of y there, raised towards ``misscaled`` and
-    ``widest`` by the squared share of the ``variance`` of b's constant in that before the first anchor."""
-    unmeasured = min(variance / config.prior_sigma**2, 1.0) ** 2
-    return p + unmeasured * np.maximum(config.misscaled - p, 0), wide + unmeasured * (config.widest - wide)
+    ``widest`` by the ``share`` that is ``unmeasured``."""
+    return p + share * np.maximum(config.misscaled - p, 0), wide + share * (config.widest - wide)
 
 
 def inlier_factor(running: Running, away: Floats) -> Floats:
@@ -249,15 +261,38 @@ def elsewhere_variance(config: PosteriorConfig, around: Floats, unseen: Floats) 
     return np.minimum(around + config.elsewhere * unseen, config.widest)
 
 
+def at_pixels(
+    config: PosteriorConfig, factor: Floats, field: Floats, roughness: float, unseen: Floats, steep: Floats,
+    share: float = 0.0,
+) -> Floats:  # fmt: skip
+    """Variance of y at pixels on the evidence's surface, before the local scale: the parts that held-out anchors show,
+    times factors from anchors to pixels. ``factor`` is h; the ``share`` that is ``unmeasured`` of the field's variance
+    has no factor."""
+    of_field = config.pixel_field + (1 - config.pixel_field) * share
+    parts = of_field * field + config.pixel_roughness * roughness + config.pixel_unseen * unseen
+    return factor * parts + config.pixel_steepness * steep
+
+
 def second_moments(
-    config: PosteriorConfig, variance: Floats, p: Floats, offset: Floats, wide: Floats
+    config: PosteriorConfig, variance: Floats, p: Floats, offset: Floats, wide: Floats, share: float = 0.0
 ) -> tuple[Floats, Floats]:  # fmt: skip
     """Variances over the squared depth: in total, and if the local correction holds. With probability ``p`` the local
-    correction ``offset`` does not hold, and y has the variance ``wide`` instead of ``variance``."""
-    inlier_variance, q = np.minimum(variance, config.widest), np.exp(np.minimum(-offset, LARGEST))
-    tail = q * q * np.exp(2 * wide) - 2 * q * np.exp(wide / 2) + 1
-    inlier: Floats = np.exp(2 * inlier_variance) - 2 * np.exp(inlier_variance / 2) + 1
+    correction ``offset`` does not hold, and y has the variance ``wide`` instead of ``variance``. The limit of errors
+    disappears with the ``share`` that is ``unmeasured``."""
+    limit = math.log(config.farthest) / max(1 - share, LEAST_MEASURED)
+    inlier = _second_moment(np.minimum(variance, config.widest), np.zeros_like(variance), limit)
+    tail = _second_moment(wide, np.clip(offset, -limit, limit), limit)
     return (1 - p) * inlier + p * tail, inlier
+
+
+def _second_moment(variance: Floats, offset: Floats, limit: float) -> Floats:
+    """E[(e^n - 1)^2 | |n| <= ``limit``], n ~ N(-offset, variance)."""
+    sigma = np.sqrt(np.maximum(variance, LEAST_VARIANCE))
+    ends = torch.from_numpy(np.stack([offset - limit, offset + limit]) / sigma)
+    mass, first, second = (np.diff(ndtr(ends - k * torch.from_numpy(sigma)).numpy(), axis=0)[0] for k in range(3))
+    q = np.exp(-offset)
+    moment: Floats = q * q * np.exp(2 * variance) * second - 2 * q * np.exp(variance / 2) * first + mass
+    return np.maximum(moment / mass, 0)
 
 
 def away_from(scene: Scene, evidence: NDArray[np.bool_]) -> Floats:

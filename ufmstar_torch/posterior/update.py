@@ -16,22 +16,28 @@ the prediction of the others is Student-t distributed: the factor (nu + z^2)/(nu
 with z from the leave-one-out residual, and the increase is added to n. This suppresses outliers. The difference of f
 across a link is Student-t distributed as well, so that f can jump.
 
-Variance over the squared depth at a node, with v = s (h (the field's variance + roughness + unseen distance) +
-steepness), and share = min(1, distance/reach):
+Variance over the squared depth at a node, with share = min(1, distance/reach):
 
-    max((1 - p) m(v) + p tail, share V/d^2),      m(v) = E[(e^n - 1)^2],  n ~ N(0, v),
+    v = s (h (a_0 the field's variance + a_1 roughness + a_2 unseen distance) + a_3 steepness),
+    max((1 - p) m(v) + p tail, share V/d^2),      m(v) = E[(e^n - 1)^2 | |n| <= log F],  n ~ N(0, v),
     p = wrong s^max(0, 1 - distance/radius),
     h = 1 + (inlier - 1) max(0, 1 - distance/(2 radius)).
 
+- a_0 to a_3 lead from anchors to pixels (``pixel_field`` ...). Anchors lie on texture, often at the edges of surfaces.
+  Between them the field errs less than it states, and neighbouring pixels differ more than neighbouring anchors. The
+  factors are fitted to tours with wrong poses, blur, noise and compressed images, for the sum of the NLL of the normal
+  distribution, that of the mixture, and the log loss of an error below 25 %.
 - s is the local scale, because the network errs more in some regions: the mean leave-one-out z^2 of the anchors in a
   Gaussian window of width ``near``, and of one virtual anchor with z^2 = 1.
 - ``steepness`` is the variance of f over a node and its neighbours: a depth edge may be one node off in f.
-- m exceeds v where v is large, because the error of the depth is log-normal. The output ``inlier`` is m(v).
+- m exceeds v where v is large, because the error of the depth is log-normal. Errors beyond a factor F (``farthest``) do
+  not count: without this limit, errors that never occur would decide the variance. The output ``inlier`` is m(v).
 - p is the probability that the depth is of another surface than its evidence: the output ``outlier``.
 - The ratios include the held-out anchors of this frame.
 
-Before the first anchor the network may be off by any factor: p is raised towards ``misscaled``, and w towards
-``widest``, by the squared share of the variance of b's constant in that before the first anchor.
+Before the first anchor the network may be off by any factor. The squared share of the variance of b's constant in that
+before the first anchor is ``unmeasured``: with it p is raised towards ``misscaled``, w towards ``widest``, a_0 towards
+1, and the limit F disappears.
 
 The distance from evidence is geodesic, in image widths, and differences of log d lengthen it: on tours the variance of
 the error is proportional to it. ``learn`` estimates ``unseen``, ``wrong`` and the other ratios (``running``).
@@ -39,12 +45,12 @@ the error is proportional to it. ``learn`` estimates ``unseen``, ``wrong`` and t
 ``tail`` is the second moment about the posterior depth if the local correction f does not hold, because the evidence is
 wrong or lies on another surface. Then y - b . x is normal with the variance w, and the depth log-normal:
 
-    tail = E[(e^(n - f) - 1)^2] = q^2 e^(2 w) - 2 q e^(w/2) + 1,      q = e^-f <= 100,      n ~ N(0, w),
+    tail = E[(e^(n - f) - 1)^2 | |n - f| <= log F],      n ~ N(0, w),
     w = a + elsewhere unseen distance.
 
 a is the variance of the anchors' y in a Gaussian window: depths differ more between surfaces than within one, and the
 farther the evidence, the more surfaces lie between. v and w are at most ``widest``. Contradictory evidence thus limits
-the certainty of every pixel, and a depth far below the global correction is less certain than one above it.
+the certainty of every pixel.
 
 Anchors that matching has measured are wrong on surfaces that move: p then includes the probability of ``motion``.
 
@@ -77,6 +83,7 @@ from ufmstar_torch.posterior.scene import (
     SIDE,
     AnchorRows,
     Grid,
+    at_pixels,
     away_from,
     elsewhere_variance,
     fitted,
@@ -87,6 +94,7 @@ from ufmstar_torch.posterior.scene import (
     second_moments,
     spread_around,
     steepness,
+    unmeasured,
     wrong_factor,
 )
 
@@ -192,16 +200,18 @@ def _of_stream(
     b, updated = field.coefficients, Running.of(memory, config)
     offset, all_anchors = mean - (x * b).sum(1), np.ones(len(scene.noise), np.bool_)
     unseen = away * updated.ratios["unseen"]
-    variance = inlier_factor(updated, away) * (variance + updated.ratios["roughness"] + unseen)
+    steep = steepness(grid, field.offset)
+    share, factor = unmeasured(config, field.covariance[0, 0]), inlier_factor(updated, away)
+    variance = at_pixels(config, factor, variance, updated.ratios["roughness"], unseen, steep, share)
     wide = elsewhere_variance(config, spread_around(scene, all_anchors, b[0]), unseen)
     scale = local_scale(scene, left_out, all_anchors)
     p = np.minimum(updated.ratios["wrong"] * wrong_factor(config, away, scale), MOST_WRONG)
-    p, wide = misscaled(config, field.covariance[0, 0], p, wide)
+    p, wide = misscaled(config, share, p, wide)
     if anchors.motion is not None:
-        tests, share = tests_at(anchors.motion, depth.shape[0], depth.shape[1], rows, cols), away / config.reach
-        P = probability(offset, grid.log_depth, share, tests, updated.ratios["between"], (rows, cols))
+        tests = tests_at(anchors.motion, depth.shape[0], depth.shape[1], rows, cols)
+        P = probability(offset, grid.log_depth, away / config.reach, tests, updated.ratios["between"], (rows, cols))
         p = 1 - (1 - p) * (1 - P)
-    variance, inlier = second_moments(config, scale * (variance + steepness(grid, field.offset)), p, offset, wide)
+    variance, inlier = second_moments(config, scale * variance, p, offset, wide, share)
     nodes = np.stack([grid.log_depth, offset, variance, inlier, p, away / config.reach], 1)
     depth, spread, inlier, p = read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
     return memory, depth, spread, p, inlier, updated, scores
