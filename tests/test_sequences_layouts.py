@@ -313,8 +313,8 @@ def test_no_frames_at_all(tmp_path, layout):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"truth_scale": 1000}, "depth_scale is in metres per unit"),
-        ({"truth_scale": 0}, "depth_scale is in metres per unit"),
+        ({"truth_scale": 1000}, "truth_scale is in metres per unit"),
+        ({"truth_scale": 0}, "truth_scale is in metres per unit"),
         ({"fps": 0}, "fps must be positive"),
         ({"max_pose_gap": -1}, "max_pose_gap must be a time"),
         ({"max_time_difference": float("nan")}, "max_time_difference must be a time"),

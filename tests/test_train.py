@@ -364,6 +364,8 @@ def test_a_stopped_training_says_how_to_go_on(ufmstar, frames, tmp_path):
         (["--resume", "--overwrite"], "contradict each other"),
         (["--data", "tour"], "--data tour takes no --root"),
         (["--threads", "0"], "--threads must be at least 1"),
+        (["--set", "widths=2"], r"--set has no widths; expected epochs, .*, network\., augment\., data\., session\."),
+        (["--set", "network.width=2"], r"--set has no network.width; expected network\.architecture, .*preprocess$"),
     ],
 )
 def test_mistakes_are_one_line(ufmstar, frames, tmp_path, more, told):

@@ -143,7 +143,8 @@ class TrainOptions:
             section, _, inner = name.rpartition(".")
             by_name = _fields_of(section)
             if inner not in by_name:
-                expected = ", ".join(by_name or [f"{prefix}." for prefix in _SECTIONS if prefix])
+                sections = [f"{prefix}." for prefix in _SECTIONS if prefix]
+                expected = ", ".join([*by_name, *(() if section and by_name else sections)])
                 within = f"{section}." if section and by_name else ""
                 raise ValueError(f"--set has no {name}; expected {within}{expected}")
             if by_name[inner].default == () and not isinstance(value, list):

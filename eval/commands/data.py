@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import OpeningOptions
-from ufmstar_torch.eval.commands.options import Flag, Positional, reader
+from ufmstar_torch.eval.commands.options import Flag, Positional, arg, reader
 
 # With one of these options the path is one sequence, whatever is below its folder.
 _OF_ONE = ("trajectory", "images", "drive")
@@ -33,7 +33,7 @@ class CheckOptions:
     USAGE: ClassVar[str] = "ufmstar data check PATH [options]"
 
     command: Positional[Literal["check"]]
-    path: Positional[str]
+    path: Annotated[Positional[str], arg(metavar="PATH")]
     pairs: int = 8
     json: Flag = False
     opening: OpeningOptions

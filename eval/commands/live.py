@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from ufmstar_torch.eval.commands.depth import NetworkOptions, PosteriorOptions
 from ufmstar_torch.eval.commands.errors import usage_errors
@@ -21,6 +21,7 @@ from ufmstar_torch.eval.commands.options import (
     Flag,
     MachineOptions,
     Positional,
+    arg,
     reader,
     require_least,
     require_positive,
@@ -74,7 +75,7 @@ class LiveOptions(MachineOptions):
 
     USAGE: ClassVar[str] = "ufmstar live SOURCE --model NAME --weights FILE... [options]"
 
-    source: Positional[str]
+    source: Annotated[Positional[str], arg(metavar="SOURCE")]
     follow: Flag = False
     speed: float = 1.0
     seconds: float = float("inf")

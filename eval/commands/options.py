@@ -23,7 +23,8 @@ from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import tyro
 from tyro.conf import Positional as Positional
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import UseAppendAction
+from tyro.conf import arg as arg
 
 from ufmstar_torch.runtime.checked import flat
 

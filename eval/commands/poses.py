@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from ufmstar_torch.eval.commands.errors import usage_errors
-from ufmstar_torch.eval.commands.options import Count, Flag, Number, Positional, Text, Texts, reader
+from ufmstar_torch.eval.commands.options import Count, Flag, Number, Positional, Text, Texts, arg, reader
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.sequences.frame import parse_slice
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics, read_intrinsics
@@ -43,7 +43,7 @@ class PosesOptions:
         "ufmstar poses VIDEO|FOLDER --out DIR [--intrinsics FILE] [--length A B METRES | --trajectory FILE] [options]"
     )
 
-    source: Positional[str]
+    source: Annotated[Positional[str], arg(metavar="SOURCE")]
     out: Path
     intrinsics: Texts = ()
     distortion: Texts = ()

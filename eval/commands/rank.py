@@ -5,12 +5,12 @@ from __future__ import annotations
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.depth import OWN_DEPTH
 from ufmstar_torch.eval.commands.errors import usage_errors
-from ufmstar_torch.eval.commands.options import Count, Flag, Positional, Texts, reader, require_least
+from ufmstar_torch.eval.commands.options import Count, Flag, Positional, Texts, arg, reader, require_least
 from ufmstar_torch.eval.commands.run import StreamOptions, job_from
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 
@@ -40,7 +40,7 @@ class RankOptions(StreamOptions):
 
     USAGE: ClassVar[str] = "ufmstar rank SEQUENCE... (--model NAME --weights FILE... | --depth DIR) --out OUT [options]"
 
-    sequences: Positional[Texts]
+    sequences: Annotated[Positional[Texts], arg(metavar="SEQUENCE...")]
     out: str
     by: Literal["total", "disagreement", "aleatoric", "epistemic", "anchored"] = "total"
     diverse: Flag = False

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from ufmstar_torch.eval.commands.errors import usage_errors
-from ufmstar_torch.eval.commands.options import Positional, reader
+from ufmstar_torch.eval.commands.options import Positional, arg, reader
 from ufmstar_torch.eval.methods.method import UFM_STAR
+from ufmstar_torch.eval.report.names import count
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -34,7 +35,7 @@ class RecalibrateOptions:
         covariate: Map the variance, or the network's confidence to a factor of the variance.
     """
 
-    out: Positional[Path]
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
     row: str
     to: Path
     covariate: Literal["variance", "confidence"] = "variance"
@@ -61,7 +62,7 @@ def main(options: RecalibrateOptions) -> int:
     print("\n".join(aligned(_table(counts, options.covariate))))
     if len(counts) == 1:
         print("fitted to a single sequence, on which it is not judged: evaluate more of them")
-    print(f"{options.to}: {len(fitted.variance)} knots, fitted to {len(counts)} sequences")
+    print(f"{options.to}: {len(fitted.variance)} knots, fitted to {count(len(counts), 'sequence')}")
     return 0
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from ufmstar_torch.eval.commands.errors import usage_errors
-from ufmstar_torch.eval.commands.options import Flag, Positional, reader
+from ufmstar_torch.eval.commands.options import Flag, Positional, arg, reader
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +22,7 @@ class ReportOptions:
         no_figures: Make tables and results alone, which needs no matplotlib.
     """
 
-    out: Positional[Path]
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
     no_figures: Flag = False
 
 

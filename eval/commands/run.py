@@ -5,13 +5,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.depth import SECTIONS, MapOptions, NetworkOptions, PosteriorOptions, UfMOptions
 from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import OpeningOptions
-from ufmstar_torch.eval.commands.options import Flag, MachineOptions, Positional, Text, as_dict, reader
+from ufmstar_torch.eval.commands.options import Flag, MachineOptions, Positional, Text, arg, as_dict, reader
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_slice
 
@@ -75,7 +75,7 @@ class RunOptions(StreamOptions):
 
     USAGE: ClassVar[str] = "ufmstar run SEQUENCE (--model NAME --weights FILE... | --depth DIR) --out OUT [options]"
 
-    sequence: Positional[str]
+    sequence: Annotated[Positional[str], arg(metavar="SEQUENCE")]
     out: str
     overwrite: Flag = False
     no_video: Flag = False

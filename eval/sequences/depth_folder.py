@@ -59,7 +59,7 @@ class DepthFolder:
     def __init__(
         self, path: str | Path, scale: float | None = None, variance: str | Path | None = None, key: str = "depth"
     ) -> None:
-        check_scale(scale)
+        check_scale("scale", scale)
         self.key = key
         self.path = Path(path)
         self.scale = scale

@@ -74,7 +74,7 @@ class Options:
                 object.__setattr__(self, name, parse_intrinsics(words, f"--{name.replace('_', '-')}"))
         if self.poses not in CONVENTIONS:
             raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {self.poses!r}")
-        check_scale(self.truth_scale)
+        check_scale("truth_scale", self.truth_scale)
         for name in ("max_time_difference", "max_pose_gap"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} must be a time of at least 0 s, got {getattr(self, name)}")
@@ -101,10 +101,10 @@ class Options:
                 raise ValueError(f"layout {layout!r} takes no {name}: its files hold that; {other}")
 
 
-def check_scale(depth_scale: float | None) -> None:
-    """Raises ValueError: metres per unit is neither None nor in (0, 1]."""
-    if depth_scale is not None and not 0 < depth_scale <= 1:
-        raise ValueError(f"depth_scale is in metres per unit (0.001: millimetres, 1/5000: TUM), got {depth_scale}")
+def check_scale(name: str, scale: float | None) -> None:
+    """Raises ValueError: the argument ``name``, metres per unit, is neither None nor in (0, 1]."""
+    if scale is not None and not 0 < scale <= 1:
+        raise ValueError(f"{name} is in metres per unit (0.001: millimetres, 1/5000: TUM), at most 1, got {scale}")
 
 
 def with_camera_files(options: Options, folder: Path) -> Options:
