@@ -144,7 +144,8 @@ MISTAKES = {
     "live: folder": (f"ufmstar live images --follow --intrinsics 1 1 1 1 {NETWORK}", "images needs --trajectory FILE"),
     "live: overwrite": (f"ufmstar live - --overwrite {NETWORK}", "--overwrite goes with --out"),
     "live: trajectory": (f"ufmstar live - --trajectory t.txt {NETWORK}", "--trajectory does not go with -: each line"),
-    "live: drive": (f"ufmstar live - --reader drive=3 {NETWORK}", "--drive goes with recordings, not with -"),
+    "live: drive": (f"ufmstar live - --reader drive=3 {NETWORK}", "--reader drive goes with recordings, not with -"),
+    "live: fps": (f"ufmstar live - --fps 3 {NETWORK}", "--fps goes with recordings, not with -"),
     "live: speed": (f"ufmstar live tour:3 --speed 0 {NETWORK}", "--speed must be positive"),
     "live: intrinsics": (f"ufmstar live /nowhere --intrinsics 1 2 {NETWORK}", "--intrinsics must be a file"),
     "live: scale": (f"ufmstar live tour:3 --scale-from network {NETWORK}", "--scale-from goes with ufmstar run"),
@@ -159,6 +160,10 @@ MISTAKES = {
     "data: intrinsics": (
         "ufmstar data check {path} --intrinsics 1 2 3",
         "--intrinsics must be a file, or the four numb",
+    ),
+    "data: reader": (
+        "ufmstar data check {path} --reader depth_intrinsics=1,2",
+        "--reader depth_intrinsics must be a file",
     ),
     "rank: part": ("ufmstar rank {tour} --depth self --by epistemic --out {out}", "comes with no epistemic variance"),
     "rank: anchors": ("ufmstar rank {tour} --depth self --by anchored --out {out}", "--by anchored needs --anchors"),

@@ -105,7 +105,9 @@ class LiveOptions(MachineOptions):
         if self.source == _STANDARD_INPUT and self.opening.trajectory is not None:
             raise ValueError("--trajectory does not go with -: each line has its pose")
         if wrong := sorted(self.opening.changed().keys() - set(_OF_LIVE)):
-            raise ValueError(f"--{wrong[0].replace('_', '-')} goes with recordings, not with {self.source}")
+            name = wrong[0]
+            option = f"--{name.replace('_', '-')}" if hasattr(self.opening, name) else f"--reader {name}"
+            raise ValueError(f"{option} goes with recordings, not with {self.source}")
         if self.source != _STANDARD_INPUT and (self.opening.trajectory is None or not self.opening.intrinsics):
             raise ValueError(f"{self.source} needs --trajectory FILE (lines may be added) and --intrinsics fx fy cx cy")
 

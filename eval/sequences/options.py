@@ -69,9 +69,9 @@ class Options:
     plugin: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("intrinsics", "depth_intrinsics"):
+        for name, option in (("intrinsics", "--intrinsics"), ("depth_intrinsics", "--reader depth_intrinsics")):
             if isinstance(words := getattr(self, name), tuple) and all(isinstance(word, str) for word in words):
-                object.__setattr__(self, name, parse_intrinsics(words, f"--{name.replace('_', '-')}"))
+                object.__setattr__(self, name, parse_intrinsics(words, option))
         if self.poses not in CONVENTIONS:
             raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {self.poses!r}")
         check_scale("truth_scale", self.truth_scale)
