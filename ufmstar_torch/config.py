@@ -204,11 +204,11 @@ class MergeConfig(Checked):
         accelerators: merge on accelerators, too, where every frame then waits for the device
     """
 
-    loss: float = number(2.0, "l_max", "nat", 0.0, 10.0, open_low=True)
+    loss: float = number(1.0, "l_max", "nat", 0.0, 10.0, open_low=True)
     every: int = number(50, "n", "frames", 1)
     accelerators: bool = False
     # s_min [1]: share in its own points below which a Gaussian is dissolved in the others
-    share: ClassVar[float] = 0.1
+    share: ClassVar[float] = 0.05
 
 
 @dataclass(frozen=True)
