@@ -334,7 +334,7 @@ class UfMStarConfig(Checked):
           sum that this approximates to save time, which was calibrated better.
         - ``unmeasured``: a surface that no two views compared reads as 0 here, as a share of its depth by default.
         - ``merge``: Gaussians are only added here; by default those that overlap are joined every 50 frames, which
-          changes ECE_delta by at most .004 (docs/results/speed.md).
+          changes ECE_delta by at most .002 (docs/results/speed.md).
         """
         return cls().with_values(PAPER)
 
