@@ -323,6 +323,7 @@ def read_checkpoint(name_or_dir: str | Path, revision: str | None = None, local_
 def _require_size(checkpoint: Checkpoint, dtype: torch.dtype) -> None:
     """Raises CheckpointError: the configuration of a directory states a model that is much larger than its weights, or
     than the limit of layers; it is built without memory, on the device "meta"."""
+    from huggingface_hub.errors import StrictDataclassError
     from transformers import CONFIG_MAPPING, AutoModelForDepthEstimation
 
     folder = Path(checkpoint.name)
@@ -337,7 +338,7 @@ def _require_size(checkpoint: Checkpoint, dtype: torch.dtype) -> None:
         with torch.device("meta"):
             config = CONFIG_MAPPING[checkpoint.model_type].from_dict(checkpoint.config)
             model: nn.Module = AutoModelForDepthEstimation.from_config(config, dtype=dtype)
-    except (*DAMAGE, NotImplementedError):
+    except (*DAMAGE, NotImplementedError, StrictDataclassError):
         return  # the loader's message names the fault
     size = sum(tensor.nbytes for tensor in (*model.parameters(), *model.buffers()))
     stored = sum(file.stat().st_size for file in folder.iterdir() if file.suffix in (".safetensors", ".bin"))

@@ -157,7 +157,7 @@ def test_poses_of_another_program(tmp_path):
     go(job)
     write_rooms(tmp_path / "plain", ["ash", "birch"], frames=3)
     go(job_on(tmp_path / "plain", tmp_path / "expected", suite=job.suite))
-    assert len(stored_results(job.out)) == 10
+    assert len(stored_results(job.out)) == 12
     assert stored_results(job.out) == stored_results(tmp_path / "expected")
     assert json.loads((job.out / "eval.json").read_text())["settings"]["trajectory"] == "slam.txt"
     with pytest.raises(FolderError, match="settings"):

@@ -204,11 +204,11 @@ class MergeConfig(Checked):
         accelerators: merge on accelerators, too, where every frame then waits for the device
     """
 
-    loss: float = number(2.0, "l_max", "nat", 0.0, 10.0, open_low=True)
+    loss: float = number(1.0, "l_max", "nat", 0.0, 10.0, open_low=True)
     every: int = number(50, "n", "frames", 1)
     accelerators: bool = False
     # s_min [1]: share in its own points below which a Gaussian is dissolved in the others
-    share: ClassVar[float] = 0.1
+    share: ClassVar[float] = 0.05
 
 
 @dataclass(frozen=True)
@@ -334,7 +334,7 @@ class UfMStarConfig(Checked):
           sum that this approximates to save time, which was calibrated better.
         - ``unmeasured``: a surface that no two views compared reads as 0 here, as a share of its depth by default.
         - ``merge``: Gaussians are only added here; by default those that overlap are joined every 50 frames, which
-          changes ECE_delta by at most .004 (docs/results/speed.md).
+          changes ECE_delta by at most .002 (docs/results/speed.md).
         """
         return cls().with_values(PAPER)
 
