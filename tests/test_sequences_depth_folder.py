@@ -28,7 +28,7 @@ def test_png_scale_is_given_or_in_the_file(tmp_path):
     assert values(DepthFolder(tmp_path / "a", scale=1 / 4000).for_frames(NAMES)) == [1, 2, 3]
     write_pngs(tmp_path / "b", NAMES, units=4000, scale_text="0.00025")
     assert values(DepthFolder(tmp_path / "b").for_frames(NAMES)) == [1, 2, 3]
-    with pytest.raises(ValueError, match="^scale is in metres per unit"):
+    with pytest.raises(ValueError, match=r"^scale is in metres per unit"):
         DepthFolder(tmp_path / "b", scale=4000)
 
 
