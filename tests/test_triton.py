@@ -128,7 +128,7 @@ def test_what_the_limit_leaves_without_a_slot_counts_as_dropped():
 
 
 def test_what_waits_for_a_slot_is_in_whatever_is_saved_or_copied(monkeypatch):
-    config = UfMStarConfig(segment=SPGF, backend="triton", initial_capacity=2)
+    config = UfMStarConfig(segment=SPGF, backend="triton", initial_capacity=2, merge=None)
     first, second = (moved(frame[:3], DEVICE) for frame in walks(1, 2, SIZE))
     ufm = UfMStar(config)
     new = int(ufm(*first).statistics.new)
