@@ -22,8 +22,15 @@ from ufmstar_torch.kernels.cpu.segment import segment
 from ufmstar_torch.steps.segment_input import SegmentInput
 
 PAPER = UfMStarConfig.paper()
+
+
+def extending(sigmas: float) -> UfMStarConfig:
+    """The paper's settings with another extent of a Gaussian, which is a constant."""
+    return type("Extending", (UfMStarConfig,), {"neighbourhood_sigmas": sigmas})(**vars(PAPER))
+
+
 SEARCHES = {
-    **{f"{s:g} sigma": PAPER.replace(neighbourhood_sigmas=s) for s in (1.0, 2.0, 3.0)},
+    **{f"{s:g} sigma": extending(s) for s in (1.0, 2.0, 3.0)},
     "all Gaussians": PAPER.replace(regression="exact"),
 }  # fmt: skip
 
