@@ -138,7 +138,7 @@ def figures(prepared: list[Prepared], kind: str, config: PosteriorConfig) -> lis
 
 
 def changed(config: PosteriorConfig, **values: float) -> PosteriorConfig:
-    """The model with other settings or constants: a class of its own, whose constants differ."""
+    """A posterior's config with other values. Constants are attributes of the class; a subclass changes them."""
     return type("Changed", (PosteriorConfig,), values)(config.half_life, config.discs)
 
 

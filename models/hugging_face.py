@@ -339,7 +339,7 @@ def _require_size(checkpoint: Checkpoint, dtype: torch.dtype) -> None:
             config = CONFIG_MAPPING[checkpoint.model_type].from_dict(checkpoint.config)
             model: nn.Module = AutoModelForDepthEstimation.from_config(config, dtype=dtype)
     except (*DAMAGE, NotImplementedError, StrictDataclassError):
-        return  # the loader's message names the fault
+        return  # the size is unknown; the loader builds the same model next, and its error names the fault
     size = sum(tensor.nbytes for tensor in (*model.parameters(), *model.buffers()))
     stored = sum(file.stat().st_size for file in folder.iterdir() if file.suffix in (".safetensors", ".bin"))
     if size > max(MOST_BYTES, 4 * stored):  # 4: weights in 8 bits

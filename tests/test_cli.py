@@ -62,7 +62,7 @@ HEAVY = ("torch", "numba", "scipy", "cv2", "PIL", "pandas", "matplotlib", "onnx"
 
 @pytest.mark.parametrize("words", [*([name, "--help"] for name in cli.COMMANDS), ["eval", "--list"]], ids=" ".join)
 def test_help_imports_no_heavy_package(words):
-    # train's options contain settings that are defined beside networks
+    # the options of train contain settings from modules that import torch
     heavy = [name for name in HEAVY if words[0] != "train" or name != "torch"]
     program = (
         "import contextlib, io, sys; from ufmstar_torch.cli import main\n"

@@ -215,7 +215,7 @@ def test_a_in_h_agrees_with_the_oracle():
 
 
 def test_e_in_h_follows_the_rule_of_a():
-    """E alone, and A beside it, are averaged as A alone; a variance that the network does not predict has no part."""
+    """A and E are averaged independently: with both, each equals its average without the other."""
     config = UfMStarConfig(segment=SPGF, variances_in_h=True, unmeasured="paper")
     both, first, second = UfMStar(config), UfMStar(config), UfMStar(config)
     depths, poses, K = scenes.sequence(2, 30, 40, 0.05)

@@ -340,7 +340,7 @@ class UfMStarConfig(Checked):
 
     @property
     def entries(self) -> int:
-        """Regressed quantities per Gaussian beside m: ``features``, and with ``variances_in_h`` A, E and 1."""
+        """Number of entries of H after m: ``features``, and with ``variances_in_h`` also A, E and 1."""
         return self.features + 3 * self.variances_in_h
 
     def merges_on(self, device_type: str) -> bool:

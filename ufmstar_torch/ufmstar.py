@@ -239,7 +239,7 @@ class UfMStar(StatefulModule):
 
         Args:
             streams: indices, or a bool mask [B]; None = all, after which the batch size may change.
-            keep_evidence: keep what anchors have taught of the B streams, to start again in the same place.
+            keep_evidence: keep the statistics of the B streams from anchors, to start again in the same place.
 
         Raises:
             IndexError: an index is out of range.

@@ -154,9 +154,11 @@ def _metered(units: Mapping[str, str], part: str, meter: EnergyMeter) -> bool:
 
 
 def measure_job(job: EvalJob, plan: Plan | None = None) -> None:
-    """Measure the rows on all selected frames of an evaluation's sequences, in a pass of its own after that of the
-    metrics, and write their means to OUT/efficiency.json; the means of the job's further architectures are under
-    "further". UfM and UfM* run on the CPU, as in the paper. The energy windows are divided among the sequences.
+    """Measure time, energy and memory of the rows, and write their means to OUT/efficiency.json.
+
+    All selected frames of an evaluation's sequences are processed a second time, after the metrics. The means of the
+    job's further architectures are under "further". UfM and UfM* run on the CPU, as in the paper. The energy windows
+    are divided among the sequences.
 
     Raises:
         ValueError: no sequence can be opened, none has a usable frame, or no row can be measured.

@@ -278,7 +278,7 @@ def _measure(job: EvalJob, threads: int | None) -> None:
         print(f"no {EFFICIENCY}: {' '.join(str(error).split())}")
 
 
-# What an evaluation needs beside its networks, by the option that is missing in a dry run.
+# Meaning of the options that an evaluation needs and a dry run does not.
 _MISSING = {
     "root": "folders with sequences, [DATASET=]DIR, or tour:SEED for rendered rooms",
     "out": "the folder for the results",

@@ -33,7 +33,7 @@ class Row:
 
     @property
     def needs(self) -> str:
-        """What the row needs: its network, poses, anchors and files; ground truth is needed by every row."""
+        """The network, poses, anchors and files of the row. Every row also needs ground truth."""
         setting, parts = self.setting, [f"{NETWORKS[self.method.base]} ({self.method.base})"]
         if self.method.fusion != ALONE:
             parts.append("poses")

@@ -1,4 +1,4 @@
-"""What a frame's anchors teach UfM*: columns of step 5's regression, and the term B.
+"""Update of the evidence by a frame's anchors, the columns of step 5's regression, and the term B.
 
 Before the regression, a frame's anchors are added to the evidence. The regression of H also regresses the mean r and e
 of the components less the stream's. The stream's means are added at every pixel.

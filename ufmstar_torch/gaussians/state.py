@@ -28,7 +28,7 @@ class UfMStarState:
         smoothed: [B, H, W] moving average of the dense disagreement [m^2] in the mixture's dtype, NaN without a
             value; of size 0 x 0 before the first average.
         by_component: tensors of the anchors [B, K, C] by name, sums over the observations of each component.
-        by_stream: tensors [B, C] by name that anchors have taught of a stream as a whole (``posterior.memory``).
+        by_stream: tensors [B, C] by name of each stream as a whole, learnt from anchors (``posterior.memory``).
     """
 
     mean: Tensor

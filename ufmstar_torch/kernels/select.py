@@ -62,7 +62,7 @@ def select_step(name: str, device_type: str) -> Step:
 
 
 class FrameKernels(NamedTuple):
-    """The implementations of the parts beside a step.
+    """The implementations of the functions that run before and after a step.
 
     Attributes:
         check: of a frame's values.
@@ -78,7 +78,7 @@ class FrameKernels(NamedTuple):
 
 
 def select_frame(name: str, device_type: str) -> FrameKernels:
-    """The parts beside a step; arguments and errors as :func:`select_step`."""
+    """Select these functions for a device; arguments and errors as :func:`select_step`."""
     if _compiled(name, device_type):
         from ufmstar_torch.anchors.kernels import learn
         from ufmstar_torch.kernels.cpu import check as check_cpu

@@ -1,4 +1,4 @@
-"""What anchors have taught a stream: the tensors of the evidence, the confidence and the posterior in the state."""
+"""The state's tensors of evidence, confidence and posterior: their initial values, and checks."""
 
 from __future__ import annotations
 
