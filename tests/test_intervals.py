@@ -217,6 +217,8 @@ def test_uncertain_depth_has_the_same_intervals():
         out = model.update(DepthPrediction(depth), T, K, anchors=anchors)
         expected = ufm(depth, T, K, anchors=anchors)
     assert out.prediction is not None
+    for value, same in zip(out.ufm.interval(0.9), out.interval(0.9), strict=True):
+        torch.testing.assert_close(value, same, rtol=0, atol=0, equal_nan=True)
     for value, same in zip(out.interval(0.9), expected.interval(0.9), strict=True):
         torch.testing.assert_close(value, same, rtol=0, atol=0, equal_nan=True)
     assert torch.equal(out.probability_nearer(1.0).nan_to_num(), expected.probability_nearer(1.0).nan_to_num())

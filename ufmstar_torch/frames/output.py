@@ -202,7 +202,8 @@ class UncertaintyOutput:
 
     @property
     def ufm(self) -> UncertaintyOutput:
-        """The result of UfM* alone: the network's depth with the variance V, and the same maps."""
+        """The network's depth with the variance V of UfM*. The maps, intervals and probabilities stay those of this
+        output: they are about the corrected depth."""
         return replace(self, depth=self.network_depth, variance=self.ufm_variance, corrected=self)
 
     def posterior(self) -> tuple[Tensor, Tensor]:
@@ -280,7 +281,8 @@ class UncertaintyOutput:
         """
         if self.quantiles is None or not self.has_intervals:
             raise ValueError(_WITHOUT_EVIDENCE if self.quantiles is None else _NO_ANCHORS_YET)
-        d, V, V1, p = self.depth, self.variance, self.posterior_inlier_variance, self.posterior_outlier
+        best = self if self.corrected is None else self.corrected  # p and V1 are about the corrected depth
+        d, V, V1, p = best.depth, best.variance, best.posterior_inlier_variance, best.posterior_outlier
         if p is None:
             weight, mean, variance = torch.ones_like(d)[None], d[None], V[None]
         else:
