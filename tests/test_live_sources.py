@@ -26,7 +26,7 @@ from ufmstar_torch.eval.run import rerun_log
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.live import PoseFile, growing_folder, json_lines, replay
 from ufmstar_torch.eval.tour import export_tour
-from ufmstar_torch.files.lock import hold
+from ufmstar_torch.files.write import hold
 
 __all__ = ["stand_in"]
 
