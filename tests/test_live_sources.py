@@ -371,7 +371,7 @@ def test_a_viewer_shows_the_results_on_this_computer_alone(ufmstar, stand_in, mo
     assert address.startswith("rerun+http://127.0.0.1:")
     (count,) = re.findall(r"(\d) of 5 images", out)
     depths, images = stand_in.logged("world/camera/maps/depth"), stand_in.logged("world/camera/image/rgb")
-    assert len(depths) == len(images) == len(stand_in.logged("plots/latency_ms")) == int(count)
+    assert len(depths) == len(images) == len(stand_in.logged("milliseconds/latency_ms")) == int(count)
     assert images[0].words[0].shape == (64, 96, 3)
     assert depths[0].words[0].dtype == np.uint16
 
