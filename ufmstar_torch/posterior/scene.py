@@ -24,8 +24,6 @@ from ufmstar_torch.posterior.running import Floats, Running
 SIDE = 28
 # Least divisor 1 - w v of a leave-one-out residual: it is 0 for a single anchor.
 LEAST_LEFT = 0.05
-# Least measured share, a divisor.
-LEAST_MEASURED = 0.05
 # Least variance of y whose distribution is computed.
 LEAST_VARIANCE = 1e-12
 # Largest probability that the local correction does not hold.
@@ -274,12 +272,11 @@ def at_pixels(
 
 
 def second_moments(
-    config: PosteriorConfig, variance: Floats, p: Floats, offset: Floats, wide: Floats, share: float = 0.0
+    config: PosteriorConfig, variance: Floats, p: Floats, offset: Floats, wide: Floats
 ) -> tuple[Floats, Floats]:  # fmt: skip
     """Variances over the squared depth: in total, and if the local correction holds. With probability ``p`` the local
-    correction ``offset`` does not hold, and y has the variance ``wide`` instead of ``variance``. The limit of errors
-    disappears with the ``share`` that is ``unmeasured``."""
-    limit = math.log(config.farthest) / max(1 - share, LEAST_MEASURED)
+    correction ``offset`` does not hold, and y has the variance ``wide`` instead of ``variance``."""
+    limit = math.log(config.farthest)
     inlier = _second_moment(np.minimum(variance, config.widest), np.zeros_like(variance), limit)
     tail = _second_moment(wide, np.clip(offset, -limit, limit), limit)
     return (1 - p) * inlier + p * tail, inlier
