@@ -19,9 +19,8 @@ from ufmstar_torch.gaussians.camera import unproject
 from ufmstar_torch.kernels.cpu import regress as regress_cpu
 from ufmstar_torch.kernels.cpu.regress import fill_and_smooth
 from ufmstar_torch.kernels.cpu.vectors import vectors
-from ufmstar_torch.steps.regress import Regression, distribute, regress, regress_image, shares, smooth
+from ufmstar_torch.steps.regress import Regression, after_regression, distribute, regress, regress_image, shares, smooth
 from ufmstar_torch.steps.sample import sample_pixels
-from ufmstar_torch.steps.unmeasured import after_regression
 
 pytestmark = pytest.mark.numerics
 

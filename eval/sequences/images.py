@@ -20,8 +20,8 @@ import torch
 from PIL import Image
 
 from ufmstar_torch.eval.sequences.frame import Entry, Frame, FrameError, Loader, Size, Skipped
-from ufmstar_torch.files.arrays import read_npy, read_npz
 from ufmstar_torch.files.limits import MOST_PIXELS, require_pixels
+from ufmstar_torch.files.read import read_npy, read_npz
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.runtime.optional import optional
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from ufmstar_torch.frames.arguments import require_number, require_whole
 from ufmstar_torch.frames.output import MeanUncertainty, SampleStatistics, StepOutput
 from ufmstar_torch.gaussians.fixed_order import total
-from ufmstar_torch.steps import unmeasured
+from ufmstar_torch.steps.regress import HALF
 
 _MAPS = ("variance", "disagreement", "aleatoric", "epistemic", "anchored", "depth")
 
@@ -64,7 +64,7 @@ def mean_uncertainty(
         anchored=by_map.get("anchored"),
         depth=by_map["depth"],
         standard_error=(variance.variance / variance.pixels * unsampled).sqrt(),
-        measured=((out.measured >= unmeasured.HALF) & used).sum(1) / count,
+        measured=((out.measured >= HALF) & used).sum(1) / count,
         statistics=out.statistics,
     )
 

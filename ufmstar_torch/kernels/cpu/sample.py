@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.frames.output import SampleStatistics
-from ufmstar_torch.kernels.cpu.arrays import array
+from ufmstar_torch.kernels.cpu.calls import array
 from ufmstar_torch.steps.sample import random_order
 
 

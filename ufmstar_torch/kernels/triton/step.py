@@ -33,8 +33,7 @@ from ufmstar_torch.kernels.triton.segment import Floor, fit
 from ufmstar_torch.steps.fuse import make_room
 from ufmstar_torch.steps.segment import max_gaussians
 from ufmstar_torch.steps.segment_input import SegmentInput
-from ufmstar_torch.steps.step import step
-from ufmstar_torch.steps.step_parts import Kernels, StepObserver
+from ufmstar_torch.steps.step import Kernels, StepObserver, step
 
 _ROOM = 4 / 3  # slots for each needed slot, below which the mixture grows
 
