@@ -24,8 +24,6 @@ from ufmstar_torch.posterior.windows import scale, spread
 SIDE = 28
 # Least divisor 1 - w v of a leave-one-out residual: it is 0 for a single anchor.
 LEAST_LEFT = 0.05
-# Least measured share, a divisor.
-LEAST_MEASURED = 0.05
 # Largest probability that the local correction does not hold.
 MOST_WRONG = 0.5
 
@@ -263,12 +261,12 @@ def at_pixels(
 
 
 def second_moments(
-    config: PosteriorConfig, variance: Floats, p: Floats, offset: Floats, wide: Floats, share: float = 0.0
+    config: PosteriorConfig, variance: Floats, p: Floats, offset: Floats, wide: Floats
 ) -> tuple[Floats, Floats]:  # fmt: skip
     """Variances over the squared depth: in total, and if the local correction holds. With probability ``p`` the local
-    correction ``offset`` does not hold, and y has the variance ``wide`` instead of ``variance``. The limit of errors
-    disappears with the ``share`` that is ``unmeasured``. All arguments are [n]."""
-    limit = math.log(config.farthest) / max(1 - share, LEAST_MEASURED)
+    correction ``offset`` does not hold, and y has the variance ``wide`` instead of ``variance``. All arguments are
+    [n]."""
+    limit = math.log(config.farthest)
     total, inlier = np.empty((2, len(variance)))
     moments(variance, p, offset, wide, limit, config.widest, total, inlier)
     return total, inlier
