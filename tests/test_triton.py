@@ -114,15 +114,15 @@ def test_capture_keeps_the_state_in_place(monkeypatch, paper):
 
 
 def test_what_the_limit_leaves_without_a_slot_counts_as_dropped():
-    """The CPU counts a dropped component in its frame; the GPU may count it in the next frame."""
+    """In the frame that the components are of, as on the CPU."""
     dropped = {}
     for backend, device in (("numba", "cpu"), ("triton", DEVICE)):
         ufm = UfMStar(UfMStarConfig(segment=SPGF, backend=backend, initial_capacity=2, max_components=3))
         outputs = [ufm(*(v.to(device) for v in frame[:3])) for frame in walks(1, 2)]
         dropped[backend] = [int(out.statistics.dropped) for out in outputs]
         assert int(ufm.mixture.components) == 3
-    assert dropped["triton"][0] == 0 < dropped["numba"][0], "components of the first frame must wait"
-    assert sum(dropped["triton"]) == sum(dropped["numba"])
+    assert dropped["triton"] == dropped["numba"]
+    assert dropped["numba"][0] > 0
 
 
 def test_what_waits_for_a_slot_is_in_whatever_is_saved_or_copied(monkeypatch):

@@ -43,10 +43,11 @@ def mean_uncertainty(
         statistics: an implementation of :func:`sample_statistics` for values without a graph.
     """
     maps = {**out.maps, "depth": out.depth, "variance": out.variance}
-    sampled = {name: torch.where(used, value, torch.nan) for name in _MAPS if (value := maps.get(name)) is not None}
-    values = torch.stack(list(sampled.values()))
+    sampled = {name: value for name in _MAPS if (value := maps.get(name)) is not None}
+    values = torch.where(used, torch.stack(list(sampled.values())), torch.nan)
     each = sample_statistics(values) if statistics is None or values.requires_grad else statistics(values)
-    by_map = {name: SampleStatistics(*(value[i] for value in vars(each).values())) for i, name in enumerate(sampled)}
+    columns = zip(*(value.unbind() for value in vars(each).values()), strict=True)
+    by_map = dict(zip(sampled, (SampleStatistics(*column) for column in columns), strict=True))
     count, variance = used.sum(1), by_map["variance"]
     # finite population correction: a sample of all pixels has no error
     unsampled = 1 - count / out.statistics.valid_pixels.clamp_min(1)
