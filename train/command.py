@@ -126,7 +126,7 @@ class TrainOptions:
     batch_size: Count = None
     learning_rate: Number = None
     set: Repeated = ()
-    own: Annotated[BackboneOptions, arg(name="own-backbone")] = field(default_factory=BackboneOptions)
+    backbone_choice: Annotated[BackboneOptions, arg(name="own-backbone")] = field(default_factory=BackboneOptions)
     source: DataOptions = field(default_factory=DataOptions)
     session: SessionOptions = field(default_factory=SessionOptions)
 
@@ -164,7 +164,7 @@ class TrainOptions:
     def job(self) -> Job:
         """The training that the options mean. Raises ValueError: an option is missing, options contradict each other,
         or a value is impossible."""
-        d, s, chosen = self.source, self.session, self.own
+        d, s, chosen = self.source, self.session, self.backbone_choice
         if self.preset is not None and chosen.backbone is not None:
             raise ValueError("--preset and --backbone contradict each other")
         recipe = None if chosen.backbone is not None else self.recipe()
