@@ -116,7 +116,7 @@ def test_a_tiny_run_from_end_to_end(tmp_path, capsys):
     assert sizes == sorted(sizes), "landmarks and the posterior add to the mixture's memory"
     assert reference["memory"]["multiview"] == plain["memory"]["multiview"], "the same mixture"
     printed = capsys.readouterr()
-    assert "UfM*-Anchored-DepthOnly" in printed.out
+    assert "UfM*-DepthOnly (anchors corners)" in printed.out
     assert [line["streams"] for line in small["streams"]] == [1, 3]
     assert all(line["step"]["count"] == 2 and line["step"]["min_ms"] > 0 for line in small["streams"])
     assert printed.out.count("\n3 streams at once: step ") == 2

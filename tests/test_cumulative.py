@@ -17,7 +17,7 @@ from ufmstar_torch.eval.bench.cumulative import (
     cumulative_costs,
     read_power,
 )
-from ufmstar_torch.eval.report.figures_cost import draw_cumulative
+from ufmstar_torch.eval.report.efficiency import draw_cumulative
 from ufmstar_torch.eval.report.text import onboard_table
 
 # Three images, 1 s apart: .2 s of network, then .1, .2 and .3 s of UfM*.

@@ -101,10 +101,10 @@ def _words(options: DemoOptions, weights: Path) -> list[str]:
 def _onboard(options: DemoOptions, weights: Path) -> int:
     """Run ``--onboard``, write its folder, and print its table. Returns the exit code."""
     from ufmstar_torch.eval.bench.onboard import GRAPH, PICTURE, run_onboard
-    from ufmstar_torch.eval.report.figures_cost import draw_cumulative
+    from ufmstar_torch.eval.engine.files import to_json, write_json_atomic
+    from ufmstar_torch.eval.report.efficiency import draw_cumulative
     from ufmstar_torch.eval.report.style import save_figure
     from ufmstar_torch.eval.report.text import onboard_table
-    from ufmstar_torch.eval.run.files import to_json, write_json_atomic
     from ufmstar_torch.eval.run.folder import FolderKind, output_folder
     from ufmstar_torch.eval.run.machine import hardware, share_threads, versions
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ufmstar_torch.eval.engine.files import write_atomic
 from ufmstar_torch.eval.methods.method import ALONE, RELATIVE, RHO, UFM, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.run.colours import FAINT, INK, plain, require_matplotlib
-from ufmstar_torch.eval.run.files import write_atomic
 
 GRID = "#e6e6e6"
 TITLE, LABEL, TICK = 11, 9, 8  # font sizes [pt]
