@@ -22,7 +22,7 @@ from ufmstar_torch.eval.engine.stream import FrameResult
 from ufmstar_torch.eval.sequences.frame import Frame, Size
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
 from ufmstar_torch.eval.sequences.intrinsics import scale_intrinsics
-from ufmstar_torch.files.atomic import write_atomic
+from ufmstar_torch.files.write import write_atomic
 
 _EXAMPLES = 3  # frames, evenly spaced
 _POINTS = 4  # along each side of a pixel, for the picture

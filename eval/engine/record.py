@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ufmstar_torch.eval.engine.files import write_atomic, write_json_atomic
 from ufmstar_torch.eval.methods.row import Row, row_from
-from ufmstar_torch.files.tensors import read_tensors
+from ufmstar_torch.files.read import read_tensors
 
 FORMAT = 1
 METRICS = "metrics"  # name of the sums of ``SequenceMetrics``
