@@ -96,7 +96,8 @@ def name_lines(axes: Any) -> None:
 def legend_below(figure: Any) -> None:
     """Add the names of all lines below the panels."""
     named = {label: h for axes in figure.axes for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    how: dict[str, Any] = {"ncols": len(named), "frameon": False, "fontsize": TICK}
+    columns = max(2, int(figure.get_figwidth() / 1.3))  # a name takes some 1.3 inches
+    how: dict[str, Any] = {"ncols": min(len(named), columns), "frameon": False, "fontsize": TICK}
     figure.legend(list(named.values()), list(named), loc="outside lower center", **how)
 
 
