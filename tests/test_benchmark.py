@@ -116,7 +116,7 @@ def test_a_tiny_run_from_end_to_end(tmp_path, capsys):
     assert sizes == sorted(sizes), "landmarks and the posterior add to the mixture's memory"
     assert reference["memory"]["multiview"] == plain["memory"]["multiview"], "the same mixture"
     printed = capsys.readouterr()
-    assert "UfM*-Anchored-DepthOnly" in printed.out
+    assert "UfM*-DepthOnly (anchors corners)" in printed.out
     assert "fastdepth 96 x 96, 5 frames" in printed.err
 
 

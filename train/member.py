@@ -13,7 +13,7 @@ import torch
 from lightning.pytorch.callbacks import Timer, TQDMProgressBar
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
-from ufmstar_torch.eval.run.files import write_json_atomic
+from ufmstar_torch.eval.engine.files import write_json_atomic
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import save_trained
 from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO, Checkpoints, Stops, require_checkpoint

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics import NLL, RMSE, AbsRel, Delta1
+from ufmstar_torch.eval.metrics import NLL, DepthAccuracy
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.train.losses import gaussian_nll
 
@@ -46,14 +46,13 @@ class Validation:
     """The figures of one validation, over the valid pixels of all processes. NCCL requires the sums on the GPU."""
 
     def __init__(self, device: torch.device | str = "cpu") -> None:
-        self._accuracy = [metric.to(device) for metric in (Delta1(), RMSE(), AbsRel())]
+        self._accuracy = DepthAccuracy().to(device)
         self._nll = NLL().to(device)
         self._has_variance = False
 
     def update(self, prediction: DepthPrediction, depth: Tensor, valid: Tensor) -> None:
         """Add a batch: true depth [B, H, W] [m], ``valid`` [B, H, W] bool, True = use."""
-        for metric in self._accuracy:
-            metric.update(prediction.depth, None, depth, valid)
+        self._accuracy.update(prediction.depth, None, depth, valid)
         if prediction.variance is not None:
             self._has_variance = True
             self._nll.update(prediction.depth, prediction.variance.clamp(min=VARIANCE_FLOOR), depth, valid)
@@ -61,7 +60,7 @@ class Validation:
     def figures(self, training: Sums) -> dict[str, float]:
         """The figures by their names in metrics.csv: the NLL only if the network predicts a variance, no figures
         without a pixel. ``training``: squared errors of the training part [m^2]. All processes must call this."""
-        accuracy = {name: value for metric in self._accuracy for name, value in metric.compute().items()}
+        accuracy = self._accuracy.compute()
         if not accuracy["pixels"]:
             return {}
         rmse = accuracy["rmse"]
