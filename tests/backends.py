@@ -25,11 +25,10 @@ from ufmstar_torch.kernels.cpu import fuse as fuse_cpu
 from ufmstar_torch.kernels.cpu import regress as regress_cpu
 from ufmstar_torch.kernels.cpu import rigid as rigid_cpu
 from ufmstar_torch.kernels.cpu import segment as segment_cpu
-from ufmstar_torch.kernels.host import moved
-from ufmstar_torch.kernels.select import select_frame, select_kernels
+from ufmstar_torch.kernels.select import moved, select_frame, select_kernels
 from ufmstar_torch.steps.correspond import Correspondence
 from ufmstar_torch.steps.segment_input import SegmentInput
-from ufmstar_torch.steps.step_parts import REFERENCE, Kernels
+from ufmstar_torch.steps.step import REFERENCE, Kernels
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"  # must be set before triton is imported
 

@@ -19,9 +19,9 @@ from ufmstar_torch.frames import frame
 from ufmstar_torch.kernels import select
 from ufmstar_torch.kernels.cpu import check as check_cpu
 from ufmstar_torch.kernels.cpu import step as step_cpu
-from ufmstar_torch.kernels.host import moved, on_host
+from ufmstar_torch.kernels.select import moved, on_host
 from ufmstar_torch.steps.segment_input import SegmentInput
-from ufmstar_torch.steps.step_parts import REFERENCE
+from ufmstar_torch.steps.step import REFERENCE
 
 pytestmark = pytest.mark.numerics
 

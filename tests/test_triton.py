@@ -78,8 +78,10 @@ def test_late_growth():
 
 
 @pytest.mark.skipif(not INTERPRETED, reason="on a GPU tests/test_gpu.py records a graph")
-def test_capture_keeps_the_state_in_place(monkeypatch):
-    """The bookkeeping of a capture, with a function instead of the graph; and the launches of a step."""
+@pytest.mark.parametrize("paper", [False, True])
+def test_capture_keeps_the_state_in_place(monkeypatch, paper):
+    """The bookkeeping of a capture, with a function instead of the graph; and the launches of a step, also of the
+    paper's settings."""
     from triton.runtime.jit import KernelInterface
 
     from ufmstar_torch.runtime.capture import Captured
@@ -90,8 +92,8 @@ def test_capture_keeps_the_state_in_place(monkeypatch):
         KernelInterface, "__getitem__", lambda kernel, grid: launched.append(kernel.fn.__name__) or launch(kernel, grid)
     )
 
-    config = UfMStarConfig(
-        segment=SPGF, backend="triton", on_bad_frame="skip", initial_capacity=16, max_components=16, merge=None
+    config = (UfMStarConfig.paper() if paper else UfMStarConfig(merge=None)).replace(
+        segment=SPGF, backend="triton", on_bad_frame="skip", initial_capacity=16, max_components=16
     )
     inputs = [frame[:3] for frame in walks(1, 2, SIZE)]
     ufm, plain = UfMStar(config), UfMStar(config)

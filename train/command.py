@@ -6,10 +6,10 @@ import sys
 from collections.abc import Sequence
 from dataclasses import Field, dataclass, field, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from ufmstar_torch.eval.commands.errors import UsageError
-from ufmstar_torch.eval.commands.options import Count, File, Flag, Number, Repeated, Text, Texts, assigned, parse
+from ufmstar_torch.eval.commands.options import Count, File, Flag, Number, Repeated, Text, Texts, arg, assigned, parse
 
 if TYPE_CHECKING:
     from ufmstar_torch.train.presets import Recipe
@@ -126,7 +126,7 @@ class TrainOptions:
     batch_size: Count = None
     learning_rate: Number = None
     set: Repeated = ()
-    backbone_options: BackboneOptions = field(default_factory=BackboneOptions)
+    custom: Annotated[BackboneOptions, arg(name="own-backbone")] = field(default_factory=BackboneOptions)
     source: DataOptions = field(default_factory=DataOptions)
     session: SessionOptions = field(default_factory=SessionOptions)
 
@@ -171,7 +171,7 @@ class TrainOptions:
         from ufmstar_torch.train.data_config import DataConfig
         from ufmstar_torch.train.settings import FitSettings, Job
 
-        d, s, chosen = self.source, self.session, self.backbone_options
+        d, s, chosen = self.source, self.session, self.custom
         if self.preset is not None and chosen.backbone is not None:
             raise ValueError("--preset and --backbone contradict each other")
         recipe = None if chosen.backbone is not None else self.recipe()

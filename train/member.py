@@ -20,8 +20,8 @@ from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelChec
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from ufmstar_torch.files.atomic import write_atomic
-from ufmstar_torch.files.tensors import read_tensors
+from ufmstar_torch.files.read import read_tensors
+from ufmstar_torch.files.write import write_atomic
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.train.data import DepthDataModule
 from ufmstar_torch.train.module import OF_MEMBER, TrainingModule, averaging

@@ -19,9 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.files.atomic import remove_temporaries, write_atomic
-from ufmstar_torch.files.lock import hold
-from ufmstar_torch.files.tensors import read_tensors
+from ufmstar_torch.files.read import read_tensors
+from ufmstar_torch.files.write import hold, remove_temporaries, write_atomic
 from ufmstar_torch.frames.arguments import (
     CameraLike,
     ImageLike,

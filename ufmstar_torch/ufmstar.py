@@ -17,19 +17,15 @@ from ufmstar_torch.frames.frame import FrameInput, as_confidence, check_frame, r
 from ufmstar_torch.frames.output import MeanUncertainty, StepOutput, UncertaintyOutput
 from ufmstar_torch.frames.warnings import StreamWarnings
 from ufmstar_torch.gaussians.mixture import GaussianMixture
-from ufmstar_torch.gaussians.state import NAMES, UfMStarState
+from ufmstar_torch.gaussians.state import ALWAYS_FLOAT64, NAMES, UfMStarState
 from ufmstar_torch.kernels.select import FrameKernels, LateStep, select_frame, select_step
-from ufmstar_torch.posterior import memory
 from ufmstar_torch.posterior.recalibrate import CONFIDENCE, Recalibration
-from ufmstar_torch.runtime.one_caller import one_caller
-from ufmstar_torch.runtime.stateful import StatefulModule, full_precision, outliving
+from ufmstar_torch.runtime.stateful import StatefulModule, full_precision, one_caller, outliving
 from ufmstar_torch.runtime.warm_up import warm_up
 from ufmstar_torch.steps import variance
-from ufmstar_torch.steps.query import query
-from ufmstar_torch.steps.regress import Regression, at_pixels
+from ufmstar_torch.steps.regress import Regression, at_pixels, query
 from ufmstar_torch.steps.sample import mean_uncertainty, sample_size
-from ufmstar_torch.steps.step import Step
-from ufmstar_torch.steps.step_parts import StepObserver
+from ufmstar_torch.steps.step import Step, StepObserver
 
 
 @one_caller("forward", "mean_uncertainty", "query", "reset", "state", "__getstate__")
@@ -50,12 +46,13 @@ class UfMStar(StatefulModule):
         dtype: of the state, torch.float32 or torch.float64.
         device: of the state until ``.to()``; None = that of the first frame.
 
-    Attribute ``observer``: receives the stages of every step, to time them (``step_parts.StepObserver``), or None.
+    Attribute ``observer``: receives the stages of every step, to time them (``step.StepObserver``), or None.
 
     Example: ``ufm = UfMStar()``; for every image, ``out = ufm(depth, T_world_cam, K)``; ``out.std`` [m].
     """
 
     STATE = NAMES
+    ALWAYS_FLOAT64 = ALWAYS_FLOAT64
     config: UfMStarConfig
     observer: StepObserver | None = None
     _cached_step: tuple[tuple[str, str], Step, FrameKernels] | None = None
@@ -76,9 +73,8 @@ class UfMStar(StatefulModule):
         self.config = config if config is not None else UfMStarConfig()
         self.recalibration = variance.require_map(recalibration, self.config)
         self._warnings, self._doubts = StreamWarnings(), AnchorDoubts()
-        self._empty = memory.initial(0, self.config, dtype, as_device("device", device))
+        self._empty = UfMStarState.initial(0, self.config, dtype, as_device("device", device))
         self.STATE = tuple(self._empty.tensors())
-        self.ALWAYS_FLOAT64 = (*UfMStar.ALWAYS_FLOAT64, *memory.ALWAYS_FLOAT64)
         for name, value in self._empty.tensors().items():
             self.register_buffer(name, value)
 
@@ -251,7 +247,7 @@ class UfMStar(StatefulModule):
             old, b = self.state, self.mean.shape[0]
             if streams is None:
                 self._warnings.reset()
-                new = memory.initial(b if keep_evidence else 0, self.config, old.mean.dtype, old.mean.device)
+                new = UfMStarState.initial(b if keep_evidence else 0, self.config, old.mean.dtype, old.mean.device)
             else:
                 self._warnings.reset((chosen := self._chosen(streams, b)).nonzero().flatten().tolist())
                 new = old.restarted(chosen)
@@ -265,8 +261,6 @@ class UfMStar(StatefulModule):
 
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
         self._empty.with_tensors(state).require(self.config, self._empty)
-        if state["weight"].device.type != "meta":
-            memory.require(state, self.config)
 
     def _checked(
         self, depth: Tensor, T: CameraLike, K: CameraLike, *maps: Array | None, anchors: Anchors | None,
@@ -301,7 +295,7 @@ class UfMStar(StatefulModule):
         """
         # Outside the caller's inference mode, since the state must outlive it.
         with outliving(), torch.no_grad(), full_precision(frame.depth.device):
-            state = memory.for_frame(self._stored(), frame, self.config)
+            state = self._stored().for_frame(frame, self.config)
             if self.config.on_bad_frame == "raise":
                 raise_faults(frame)
             if self.observer is not None:

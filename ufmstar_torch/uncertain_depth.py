@@ -45,7 +45,7 @@ from ufmstar_torch.frames.output import FrameStatistics, MeanUncertainty, Uncert
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.posterior.recalibrate import Recalibration
-from ufmstar_torch.runtime.one_caller import OneCaller, one_caller
+from ufmstar_torch.runtime.stateful import OneCaller, one_caller
 from ufmstar_torch.runtime.warm_up import along_wall, camera_of, require_size, warm_up
 from ufmstar_torch.ufmstar import UfMStar
 

@@ -157,9 +157,8 @@ class Pointwise(Estimator):
 
     def memory(self) -> dict[str, float]:
         """Bytes and number of the points."""
-        cloud = self.ufm.cloud
-        count, size = (0, 0) if cloud is None else (len(cloud.count), len(cloud.count) * cloud.bytes_per_point)
-        return {"bytes": size, "count": count, "smoothing_bytes": 0}
+        counts = [(len(cloud.count), cloud.bytes_per_point) for cloud in self.ufm.clouds]
+        return {"bytes": sum(n * each for n, each in counts), "count": sum(n for n, _ in counts), "smoothing_bytes": 0}
 
 
 class Gaussians(Estimator):

@@ -59,7 +59,10 @@ class DepthPrediction:
                 )
 
     def to(self, to: torch.device | torch.dtype) -> DepthPrediction:
-        """A copy with the maps on a device, or of a dtype; the intrinsics are unchanged."""
+        """The prediction with the maps on a device, or of a dtype; the intrinsics are unchanged."""
+        present = (value for name in ("depth", *_OPTIONAL, "informative") if (value := getattr(self, name)) is not None)
+        if all(value.device == to for value in present):
+            return self
         maps = {name: value.to(to) for name in ("depth", *_OPTIONAL) if (value := getattr(self, name)) is not None}
         informative = self.informative
         if informative is not None and isinstance(to, torch.device):

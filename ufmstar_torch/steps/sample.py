@@ -13,7 +13,7 @@ from torch import Tensor
 from ufmstar_torch.frames.arguments import require_number, require_whole
 from ufmstar_torch.frames.output import MeanUncertainty, SampleStatistics, StepOutput
 from ufmstar_torch.gaussians.fixed_order import total
-from ufmstar_torch.steps import unmeasured
+from ufmstar_torch.steps.regress import HALF
 
 _MAPS = ("variance", "disagreement", "aleatoric", "epistemic", "anchored", "depth")
 
@@ -49,10 +49,11 @@ def mean_uncertainty(
         statistics: an implementation of :func:`sample_statistics` for values without a graph.
     """
     maps = {**maps, "depth": torch.gather(depth.flatten(1), 1, index)}
-    sampled = {name: torch.where(used, value, torch.nan) for name in _MAPS if (value := maps.get(name)) is not None}
-    values = torch.stack(list(sampled.values()))
+    sampled = {name: value for name in _MAPS if (value := maps.get(name)) is not None}
+    values = torch.where(used, torch.stack(list(sampled.values())), torch.nan)
     each = sample_statistics(values) if statistics is None or values.requires_grad else statistics(values)
-    by_map = {name: SampleStatistics(*(value[i] for value in vars(each).values())) for i, name in enumerate(sampled)}
+    columns = zip(*(value.unbind() for value in vars(each).values()), strict=True)
+    by_map = dict(zip(sampled, (SampleStatistics(*column) for column in columns), strict=True))
     count, variance = used.sum(1), by_map["variance"]
     # finite population correction: a sample of all pixels has no error
     unsampled = 1 - count / out.statistics.valid_pixels.clamp_min(1)
@@ -64,7 +65,7 @@ def mean_uncertainty(
         anchored=by_map.get("anchored"),
         depth=by_map["depth"],
         standard_error=(variance.variance / variance.pixels * unsampled).sqrt(),
-        measured=((out.measured >= unmeasured.HALF) & used).sum(1) / count,
+        measured=((out.measured >= HALF) & used).sum(1) / count,
         statistics=out.statistics,
     )
 

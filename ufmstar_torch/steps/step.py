@@ -4,12 +4,13 @@ The mixture is stored in the frame of each stream's first camera. Poses are conv
 world coordinates never reach the float32 state, and components that a frame does not update never change.
 
 ``UfMStar`` calls a :class:`Step`; :func:`step` is the reference. Its kernels can be replaced individually
-(``step_parts``); another implementation of the whole step has the same signature.
+(:class:`Kernels`); another implementation of the whole step has the same signature.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import torch
@@ -19,15 +20,55 @@ from ufmstar_torch.anchors import learn as anchors
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.frame import FrameInput
 from ufmstar_torch.frames.output import FrameStatistics, StepOutput
+from ufmstar_torch.gaussians import gaussian
 from ufmstar_torch.gaussians.camera import focal_and_centre, relative_pose
 from ufmstar_torch.gaussians.gaussian import pixel_footprint, storage_floor
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.gaussians.state import UfMStarState
-from ufmstar_torch.steps import fuse, regress, unmeasured
+from ufmstar_torch.steps import correspond, fuse, regress, segment
 from ufmstar_torch.steps.correspond import Correspondence
 from ufmstar_torch.steps.disagree import with_overlap_disagreement
+from ufmstar_torch.steps.regress import Regression
 from ufmstar_torch.steps.segment_input import SegmentInput
-from ufmstar_torch.steps.step_parts import REFERENCE, Kernels, StepObserver
+
+
+class StepObserver(Protocol):
+    """Receives the end of each stage of a step, to time it; it changes no result."""
+
+    def stage(self, name: str) -> None:
+        """Called at the end of a stage: check, segment, correspond, fuse, append, regress or average, in this order.
+
+        Work between two kernels belongs to the later stage. segment: SPGF and the floor of its covariances.
+        correspond: the transformation of the mixture into the camera frame, and the matching. fuse: the disagreement of
+        overlaps, the transformation of the segments into the first camera's frame, growth, and the fusion. append: the
+        new components, the transformation of the mixture into the camera frame, and the columns of anchors. regress:
+        the regression. average: the moving average, statistics and the new state. The caller of the step ends "check".
+        """
+        ...
+
+
+# C_i in the camera frame, and labels [B, H, W].
+SegmentKernel = Callable[[SegmentInput], tuple[GaussianMixture, Tensor]]
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """The replaceable parts of :func:`step`. Signatures as in ``REFERENCE``; all inputs are checked."""
+
+    spgf: SegmentKernel  # step 2, without a floor
+    floor_covariance: Callable[[Tensor, Tensor], Tensor]
+    correspond: Callable[[GaussianMixture, GaussianMixture, Tensor, tuple[int, int], UfMStarConfig], Correspondence]
+    fuse: Callable[..., GaussianMixture]
+    regress_image: Callable[..., Regression]
+
+
+REFERENCE = Kernels(
+    spgf=segment.segment,
+    floor_covariance=gaussian.floor_covariance,
+    correspond=correspond.correspond,
+    fuse=fuse.fuse,
+    regress_image=regress.regress_image,
+)
 
 
 class Step(Protocol):
@@ -109,12 +150,12 @@ def step(
         learnt = anchors.learn({**state.by_stream, **sums}, mixture_cam, frame, config, regress.distribute)
         columns = learnt.beyond.to(mixture_cam.features.dtype)
         mixture_cam = mixture_cam.replace(features=torch.cat([mixture_cam.features, columns], -1))
-    mixture_cam = unmeasured.before_regression(mixture_cam)
+    mixture_cam = regress.with_measured_share(mixture_cam)
     stage("append")
 
     result = kernels.regress_image(mixture_cam, frame.depth, frame.intrinsics, frame.valid, config, pixels)
     at_pixels = regress.at_pixels(frame.depth, pixels)
-    result, measured = unmeasured.after_regression(result, at_pixels, config, frame.informative)
+    result, measured = regress.set_unmeasured(result, at_pixels, config, frame.informative)
     features, residual = result.features, None
     if learnt is not None:
         features, columns = features.split([features.shape[-1] - anchors.COLUMNS, anchors.COLUMNS], -1)
@@ -129,7 +170,7 @@ def step(
         "new": new.sum(1) - dropped,
         "dropped": gone + dropped + (current_cam.valid & ~far_enough).sum(1),
         "valid_pixels": frame.valid.sum((1, 2)),
-        "unmeasured": (measured < unmeasured.HALF).flatten(1).sum(1),
+        "unmeasured": (measured < regress.HALF).flatten(1).sum(1),
         "single_view": (mixture.valid & (mixture.views == 0)).sum(1),
     }
     disagreement, smoothed = result.disagreement, state.smoothed

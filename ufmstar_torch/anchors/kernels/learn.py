@@ -21,12 +21,11 @@ from ufmstar_torch.anchors.learn import Learnt
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.frame import AnchorInput, FrameInput
 from ufmstar_torch.kernels.compile_cpu import kernel, leaf, part
-from ufmstar_torch.kernels.cpu.arrays import array
+from ufmstar_torch.kernels.cpu.calls import array, each
 from ufmstar_torch.kernels.cpu.regress import Seen, View
 from ufmstar_torch.kernels.cpu.regress_cull import FIELDS, cull
 from ufmstar_torch.kernels.cpu.regress_vectors import TERMS, add_shares
 from ufmstar_torch.kernels.cpu.rigid import padded
-from ufmstar_torch.kernels.cpu.threads import each
 
 _PER_CELL = 16  # mean number of anchors in a cell of the search for components
 _NEGLIGIBLE = 1e-30  # smaller means become 0, before single precision loses them

@@ -17,10 +17,9 @@ from torch import Tensor
 
 from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.gaussians.mixture import GaussianMixture
-from ufmstar_torch.kernels.cpu.arrays import array
+from ufmstar_torch.kernels.cpu.calls import array, each, shares_of_stream
 from ufmstar_torch.kernels.cpu.segment_image import join_rows, write_gaussians, write_labels
 from ufmstar_torch.kernels.cpu.segment_rows import SEGMENT, SEGMENT_INT, scan_rows
-from ufmstar_torch.kernels.cpu.threads import each, shares_of_stream
 from ufmstar_torch.steps.segment_input import SegmentInput
 
 _LIGHTER = 4  # a pixel takes a fraction of its regression's time: fewer threads pay off

@@ -25,19 +25,17 @@ from ufmstar_torch.gaussians.camera import relative_pose
 from ufmstar_torch.gaussians.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.gaussians.state import UfMStarState
-from ufmstar_torch.kernels.cpu.arrays import array
+from ufmstar_torch.kernels.cpu.calls import array, each
 from ufmstar_torch.kernels.cpu.fuse import lift
 from ufmstar_torch.kernels.cpu.regress import Seen, View, fill_and_smooth, regress_maps, views_of
 from ufmstar_torch.kernels.cpu.rigid import COVARIANCE, FIELDS, WEIGHT, padded
 from ufmstar_torch.kernels.cpu.segment import gaussians
 from ufmstar_torch.kernels.cpu.stream import join, match
-from ufmstar_torch.kernels.cpu.threads import each
 from ufmstar_torch.steps.disagree import overlap_disagreement
 from ufmstar_torch.steps.fuse import make_room
 from ufmstar_torch.steps.regress import at_pixels, distribute, memory_for, with_pixels
 from ufmstar_torch.steps.segment_input import SegmentInput
-from ufmstar_torch.steps.step import frame_statistics, unobserved
-from ufmstar_torch.steps.step_parts import StepObserver
+from ufmstar_torch.steps.step import StepObserver, frame_statistics, unobserved
 
 Floats = NDArray[np.floating[Any]]
 _NAMES = tuple(field.name for field in fields(GaussianMixture))

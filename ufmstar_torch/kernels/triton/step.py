@@ -7,9 +7,9 @@ without a slot, before anything else: the next frame matches the same components
 and only the map of the frame before was regressed without them. Growth starts before the slots are full, so that this
 is rare.
 
-What is not in the paper's step (anchors, a subset of pixels, ``config.disagreement == "overlap"``,
-``config.overlap_weighted``, the neighbourhood) run as ``step.step`` with the GPU's kernels. The mixture then grows one
-frame ahead, to slots for all that a frame can segment, so that the host reads only the count of the frame before.
+Frames with anchors or a subset of pixels, ``config.disagreement == "overlap"`` and ``config.overlap_weighted`` run as
+``step.step`` with the GPU's kernels. The mixture then grows one frame ahead, to slots for all that a frame can segment,
+so that the host reads only the count of the frame before.
 """
 
 from __future__ import annotations
@@ -33,8 +33,7 @@ from ufmstar_torch.kernels.triton.segment import Floor, fit
 from ufmstar_torch.steps.fuse import make_room
 from ufmstar_torch.steps.segment import max_gaussians
 from ufmstar_torch.steps.segment_input import SegmentInput
-from ufmstar_torch.steps.step import step
-from ufmstar_torch.steps.step_parts import Kernels, StepObserver
+from ufmstar_torch.steps.step import Kernels, StepObserver, step
 
 _ROOM = 4 / 3  # slots for each needed slot, below which the mixture grows
 
@@ -114,8 +113,7 @@ class DeviceStep:
         smooth: bool = True,
         observer: StepObserver | None = None,
     ) -> tuple[UfMStarState, StepOutput]:
-        plain = config.disagreement == "w2" and config.regression == "exact"
-        plain = plain and config.anchors is None
+        plain = config.disagreement == "w2" and config.anchors is None
         if config.overlap_weighted or not plain or pixels is not None or observer is not None:
             state = self._with_room(state, config, ahead=max_gaussians(SegmentInput.of_frame(frame, config)))
             updated, out = step(
