@@ -409,13 +409,16 @@ def _preprocess(
             f"{name}: its image processor needs {unknown or f'resample {processor.resample}'}, which is not supported: "
             f"declare another one {declare}"
         )
-    if size is None and (not stated or not (stated.height and stated.width)):
-        raise ValueError(f"{name}: preprocessor_config.json states no size with height and width: declare it {declare}")
+    if size is None:
+        if not (stated and stated.height and stated.width):
+            expected = f"preprocessor_config.json states no size with height and width: declare it {declare}"
+            raise ValueError(f"{name}: {expected}")
+        size = (int(stated.height), int(stated.width))
     keep = bool(getattr(processor, "keep_aspect_ratio", False)) if keep_aspect is None else keep_aspect
     divisors = (getattr(processor, option, None) or 1 for option in ("ensure_multiple_of", "size_divisor"))
     mean, std = (processor.image_mean, processor.image_std) if processor.do_normalize else ((0.0,) * 3, (1.0,) * 3)
     return Preprocess(
-        size=size or (int(stated.height), int(stated.width)),
+        size=size,
         aspect_multiple=int(max(checkpoint.patch, *divisors)) if keep else None,
         value_range=255 * processor.rescale_factor if processor.do_rescale else 255.0,
         mean=tuple(mean),

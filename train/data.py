@@ -77,7 +77,8 @@ class DepthDataModule(LightningDataModule):
         if self.trainer is not None:
             rank, world = self.trainer.global_rank, self.trainer.world_size
             # Workers prefetch before Lightning sets the epoch, which is not 0 in a resumed training.
-            epoch = self.trainer.fit_loop.epoch_progress.current.processed
+            progress: Any = self.trainer.fit_loop.epoch_progress.current
+            epoch = progress.processed
         # The order of an epoch is drawn with the sum of seed and epoch: no two trainings share one.
         seed = (self.seed << 20) % 2**63
         order: Any = DistributedSampler(self._opened(self.train_set), world, rank, seed=seed, drop_last=True)

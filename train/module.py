@@ -88,7 +88,8 @@ class TrainingModule(pl.LightningModule):
         loss: Tensor = total / pixels.clamp(min=1)
         where: dict[str, Any] = {"on_step": True, "on_epoch": True, "prog_bar": True, "sync_dist": True}
         self.log("train_loss", loss.detach(), batch_size=len(batch["image"]), **where)
-        if batch_idx % self.trainer.log_every_n_steps == 0:  # the log reads the value, too
+        trainer: Any = self.trainer
+        if batch_idx % trainer.log_every_n_steps == 0:  # the log reads the value, too
             self._require_finite(loss)
         return loss
 
