@@ -202,8 +202,8 @@ def update(state, depth, claimed, pixel, g, variance, motion=None):
     wide = [each + unmeasured * (2 - each) for each in wide]
     if motion is not None:
         p = 1 - (1 - p) * (1 - moving(motion, depth.shape, logs, offset, share, ratio(after, "between")))
-    alone = [second_moment(0.0, *each, unmeasured) for each in zip(spread, offset, wide, strict=True)]
-    spread = [second_moment(*each, unmeasured) for each in zip(p, spread, offset, wide, strict=True)]
+    alone = [second_moment(0.0, *each) for each in zip(spread, offset, wide, strict=True)]
+    spread = [second_moment(*each) for each in zip(p, spread, offset, wide, strict=True)]
     posterior, variance, outlier = read(depth, np.nan_to_num(claimed), logs, mean[:4], offset, spread, p, share)
     _, inlier, _ = read(depth, 0 * depth, logs, mean[:4], offset, alone, p, share)
     return after, posterior, variance, inlier, outlier
@@ -274,10 +274,9 @@ def y_variance(shape, node, y, noise, used, centre):
     return out.ravel()
 
 
-def second_moment(p, variance, offset, wide, unmeasured=0.0):
-    """E[(e^n - 1)^2] for |n| up to log 6, n normal, or with the probability p of n - offset; a larger limit before
-    the first anchor."""
-    limit, moments = math.log(6) / max(1 - unmeasured, 0.05), []
+def second_moment(p, variance, offset, wide):
+    """E[(e^n - 1)^2] for |n| up to log 6, n normal, or with the probability p of n - offset."""
+    limit, moments = math.log(6), []
     for v, o in ((min(variance, 2), 0.0), (wide, min(max(offset, -limit), limit))):
         sigma = math.sqrt(v)
         mass, first, second = (

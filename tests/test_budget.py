@@ -12,7 +12,7 @@ from runs import Brightness, job_of, networks
 from tiny_suite import evaluate, row
 
 import ufmstar_torch
-from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStarConfig
+from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStarConfig, UncertainDepth
 from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.sequences.frame import in_memory
 from ufmstar_torch.eval.tour.sequence import open_tour
@@ -26,7 +26,7 @@ class Passed:
     """The package's classes whose methods are called, and the files whose functions are called, in all threads."""
 
     def __init__(self):
-        self.classes, self.files, self.counts = set(), set(), False
+        self.classes, self.files, self.calls, self.counts = set(), set(), 0, False
 
     def note(self, frame, event, _):
         if event != "call" or not self.counts:
@@ -34,6 +34,7 @@ class Passed:
         code = frame.f_code
         if Path(code.co_filename).is_relative_to(CORE) or Path(code.co_filename).is_relative_to(EVAL):
             self.files.add(code.co_filename)
+            self.calls += not code.co_name.startswith("<")  # a comprehension or generator is no call
         if code.co_argcount and code.co_varnames[0] == "self":
             kind = type(frame.f_locals["self"])
             if kind.__module__.startswith("ufmstar_torch"):
@@ -103,3 +104,15 @@ def test_a_frame_of_eval(tour):
     with passed.watching():
         evaluate(tour, [row("UfM*-Aleatoric")], source, progress=passed.at)
     assert_within(passed, (19, 36), (28, 25))
+
+
+def test_a_call_of_the_default(tour):
+    """(classes, files) and calls of Python functions in one call of ``UncertainDepth`` with anchors and posterior."""
+    passed, model, last = Passed(), UncertainDepth(Brightness(1.0, spread=0.02)), len(tour) - 1
+    with passed.watching():
+        for i, frame in enumerate(tour):
+            passed.counts = i == last
+            model(frame.image, frame.T_world_cam, frame.intrinsics)
+            passed.counts = False
+    assert_within(passed, (99, 99), (0, 0))
+    assert passed.calls <= 9999, passed.calls

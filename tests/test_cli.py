@@ -212,6 +212,20 @@ def test_debug_shows_the_traceback(ufmstar, tmp_path):
     assert "Traceback" in err
 
 
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("words", [["--help"], ["eval", "--list"], ["run", "--help"], ["data", "check", "{path}"]])
+def test_a_reader_that_closes_the_output_ends_the_command_quietly(words, unbuffered, path):
+    """As ``ufmstar eval --list | head -1`` does."""
+    command = [sys.executable, "-m", "ufmstar_torch.cli", *(word.format(path=path) for word in words)]
+    closed, output = os.pipe()
+    os.close(closed)
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    ended = subprocess.run(command, stdout=output, stderr=subprocess.PIPE, text=True, env=environment, check=False)
+    os.close(output)
+    assert ended.returncode == cli.CLOSED
+    assert not [text for text in ("failed", "Broken pipe", "Traceback", "Exception") if text in ended.stderr]
+
+
 # ---- options ----
 
 

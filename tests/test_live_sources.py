@@ -31,7 +31,7 @@ from ufmstar_torch.eval.sequences import live as sources
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.live import PoseFile, growing_folder, json_lines, replay
 from ufmstar_torch.eval.tour import export_tour
-from ufmstar_torch.files.lock import hold
+from ufmstar_torch.files.write import hold
 from ufmstar_torch.frames.networks import NetworksInTurn
 
 __all__ = ["stand_in"]
@@ -390,7 +390,7 @@ def test_a_viewer_shows_the_results_on_this_computer_alone(ufmstar, stand_in, mo
     assert address.startswith("rerun+http://127.0.0.1:")
     (count,) = re.findall(r"(\d) of 5 images", out)
     depths, images = stand_in.logged("world/camera/maps/depth"), stand_in.logged("world/camera/image/rgb")
-    assert len(depths) == len(images) == len(stand_in.logged("plots/latency_ms")) == int(count)
+    assert len(depths) == len(images) == len(stand_in.logged("milliseconds/latency_ms")) == int(count)
     assert images[0].words[0].shape == (64, 96, 3)
     assert depths[0].words[0].dtype == np.uint16
 

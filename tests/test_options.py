@@ -213,6 +213,11 @@ def test_rarer_options_of_readers():
     ):
         with pytest.raises(ValueError, match=reason):
             OpeningOptions(reader=(wrong,))
+    words = ["check", "walk", "--max-pose-gap", ".3"]
+    with pytest.raises(ValueError, match=r"--max-pose-gap, \.3; it is a rarer option .*: --reader max_pose_gap=VALUE$"):
+        parse(_options_of("data"), words, "ufmstar data")
+    with pytest.raises(ValueError, match=r"^Unrecognized options: --anything$"):
+        parse(_options_of("data"), ["check", "walk", "--anything"], "ufmstar data")
 
 
 def _options_of(command: str) -> type:
@@ -244,6 +249,7 @@ def test_help_is_short_and_has_sentences(command, monkeypatch):
         parse(options, ["--help"], f"ufmstar {command}")
     assert ended.value.code == 0
     assert len(shown.getvalue().splitlines()) <= _TWO_SCREENS
+    assert "options options" not in shown.getvalue().replace("-options", "options")
     for name, text in _texts(options).items():
         assert text, name
         assert text[0].isupper(), f"{name}: {text}"

@@ -94,7 +94,8 @@ def parse(options: type[T], words: Sequence[str], prog: str) -> T:
     except SystemExit as ended:
         if not ended.code:
             raise
-        raise ValueError(_first_lines(message.getvalue())) from None
+        text = _first_lines(message.getvalue())
+        raise ValueError(f"{text}{_rarer(text, options)}") from None
 
 
 def reader(options: type[T], prog: str) -> Callable[[Sequence[str]], T]:
@@ -220,6 +221,16 @@ def _description(options: type) -> str:
     """The docstring of a class up to its attributes."""
     lines = (options.__doc__ or "").partition("Attributes:")[0].strip().splitlines()
     return "\n".join(line.strip() for line in lines)
+
+
+def _rarer(text: str, options: type) -> str:
+    """How to type an unknown option that is a rarer one of the readers; "" for others."""
+    from ufmstar_torch.eval.sequences.options import Options
+
+    unknown = re.match(r"Unrecognized options: --([\w-]+)", text)
+    name = unknown[1].replace("-", "_") if unknown else ""
+    rarer = "reader" in _names(options) and name in (f.name for f in fields(Options))
+    return f"; it is a rarer option of readers: --reader {name}=VALUE" if rarer else ""
 
 
 def _first_lines(message: str) -> str:

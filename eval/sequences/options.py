@@ -93,13 +93,6 @@ class Options:
         defaults = {f.name: f.default for f in fields(self)}
         return {name: value for name, value in values.items() if defaults[name] is None or value != defaults[name]}
 
-    def reject(self, layout: str, *names: str) -> None:
-        """Raises ValueError: one of the options ``names``, which the layout does not use, is set."""
-        for name in names:
-            if name in self.changed():
-                other = "use layout='generic' to combine images, depth and a trajectory freely"
-                raise ValueError(f"layout {layout!r} takes no {name}: its files hold that; {other}")
-
 
 def check_scale(name: str, scale: float | None) -> None:
     """Raises ValueError: the argument ``name``, metres per unit, is neither None nor in (0, 1]."""

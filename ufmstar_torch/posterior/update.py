@@ -36,8 +36,8 @@ Variance over the squared depth at a node, with share = min(1, distance/reach):
 - The ratios include the held-out anchors of this frame.
 
 Before the first anchor the network may be off by any factor. The squared share of the variance of b's constant in that
-before the first anchor is ``unmeasured``: with it p is raised towards ``misscaled``, w towards ``widest``, a_0 towards
-1, and the limit F disappears.
+before the first anchor is ``unmeasured``: with it p is raised towards ``misscaled``, w towards ``widest``, and a_0
+towards 1. At the start the standard deviation is .9 times the depth.
 
 The distance from evidence is geodesic, in image widths, and differences of log d lengthen it: on tours the variance of
 the error is proportional to it. ``learn`` estimates ``unseen``, ``wrong`` and the other ratios (``running``).
@@ -70,8 +70,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.frames.frame import AnchorInput, FrameInput
-from ufmstar_torch.kernels.cpu.arrays import array
-from ufmstar_torch.kernels.cpu.threads import each
+from ufmstar_torch.kernels.cpu.calls import array, each
 from ufmstar_torch.posterior.cells import cell_means, features, read
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.field import at
@@ -211,7 +210,7 @@ def _of_stream(
         tests = tests_at(anchors.motion, depth.shape[0], depth.shape[1], rows, cols)
         P = probability(offset, grid.log_depth, away / config.reach, tests, updated.ratios["between"], (rows, cols))
         p = 1 - (1 - p) * (1 - P)
-    variance, inlier = second_moments(config, scale * variance, p, offset, wide, share)
+    variance, inlier = second_moments(config, scale * variance, p, offset, wide)
     nodes = np.stack([grid.log_depth, offset, variance, inlier, p, away / config.reach], 1)
     depth, spread, inlier, p = read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
     return memory, depth, spread, p, inlier, updated, scores
