@@ -25,11 +25,9 @@ from ufmstar_torch.kernels.cpu import fuse as fuse_cpu
 from ufmstar_torch.kernels.cpu import regress as regress_cpu
 from ufmstar_torch.kernels.cpu import rigid as rigid_cpu
 from ufmstar_torch.kernels.cpu import segment as segment_cpu
-from ufmstar_torch.kernels.host import moved
-from ufmstar_torch.kernels.select import select_frame, select_kernels
+from ufmstar_torch.kernels.select import moved, select_frame, select_kernels
 from ufmstar_torch.steps.correspond import Correspondence
-from ufmstar_torch.steps.segment_input import SegmentInput
-from ufmstar_torch.steps.step_parts import REFERENCE, Kernels
+from ufmstar_torch.steps.step import REFERENCE, Kernels
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"  # must be set before triton is imported
 
@@ -53,7 +51,7 @@ class Backend:
 
     def spgf(self, depth, intrinsics, config, *, features=None):
         """Segment depth maps [B, H, W] (step 2)."""
-        return self.kernels.spgf(SegmentInput.of(depth, intrinsics, config, features))
+        return self.kernels.spgf(depth, intrinsics, config.scaled_to(*depth.shape[1:]), features)
 
     def module(self, config: UfMStarConfig, dtype: torch.dtype = torch.float32) -> Callable[..., Any]:
         """UfM* on this backend, with CPU tensors as arguments and results; ``ufm`` is the wrapped module."""

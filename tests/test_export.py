@@ -396,7 +396,7 @@ def test_a_rerun_recording(finished):
     text = printed(file)
     for entity in ("camera/image/rgb", "camera/maps/depth", "camera/maps/sigma", "camera/points", "gaussians"):
         assert f"/world/{entity}" in text
-    assert "/plots/mean_disagreement" in text
+    assert "/metres/mean_sigma" in text
     assert "Blueprint" in text
     assert file.stat().st_size < 2e6
     assert [path.name for path in file.parent.iterdir() if path.name.startswith(".")] == []

@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from oracle_paper import PaperOracle
 from shared_data import require_shared
 from walks import oracle_settings
 
+import oracle
 import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.eval.sequences import open_sequence
@@ -19,6 +19,8 @@ from ufmstar_torch.models.load import load_network
 pytestmark = pytest.mark.numerics
 
 LIMIT = 1e-4  # [m^2]
+# The search in the R-tree: boxes of 2 standard deviations (the paper states none), within .1 m, or .5 m.
+LITERAL = {"near": 0.0, "pixel_variance": 0.0, "baseline": None, "neighbourhood": (2.0, 0.1, 0.5)}
 RECORDINGS = {
     "fr1": "rgbd_dataset_freiburg1_xyz", "teddy": "rgbd_dataset_freiburg3_teddy", "hololens": "hololens_office",
     "tartanair": "tartanair_sample/P000",
@@ -32,8 +34,9 @@ def distance(frames):
     for depth, T, K in frames:
         if literal is None:
             segmentation = oracle_settings(config.segment.scaled_to(*depth.shape))
-            literal = PaperOracle(segmentation.settings, segmentation.min_pixels, segmentation.min_rows)
-        M = literal.step(depth, T, K)
+            assert segmentation.prune == "either"
+            literal = oracle.Oracle(segmentation, **LITERAL)
+        M = literal.step(depth, T, K)[1]
         out = ufm(*(torch.from_numpy(x)[None] for x in (depth, T, K)))
         found = out.disagreement[0].numpy()
         valid = np.isfinite(depth) & (depth > 0)

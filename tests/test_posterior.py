@@ -13,7 +13,7 @@ from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.anchors.anchors import check_anchors
 from ufmstar_torch.frames.frame import check_frame
-from ufmstar_torch.kernels.host import moved
+from ufmstar_torch.kernels.select import moved
 from ufmstar_torch.posterior import field
 from ufmstar_torch.posterior.running import FEATURES, SIZE, Running
 from ufmstar_torch.posterior.scene import SIDE, elsewhere_variance, second_moments

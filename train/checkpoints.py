@@ -21,8 +21,8 @@ import lightning.pytorch as pl
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from ufmstar_torch.files.atomic import write_atomic
-from ufmstar_torch.files.tensors import read_tensors
+from ufmstar_torch.files.read import read_tensors
+from ufmstar_torch.files.write import write_atomic
 from ufmstar_torch.train.module import FIGURES_KEY
 
 NAME = "last.ckpt"

@@ -6,10 +6,10 @@ import sys
 from collections.abc import Sequence
 from dataclasses import Field, dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from ufmstar_torch.eval.commands.errors import UsageError
-from ufmstar_torch.eval.commands.options import Count, File, Flag, Number, Repeated, Text, Texts, assigned, parse
+from ufmstar_torch.eval.commands.options import Count, File, Flag, Number, Repeated, Text, Texts, arg, assigned, parse
 from ufmstar_torch.models.spec import NetworkSpec
 from ufmstar_torch.train.augment import AugmentationConfig
 from ufmstar_torch.train.data_config import DataConfig
@@ -126,7 +126,7 @@ class TrainOptions:
     batch_size: Count = None
     learning_rate: Number = None
     set: Repeated = ()
-    backbone_options: BackboneOptions = field(default_factory=BackboneOptions)
+    backbone_choice: Annotated[BackboneOptions, arg(name="own-backbone")] = field(default_factory=BackboneOptions)
     source: DataOptions = field(default_factory=DataOptions)
     session: SessionOptions = field(default_factory=SessionOptions)
 
@@ -164,7 +164,7 @@ class TrainOptions:
     def job(self) -> Job:
         """The training that the options mean. Raises ValueError: an option is missing, options contradict each other,
         or a value is impossible."""
-        d, s, chosen = self.source, self.session, self.backbone_options
+        d, s, chosen = self.source, self.session, self.backbone_choice
         if self.preset is not None and chosen.backbone is not None:
             raise ValueError("--preset and --backbone contradict each other")
         recipe = None if chosen.backbone is not None else self.recipe()

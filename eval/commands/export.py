@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from ufmstar_torch.eval.commands.errors import usage_errors
-from ufmstar_torch.eval.commands.opening import OpeningOptions
+from ufmstar_torch.eval.commands.opening import Recording
 from ufmstar_torch.eval.commands.options import Positional, Text, arg, reader, require_positive
 
 
@@ -40,7 +40,7 @@ class ExportOptions:
     max_sigma: float = float("inf")
     max_relative_sigma: float = float("inf")
     voxel: float = 0.02
-    opening: OpeningOptions
+    opening: Recording
 
     def __post_init__(self) -> None:
         require_positive(self, "max_sigma", "max_relative_sigma", "voxel")

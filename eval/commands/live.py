@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from ufmstar_torch.eval.commands.depth import NetworkOptions, PosteriorOptions
 from ufmstar_torch.eval.commands.errors import usage_errors
-from ufmstar_torch.eval.commands.opening import OpeningOptions
+from ufmstar_torch.eval.commands.opening import Recording
 from ufmstar_torch.eval.commands.options import (
     File,
     Flag,
@@ -87,7 +87,7 @@ class LiveOptions(MachineOptions):
     overwrite: Flag = False
     view: Flag = False
     json: Flag = False
-    opening: OpeningOptions
+    opening: Recording
     network: NetworkOptions
     uncertainty: PosteriorOptions
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -150,4 +151,7 @@ def _write(options: RankOptions, scores: ImageScores) -> int:
     print("\n".join(aligned(shown)))
     above = f", the first {_SHOWN} above" if len(chosen) > _SHOWN else ""
     print(f"{out}: {', '.join(files)}; {len(lines)} images, {len(chosen)} with a rank{above}")
+    if unmeasured := sum(math.isnan(image.score) for image in scores.images):
+        seen = f"less than {options.measured:.0%} of their pixels were seen from two places (--measured)"
+        print(f"{unmeasured} of them cannot be ranked: {seen}")
     return 0 if chosen else 1

@@ -26,7 +26,7 @@ from ufmstar_torch.eval.engine.stream import FrameResult
 from ufmstar_torch.eval.sequences.frame import Frame, Size
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
 from ufmstar_torch.eval.sequences.intrinsics import scale_intrinsics
-from ufmstar_torch.files.atomic import write_atomic
+from ufmstar_torch.files.write import write_atomic
 
 # Shares of the frames after which the mixture is stored; it is stored again at the end.
 ROOM_SHARES = (0.25, 0.5)

@@ -1,12 +1,9 @@
-"""The paper's figures of the time of UfM*'s stages, and of cumulative time and energy on a small computer."""
+"""The paper's figure of the time of UfM*'s stages."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any
-
-import numpy as np
 
 from ufmstar_torch.eval.report import style
 from ufmstar_torch.eval.report.data import Results
@@ -18,8 +15,6 @@ STAGES = {
     "check": "#4d4d4d", "segment": "#0072B2", "correspond": "#009E73", "fuse": "#D55E00", "append": "#CC79A7",
     "regress": "#E69F00", "average": "#56B4E9",
 }  # fmt: skip
-# Colours of camera and network, UfM*, and the rest.
-PARTS = ("#E69F00", "#0072B2", "#d0d0d0")
 
 
 def draw_stages(results: Results) -> Any | None:
@@ -48,19 +43,5 @@ def draw_stages(results: Results) -> Any | None:
     style.finish(axes, x="share of the step [%], medians of its stages")
     axes.grid(visible=False)
     axes.set(xlim=(0, 100), ylim=(len(staged) - 0.4, -0.6))
-    style.legend_below(figure)
-    return figure
-
-
-def draw_cumulative(costs: Mapping[str, Any]) -> Any:
-    """The paper's system figure (c): time, and energy if it was measured, of the parts of a live run above each other,
-    from ``bench.cumulative.cumulative_costs``."""
-    panels = [("times", "seconds", "cumulative time [s]")]
-    panels += [("energy_times", "joules", "cumulative energy [J]")] if "joules" in costs else []
-    figure = style.new_figure(5.2 * len(panels), 3.6, "Cost of a live run")
-    for axes, (times, kind, label) in zip(np.atleast_1d(figure.subplots(1, len(panels))), panels, strict=True):
-        axes.stackplot(costs[times], *costs[kind].values(), labels=list(costs[kind]), colors=PARTS)
-        axes.margins(0)
-        style.finish(axes, x="time of the run [s]", y=label)
     style.legend_below(figure)
     return figure

@@ -16,7 +16,7 @@ from ufmstar_torch.eval.engine.judge import METRICS
 from ufmstar_torch.eval.methods.row import Row, row_from
 from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
 from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
-from ufmstar_torch.files.tensors import read_tensors
+from ufmstar_torch.files.read import read_tensors
 
 FORMAT = 1
 Sums = Mapping[str, Mapping[str, Tensor]]

@@ -129,6 +129,13 @@ class FrameInput:
         """Image height and width [px]."""
         return self.depth.shape[-2], self.depth.shape[-1]
 
+    @property
+    def informative_depth(self) -> Tensor:
+        """The depth to segment [B, H, W]: 0 where not valid, and everywhere in an image that shows nothing."""
+        if self.informative is None:
+            return self.depth
+        return torch.where(self.informative[:, None, None], self.depth, torch.zeros_like(self.depth))
+
 
 def check_values(
     depth: Tensor,
@@ -242,13 +249,16 @@ def check_frame(
         either = [*shapes, (shape[0], 1, *shape[-2:])]
         mask = _as(require_mask("valid", as_tensor("valid", valid), either, depth), size, torch.bool)
     frame = kernel(plain, T, K, a, e, extra, mask, rotation_tolerance=rotation_tolerance, max_depth=max_depth)
+    informative = _of_streams("informative", informative, plain)
+    if informative is not None and informative.is_cpu and bool(informative.all()):
+        informative = None
     if informative is None and isinstance(member, int) and member == 0:
         return frame
     if isinstance(member, Tensor):
         index = _moved(member.to(torch.float64), plain.device).expand(shape[0])
     else:  # filled on the device: a copy would synchronise
         index = torch.full(shape[:1], float(member), dtype=torch.float64, device=plain.device)
-    return replace(frame, member=index, informative=_of_streams("informative", informative, plain))
+    return replace(frame, member=index, informative=informative)
 
 
 def as_confidence(values: object, frame: FrameInput) -> Tensor:

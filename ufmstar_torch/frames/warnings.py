@@ -80,9 +80,9 @@ class _Track:
     waiting: bool = False  # whether its next prediction is to be compared
 
     def follow(
-        self, T: list[list[float]], focal: tuple[float, float], depth: Tensor, total: float, member: float
+        self, T: list[list[float]], focal: tuple[float, float], depth: Tensor, total: float, mean: float, member: float
     ) -> Iterator[tuple[str, str]]:
-        """Update the statistics with a frame; yields kinds and texts of warnings."""
+        """Update the statistics with a frame of a ``mean`` depth [m]; yields kinds and texts of warnings."""
         step = math.dist(_position(T), _position(self.T))
         if max(max(new / old, old / new) for new, old in zip(focal, self.focal, strict=True)) > _ZOOM:
             each = " and ".join(f"{fx:.2f} of the width, {fy:.2f} of the height" for fx, fy in (self.focal, focal))
@@ -97,14 +97,14 @@ class _Track:
             yield from self._alternate(T, step)
             yield from self._saturate(depth)
             sudden = self.steps >= _FRAMES and step > _JUMP * self.largest
-            if sudden and step > _AWAY * _mean(depth, total):
+            if sudden and step > _AWAY * mean:
                 text = f"the camera jumped by {step:.3g} m, after steps of at most {self.largest:.3g} m. Another "
                 yield "jump", text + "recording, or a map that was moved, begins with reset()"
             if self.steps >= _FRAMES and self.first == T:
                 text = f"the pose is exactly the first one again, {self.steps} poses later. Another recording begins "
                 yield "again", text + "with reset()"
             self.steps, self.largest = self.steps + 1, max(self.largest, step)
-            self.travelled += step / _mean(depth, total)
+            self.travelled += step / mean
         self.before = _position(self.T)
         self.T, self.focal, self.total = T, focal, total
 
@@ -229,13 +229,14 @@ class StreamWarnings:
             if fault or not pixels[b]:
                 continue
             T, focal = poses[b], (cameras[b][0][0] / width, cameras[b][1][1] / height)
+            mean = _mean(rows[b], sums[b])
             if text := doubtful_centre(cameras[b], frame.size):
                 yield b, "centre", text
             if (track := self._tracks.get(b)) is None:
                 self._tracks[b] = track = _Track(T, T, focal, sums[b], _position(T))
             else:
-                yield from ((b, *warning) for warning in track.follow(T, focal, rows[b], sums[b], members[b]))
-            if used is not None and (text := track.anchored(used[b], _mean(rows[b], sums[b]))):
+                yield from ((b, *warning) for warning in track.follow(T, focal, rows[b], sums[b], mean, members[b]))
+            if used is not None and (text := track.anchored(used[b], mean)):
                 yield b, "anchors", text
 
     def _alone(self, statistics: FrameStatistics, frames: Tensor) -> Iterator[tuple[int, str, str]]:

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.posterior.conformal import image_weights
-from ufmstar_torch.posterior.distribution import score
 from ufmstar_torch.posterior.field import Field, at, conditioned
+from ufmstar_torch.posterior.moments import score
 from ufmstar_torch.posterior.running import Floats, Running
 from ufmstar_torch.posterior.scene import (
     MOST_WRONG,
@@ -78,7 +78,7 @@ def _of_discs(
     mean, variance = at(field, node, x)
     away, b = away_from(scene, rest)[node], field.coefficients
     error, offset = scene.observed.value[held_out] - mean, mean - (x * b).sum(1)
-    believed = np.where(held_out, scene.believed(), 0.0)
+    believed = np.where(held_out, scene.believed, 0.0)
     area = (believed / np.maximum(scene.counted(believed), 1e-12))[held_out]
     unseen = away * running.ratios["unseen"]
     wide = elsewhere_variance(config, spread_around(scene, rest, b[0])[node], unseen)

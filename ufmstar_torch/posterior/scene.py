@@ -11,21 +11,19 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch.special import ndtr
 
 from ufmstar_torch.posterior.cells import features, local_variance, ranges
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.field import Field, Observed, Prior, at, conditioned, distance
+from ufmstar_torch.posterior.moments import moments
 from ufmstar_torch.posterior.running import Floats, Running
+from ufmstar_torch.posterior.windows import scale, spread
 
 # Largest number of nodes in a row and in a column (the field's window allows 31 in a row).
 SIDE = 28
 # Least divisor 1 - w v of a leave-one-out residual: it is 0 for a single anchor.
 LEAST_LEFT = 0.05
-# Least variance of y whose distribution is computed.
-LEAST_VARIANCE = 1e-12
 # Largest probability that the local correction does not hold.
 MOST_WRONG = 0.5
 
@@ -94,6 +92,8 @@ class Scene(NamedTuple):
         observed: the anchors.
         stated: [N] noise s^2/g^2 + alone/N.
         noise: [N] n: ``stated`` with roughness and blur^2.
+        believed: [N] weight of an anchor in the learnt means: 1/(1 + n/weak_sigma^2).
+        by_area: [N] ``believed`` over the number of anchors in the cell.
     """
 
     config: PosteriorConfig
@@ -102,16 +102,14 @@ class Scene(NamedTuple):
     observed: Observed
     stated: Floats
     noise: Floats
+    believed: Floats
+    by_area: Floats
 
     def counted(self, values: Floats) -> Floats:
         """[N] sums of ``values`` over the anchors of the same cell."""
         node = self.observed.node
         summed: Floats = np.bincount(node, values, len(self.grid.log_depth)).astype(np.float64)
         return summed[node]
-
-    def believed(self) -> Floats:
-        """[N] weight of an anchor in the learnt means: 1/(1 + n/weak_sigma^2)."""
-        return 1 / (1 + self.noise / self.config.weak_sigma**2)
 
 
 class LeftOut(NamedTuple):
@@ -145,7 +143,9 @@ def scene_of(
     stated = running.ratios["noise"] * anchors.variance / anchors.depth**2
     stated = stated + running.config.alone / max(len(stated), 1)
     noise = stated + running.ratios["roughness"] + (ranges(depth, valid, anchors.at_pixel) / 2) ** 2
-    return Scene(running.config, grid, _prior(grid, running), observed, stated, noise)
+    believed, count = 1 / (1 + noise / running.config.weak_sigma**2), np.bincount(observed.node)
+    by_area = believed / count[observed.node]
+    return Scene(running.config, grid, _prior(grid, running), observed, stated, noise, believed, by_area)
 
 
 def _prior(grid: Grid, running: Running) -> Prior:
@@ -184,34 +184,23 @@ def _with_weights(scene: Scene, weight: Floats) -> tuple[Field, LeftOut]:
 
 
 def spread_around(scene: Scene, used: NDArray[np.bool_], mean: float) -> Floats:
-    """[n] variance of y around every node, over the anchors of the mask ``used`` [N] and one virtual anchor of the
-    prior variance about ``mean``."""
-    y = scene.observed.value
-    weight, first, second = _around(scene, used, scene.config.radius, y, y**2)
-    middle = (first + mean) / (weight + 1)
-    moment = (second + mean**2 + scene.config.prior_sigma**2) / (weight + 1)
-    spread: Floats = np.maximum(moment - middle**2, 0)
-    return spread
+    """[n] variance of y around every node, over the anchors of the mask ``used`` [N], weighted ``by_area`` and by a
+    Gaussian window, and one virtual anchor of the prior variance about ``mean``."""
+    out, grid = np.empty(len(scene.grid.log_depth)), scene.grid
+    windows = (_window(count, scene.config.radius) for count in (grid.rows, grid.cols))
+    observed, prior = scene.observed, scene.config.prior_sigma**2
+    spread(observed.node, scene.by_area, used, observed.value, *windows, mean, prior, out)
+    return out
 
 
 def local_scale(scene: Scene, left_out: LeftOut, used: NDArray[np.bool_]) -> Floats:
     """[n] factor by which errors around every node exceed the field's prediction: the mean leave-one-out z^2 of the
-    anchors of the mask ``used`` [N] and of one virtual anchor with z^2 = 1."""
-    z2 = np.minimum(left_out.residual**2 / left_out.total, scene.config.clip)
-    weight, first = _around(scene, used, scene.config.near, z2)
-    scale: Floats = (first + 1) / (weight + 1)
-    return scale
-
-
-def _around(scene: Scene, used: NDArray[np.bool_], width: float, *values: Floats) -> Floats:
-    """[1 + k, n] sums of 1 and of the k values [N] over the anchors of the mask ``used`` [N], weighted by a Gaussian
-    window around every node, by ``believed``, and by 1/(anchors in the cell)."""
-    weight = np.where(used, scene.believed() / scene.counted(np.ones(len(scene.noise))), 0.0)
-    grid, terms = scene.grid, (weight, *(weight * x for x in values))
-    nodes = np.stack([np.bincount(scene.observed.node, x, grid.rows * grid.cols) for x in terms])
-    nodes = nodes.reshape(-1, grid.rows, grid.cols)
-    sums: Floats = (_window(grid.rows, width) @ nodes @ _window(grid.cols, width)).reshape(len(nodes), -1)
-    return sums
+    anchors of the mask ``used`` [N] and of one virtual anchor with z^2 = 1. Gaussian windows and weights as in
+    :func:`spread_around`."""
+    out, grid = np.empty(len(scene.grid.log_depth)), scene.grid
+    windows = (_window(count, scene.config.near) for count in (grid.rows, grid.cols))
+    scale(scene.observed.node, scene.by_area, used, *left_out, scene.config.clip, *windows, out)
+    return out
 
 
 @functools.lru_cache(maxsize=8)  # two widths; the sizes of the grid hardly change
@@ -283,21 +272,12 @@ def second_moments(
     config: PosteriorConfig, variance: Floats, p: Floats, offset: Floats, wide: Floats
 ) -> tuple[Floats, Floats]:  # fmt: skip
     """Variances over the squared depth: in total, and if the local correction holds. With probability ``p`` the local
-    correction ``offset`` does not hold, and y has the variance ``wide`` instead of ``variance``."""
+    correction ``offset`` does not hold, and y has the variance ``wide`` instead of ``variance``. All arguments are
+    [n]."""
     limit = math.log(config.farthest)
-    inlier = _second_moment(np.minimum(variance, config.widest), np.zeros_like(variance), limit)
-    tail = _second_moment(wide, np.clip(offset, -limit, limit), limit)
-    return (1 - p) * inlier + p * tail, inlier
-
-
-def _second_moment(variance: Floats, offset: Floats, limit: float) -> Floats:
-    """E[(e^n - 1)^2 | |n| <= ``limit``], n ~ N(-offset, variance)."""
-    sigma = np.sqrt(np.maximum(variance, LEAST_VARIANCE))
-    ends = torch.from_numpy(np.stack([offset - limit, offset + limit]) / sigma)
-    mass, first, second = (np.diff(ndtr(ends - k * torch.from_numpy(sigma)).numpy(), axis=0)[0] for k in range(3))
-    q = np.exp(-offset)
-    moment: Floats = q * q * np.exp(2 * variance) * second - 2 * q * np.exp(variance / 2) * first + mass
-    return np.maximum(moment / mass, 0)
+    total, inlier = np.empty((2, len(variance)))
+    moments(variance, p, offset, wide, limit, config.widest, total, inlier)
+    return total, inlier
 
 
 def away_from(scene: Scene, evidence: NDArray[np.bool_]) -> Floats:

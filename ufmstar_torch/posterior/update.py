@@ -74,8 +74,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.frames.frame import AnchorInput, FrameInput
-from ufmstar_torch.kernels.cpu.arrays import array
-from ufmstar_torch.kernels.cpu.threads import each
+from ufmstar_torch.kernels.cpu.calls import array, each
 from ufmstar_torch.posterior.cells import cell_means, features, read
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.field import at
