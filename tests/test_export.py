@@ -404,7 +404,7 @@ def test_a_rerun_recording(finished):
 
 def printed(file):
     words = [sys.executable, "-m", "rerun", "rrd", "print", "-v", str(file)]
-    return subprocess.run(words, check=True, capture_output=True, text=True, timeout=100).stdout
+    return subprocess.run(words, check=True, capture_output=True, text=True).stdout
 
 
 def test_anchors_have_a_line_to_the_depth_of_their_pixel(stand_in, tmp_path):
