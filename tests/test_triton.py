@@ -125,12 +125,12 @@ def test_what_the_limit_leaves_without_a_slot_counts_as_dropped():
     assert dropped["numba"][0] > 0
 
 
-def test_what_waits_for_a_slot_is_in_whatever_is_saved_or_copied(monkeypatch):
+def test_copies_and_saved_states_continue_also_after_a_step_that_failed(monkeypatch):
     config = UfMStarConfig(segment=SPGF, backend="triton", initial_capacity=2, merge=None)
     first, second = (moved(frame[:3], DEVICE) for frame in walks(1, 2, SIZE))
     ufm = UfMStar(config)
     new = int(ufm(*first).statistics.new)
-    assert new > 2 == ufm.mean.shape[1], "some must wait"
+    assert new > 2, "the mixture must have grown"
     with monkeypatch.context() as broken:
         broken.setattr("ufmstar_torch.kernels.triton.step.fuse_bits", Mock(side_effect=RuntimeError("out of memory")))
         with pytest.raises(RuntimeError, match="out of memory"):
@@ -140,8 +140,9 @@ def test_what_waits_for_a_slot_is_in_whatever_is_saved_or_copied(monkeypatch):
     assert int((ufm.state_dict()["weight"] > 0).sum()) == new
     restored = UfMStar(config, device=DEVICE)
     restored.load_state_dict(ufm.state_dict())
-    outputs = [module(*second) for module in (ufm, restored)]
-    close(outputs[1].variance, outputs[0].variance, 0, 0)
-    assert torch.equal(outputs[0].statistics.components, outputs[1].statistics.components)
+    expected, *outputs = [module(*second) for module in (ufm, twin, restored)]
+    for out in outputs:
+        close(out.variance, expected.variance, 0, 0)
+        assert torch.equal(out.statistics.components, expected.statistics.components)
     ufm.reset()
     assert ufm.state.mixture.streams == 0

@@ -280,7 +280,7 @@ class UfMStarConfig(Checked):
 
     # Fusion (section "Multiview Fusion")
     overlap_weighted: bool = False
-    # Two views from one position are one view (``views``).
+    # Two views from one position are one view (``steps.fuse``).
     view_baseline: float | None = number(0.07, "b_0", "1", 0.0, open_low=True, optional=True)
     # m averages the paper's squared 2-Wasserstein distance, or the squared depth difference where both Gaussians are
     # seen (``disagree``).
@@ -350,7 +350,7 @@ class UfMStarConfig(Checked):
         - ``segment.slope_focal``: SPGF's thresholds have the camera's own focal length here, by default the
           reference's, which made no difference on tours.
         - ``view_baseline``: every comparison counts here, and the first view counts as agreement; by default a
-          comparison counts as far as the view changed (``views``).
+          comparison counts as far as the view changed (``steps.fuse``).
         - ``regression``: over the Gaussians within .1 m here, or .5 m where there are none; by default over all, the
           sum that this approximates to save time, which was calibrated better.
         - ``unmeasured``: a surface that no two views compared reads as 0 here, as a share of its depth by default.

@@ -108,7 +108,7 @@ class UfMStar(StatefulModule):
             epistemic: likewise E [m^2].
             valid: like ``depth``, bool, True = use.
             features: [B, F, H, W] with F = ``config.features``, averaged per component and regressed; of at most 1e12.
-            member: index of the network, or random sample, that predicted, an integer or [B]; see ``views``.
+            member: index of the network, or random sample, that predicted, an integer or [B]; see ``steps.fuse``.
             informative: [B] bool, False where the image shows nothing, so that the depth is neither fused nor measured.
             anchors: sparse depths of this frame, with ``config.anchors``; None = none.
             confidence: like ``depth``, the network's confidence, with ``config.confidence`` or a recalibration of it.
