@@ -103,7 +103,7 @@ def test_a_tiny_run_from_end_to_end(tmp_path, capsys):
     assert len(rows) == 7, "UfM, and three rows of UfM* for each backend"
     plain, corners, posterior, reference = (
         rows[f"UfM*-{name}"]
-        for name in ("DepthOnly", "Anchored-DepthOnly", "DepthOnly (anchors dense, posterior True)",
+        for name in ("DepthOnly", "DepthOnly (anchors corners)", "DepthOnly (anchors dense, posterior True)",
                      "DepthOnly (backend torch)")
     )  # fmt: skip
     for row in rows.values():
