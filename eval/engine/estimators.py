@@ -20,7 +20,6 @@ from ufmstar_torch.eval.methods.setting import configured
 from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.frames.output import EVERY_FRAME, FrameStatistics, UncertaintyOutput
 from ufmstar_torch.frames.prediction import DepthPrediction
-from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.posterior.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar
 
@@ -183,11 +182,6 @@ class Gaussians(Estimator):
         used = out.statistics.anchors_used
         self._anchors = 0 if used is None else int(used[0])
         return out
-
-    def mixture_world(self) -> GaussianMixture:
-        """[1, K] M_i in the world's frame, float64; after a frame."""
-        T = self.ufm.T_world_first.double()
-        return self.ufm.mixture.to(torch.float64).rigid(T[:, :3, :3], T[:, :3, 3])
 
     def memory(self) -> dict[str, float]:
         """Bytes and number of the occupied components, anchor terms included; bytes of the moving average."""
