@@ -16,6 +16,7 @@ import torch
 from ufmstar_torch.eval.run.files import write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.machine import hardware, versions
+from ufmstar_torch.files.limits import read_text
 from ufmstar_torch.models.trained import load_for_training, save_trained
 from ufmstar_torch.train.checkpoints import ResumeError
 from ufmstar_torch.train.folder import SUMMARY, open_folder
@@ -86,7 +87,7 @@ def read_result(job: Job, member: int) -> dict[str, Any]:
     if not file.is_file():
         return {}
     try:
-        result = json.loads(file.read_text(encoding="utf-8"))
+        result = json.loads(read_text(file))
     except (ValueError, RecursionError) as error:
         raise ResumeError(f"{file} is not the result of a member: {error}; --overwrite starts again") from error
     if not isinstance(result, dict):

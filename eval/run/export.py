@@ -25,6 +25,7 @@ from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
 from ufmstar_torch.eval.sequences.intrinsics import pinhole_values
 from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
+from ufmstar_torch.files.limits import read_text
 from ufmstar_torch.gaussians.conventions import CONVENTIONS
 
 _LEAST_SIGMA = 1e-3  # [m] lower limit of sigma in a point's weight
@@ -235,7 +236,7 @@ def export_transforms(frames: Iterator[RunFrame], out: Path) -> str:
 def run_summary(out: Path) -> dict[str, Any]:
     """The summary of a run. Raises ValueError: it cannot be read."""
     try:
-        return dict(json.loads((out / "summary.json").read_text(encoding="utf-8")))
+        return dict(json.loads(read_text(out / "summary.json")))
     except (OSError, ValueError, TypeError, RecursionError) as error:
         raise ValueError(f"{out}/summary.json is not that of a run: {error}") from error
 
