@@ -116,7 +116,13 @@ def write(folder: Path, name: str) -> dict[str, Any]:
         write_depth_anything(folder, "metric")
     elif name in ("ZoeDepth", "Depth Pro"):
         write_other(folder, {"ZoeDepth": "zoedepth", "Depth Pro": "depth_pro"}[name])
-    stand_ins: dict[str, Any] = {"yolo": Yolo(), "unidepth": UniDepth(), "moge": MoGe(), "metric3d": Metric3D(), "da3": DepthAnything3()}
+    stand_ins: dict[str, Any] = {
+        "yolo": Yolo(),
+        "unidepth": UniDepth(),
+        "moge": MoGe(),
+        "metric3d": Metric3D(),
+        "da3": DepthAnything3(),
+    }
     return {"DIR": folder, **stand_ins}
 
 
