@@ -226,6 +226,20 @@ def test_a_reader_that_closes_the_output_ends_the_command_quietly(words, unbuffe
     assert not [text for text in ("failed", "Broken pipe", "Traceback", "Exception") if text in ended.stderr]
 
 
+def test_messages_do_not_depend_on_the_encoding_of_the_terminal(tmp_path, path):
+    """Also an option's error, which tyro frames in other letters; a file's name that it cannot show is escaped."""
+    command = [sys.executable, "-m", "ufmstar_torch.cli"]
+    odd = tmp_path / "grün \udcff"
+    path.rename(odd)
+    for words, expected in ((("run", "x", "--poses", "foo"), "invalid choice 'foo' for argument '--poses'"),
+                            (("data", "check", str(odd)), "gr\\xfcn \\udcff")):  # fmt: skip
+        environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+        ended = subprocess.run([*command, *words], capture_output=True, text=True, env=environment, check=False)
+        assert expected in ended.stdout + ended.stderr
+        assert ended.returncode in (0, 1, 2)
+        assert "Error:" not in ended.stderr
+
+
 # ---- options ----
 
 

@@ -117,12 +117,8 @@ def write(folder: Path, name: str) -> dict[str, Any]:
     elif name in ("ZoeDepth", "Depth Pro"):
         write_other(folder, {"ZoeDepth": "zoedepth", "Depth Pro": "depth_pro"}[name])
     stand_ins: dict[str, Any] = {
-        "yolo": Yolo(),
-        "unidepth": UniDepth(),
-        "moge": MoGe(),
-        "metric3d": Metric3D(),
-        "da3": DepthAnything3(),
-    }
+        "yolo": Yolo(), "unidepth": UniDepth(), "moge": MoGe(), "metric3d": Metric3D(), "da3": DepthAnything3(),
+    }  # fmt: skip
     return {"DIR": folder, **stand_ins}
 
 

@@ -19,7 +19,7 @@ from ufmstar_torch.gaussians.camera import unproject
 from ufmstar_torch.kernels.cpu import regress as regress_cpu
 from ufmstar_torch.kernels.cpu.regress import fill_and_smooth
 from ufmstar_torch.kernels.cpu.vectors import vectors
-from ufmstar_torch.steps.regress import Regression, after_regression, distribute, regress, regress_image, shares, smooth
+from ufmstar_torch.steps.regress import Regression, distribute, regress, regress_image, set_unmeasured, shares, smooth
 from ufmstar_torch.steps.sample import sample_pixels
 
 pytestmark = pytest.mark.numerics
@@ -193,7 +193,7 @@ def test_filling_and_smoothing_at_once_equal_both(stated, dtype):
     maps = torch.rand(4, 2, 9, 11, generator=generator).to(dtype)
     maps[3, :, :2, ::2], maps[:3, :, 1:4, :3] = torch.nan, torch.nan  # of the mixture, and of the frame
     disagreement, measured, depth, memory = (*maps[:3], maps[3].float())
-    filled, _ = after_regression(Regression(disagreement, measured[..., None]), depth, config)
+    filled, _ = set_unmeasured(Regression(disagreement, measured[..., None]), depth, config)
     for alpha in (0.3, 1.0):
         expected = smooth(memory, filled.disagreement, alpha)
         *found, counts = fill_and_smooth(disagreement, measured, depth, memory, config, alpha)

@@ -12,7 +12,7 @@ from typing import Any
 import lightning.pytorch as pl
 import torch
 
-from ufmstar_torch.eval.run.files import write_json_atomic
+from ufmstar_torch.eval.engine.files import write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.machine import hardware, versions
 from ufmstar_torch.models.trained import save_trained

@@ -12,6 +12,7 @@ import sys
 import traceback
 from collections.abc import Sequence
 from importlib import import_module
+from io import TextIOWrapper
 from typing import Any
 
 from ufmstar_torch.runtime.optional import naming_extra
@@ -57,6 +58,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Args:
         arguments: without the program's name; None = ``sys.argv[1:]``.
     """
+    if isinstance(sys.stdout, TextIOWrapper):  # a terminal may not have the letters of a file's name
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         try:
             return _main(list(sys.argv[1:] if arguments is None else arguments))

@@ -13,7 +13,6 @@ from ufmstar_torch.eval.bench.measure import Plan, measure
 from ufmstar_torch.eval.bench.networks import ONCE, TimedNetwork
 from ufmstar_torch.eval.bench.parts import MULTIVIEW
 from ufmstar_torch.eval.bench.settings import ARCHITECTURES, TOUR, BenchSettings
-from ufmstar_torch.eval.bench.streams import time_streams
 from ufmstar_torch.eval.bench.timing import most_threads
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.methods.method import BASES, Method
@@ -54,11 +53,7 @@ def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None
         sequence = open_sequence(name if options.sequence == TOUR else options.sequence)
         rows = [Row(Method.parse(name), setting) for name, setting in _rows(network.base, options.backends)]
         devices: dict[str, Any] = {"device": device, "multiview_device": device, "plan": plan}
-        result = measure(rows, {network.base: network}, sequence, **devices)
-        result["streams"] = []
-        if options.streams:
-            result["streams"] = time_streams(network, sequence, options.streams, device=device, plan=plan)
-        results.append(result)
+        results.append(measure(rows, {network.base: network}, sequence, **devices))
     used = {name: str(value) for name, value in vars(options).items() if value is not None}
     return {"schema": 2, "date": datetime.now(UTC).isoformat(timespec="seconds"), "options": used, "results": results}
 
@@ -144,7 +139,4 @@ def _lines(result: Mapping[str, Any]) -> list[str]:
             share = row["stages"]["beyond_the_paper"]["median"]
             lines.append(f"mean over 1,000 pixels {times['median_ms']:.2f} ms, x step {ratio:.3f}; ")
             lines[-1] += f"check and average, which the paper does not have, x step {share:.3f}"
-    for line in result["streams"]:
-        forms = (f"{name} {line[name]['median_ms']:.2f} ms" for name in ("step", "graph") if name in line)
-        lines.append(f"{line['streams']} streams at once: {', '.join(forms)}")
     return [*lines, *(f"no energy of the {unit}: {why}" for unit, why in result["power"]["missing"].items())]

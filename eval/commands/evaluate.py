@@ -236,10 +236,10 @@ def _evaluate(options: EvalOptions) -> int:
 
 def _report(job: EvalJob, outcome: EvalOutcome, options: EvalOptions) -> int:
     """Print the table, measure, draw the report, print the failures. Returns the exit code."""
+    from ufmstar_torch.eval.engine.record import ResultsError
     from ufmstar_torch.eval.report.data import load_results
     from ufmstar_torch.eval.report.text import summary, written
     from ufmstar_torch.eval.report.write import write_report
-    from ufmstar_torch.eval.suite.record import ResultsError
 
     try:
         print(summary(load_results(job.out, with_sums=False)))

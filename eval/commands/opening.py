@@ -56,8 +56,8 @@ class OpeningOptions:
         if unknown := sorted(rarer.keys() - expected):
             raise ValueError(f"--reader has no {', '.join(unknown)}; it has {', '.join(sorted(expected))}")
         for name in ("depth_intrinsics", "topics"):
-            if isinstance(text := rarer.get(name), str):
-                rarer[name] = tuple(text.split(","))
+            if name in rarer:
+                rarer[name] = tuple(str(rarer[name]).split(","))
         empty = {name: value for name, value in values.items() if value != ()}
         return Options(**empty, **rarer)
 

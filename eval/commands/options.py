@@ -234,8 +234,11 @@ def _rarer(text: str, options: type) -> str:
 
 
 def _first_lines(message: str) -> str:
-    """The lines of tyro's error in a box up to its first rule, as one line, without the name of a group."""
-    lines = [line.strip("│ ") for line in message.splitlines() if line.startswith("│")]
-    rules = [number for number, line in enumerate(lines) if line.startswith("─")]
-    text = " ".join(" ".join(lines[: rules[0] if rules else None]).split())
+    """The text of tyro's error up to its rule, as one line, without the name of a group. Where the terminal has UTF-8,
+    the message stands in a box; elsewhere it follows a title and a rule."""
+    boxed = [line for line in message.splitlines() if line.startswith("│")]
+    lines = [line.strip("│ ") for line in boxed or message.splitlines()]
+    rules = [number for number, line in enumerate(lines) if line and not line.strip("─-")]
+    first = 0 if boxed or not rules else rules.pop(0) + 1
+    text = " ".join(" ".join(lines[first : rules[0] if rules else None]).split())
     return re.sub(r"^Error parsing (?!--)\S+: ", "", text)

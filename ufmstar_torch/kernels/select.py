@@ -6,15 +6,13 @@ import functools
 import warnings
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import CheckAnchors, check_anchor_values
-from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.frame import CheckKernel, check_values
-from ufmstar_torch.gaussians.state import UfMStarState
 from ufmstar_torch.steps.merge import REFERENCE as MERGE_REFERENCE
 from ufmstar_torch.steps.merge import MergeKernels
 from ufmstar_torch.steps.sample import REFERENCE as SAMPLE_REFERENCE
@@ -25,17 +23,8 @@ _TRITON_DEVICES = ("cuda", "xpu")  # "cuda" is ROCm's name as well
 _LEAST_CAPABILITY = (8, 0)  # of an NVIDIA GPU that triton supports
 
 
-@runtime_checkable
-class LateStep(Protocol):
-    """A step that defers a part of a frame's work to the next frame."""
-
-    def settled(self, state: UfMStarState, config: UfMStarConfig, /) -> UfMStarState:
-        """Apply the deferred work to the state that the step returned last."""
-        ...
-
-
 def select_step(name: str, device_type: str) -> Step:
-    """The step for a device. The step of a GPU has a memory (``step_device``): use one instance for each state.
+    """The step for a device. The step of a GPU remembers a count of its last state: use one instance for each module.
 
     Args:
         name: one of

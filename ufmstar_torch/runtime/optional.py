@@ -74,8 +74,10 @@ def lazy_names(package: str, **completed: str) -> tuple[Callable[[str], Any], Ca
         module, original = origins()[name]
         module = completed.get(name, module)
         try:
-            return getattr(import_module(module), original)
+            value = getattr(import_module(module), original)
         except ModuleNotFoundError as error:
             raise naming_extra(error, f"{package}.{name}") from error
+        setattr(sys.modules[package], name, value)  # the next look-up does not come here
+        return value
 
     return getattr_, lambda: sorted(origins())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import threading
 import warnings
@@ -53,7 +54,7 @@ def one_caller(*names: str) -> Callable[[type[Class]], type[Class]]:
 
     def decorate(owner: type[Class]) -> type[Class]:
         for name in names:
-            member = vars(owner)[name]
+            member = inspect.getattr_static(owner, name)
             is_property = isinstance(member, property)
             guarded = _guarded(member.fget if is_property else member)
             setattr(owner, name, property(guarded) if is_property else guarded)
@@ -135,16 +136,8 @@ class StatefulModule(nn.Module):
         chosen[indices if indices.numel() else indices.long()] = True
         return chosen
 
-    def _settle(self) -> None:
-        """Write pending results into the buffers before they are saved, loaded, copied or moved."""
-
-    def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
-        self._settle()
-        super()._save_to_state_dict(destination, prefix, keep_vars)
-
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Applies ``.to()`` and similar conversions, with the exceptions in the class's docstring."""
-        self._settle()
         before = {name: getattr(self, name) for name in self.STATE}
         super()._apply(fn, recurse)
         for name, old in before.items():
@@ -178,7 +171,6 @@ class StatefulModule(nn.Module):
         Raises:
             ValueError: tensors that do not match each other, or invalid values.
         """
-        self._settle()
         try:
             saved = {
                 n: _fitting(n, state_dict[prefix + n], getattr(self, n)) for n in self.STATE if prefix + n in state_dict

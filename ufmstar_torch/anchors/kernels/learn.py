@@ -26,6 +26,7 @@ from ufmstar_torch.kernels.cpu.regress import Seen, View
 from ufmstar_torch.kernels.cpu.regress_cull import FIELDS, cull
 from ufmstar_torch.kernels.cpu.regress_vectors import TERMS, add_shares
 from ufmstar_torch.kernels.cpu.rigid import padded
+from ufmstar_torch.kernels.cpu.sample import folded
 
 _PER_CELL = 16  # mean number of anchors in a cell of the search for components
 _NEGLIGIBLE = 1e-30  # smaller means become 0, before single precision loses them
@@ -146,7 +147,7 @@ def _learn(
         _distribute(index, predicted, chosen, rows, K, width, view, sums)
     fade = memory if used[0] > 0 else 1.0
     for c in range(3):  # rounded to the state's dtype
-        overall[c] = fade * overall_before[c] + _folded(rows[:, c])
+        overall[c] = fade * overall_before[c] + folded(rows[:, c].copy())
     for c in range(2):
         stream[c] = np.float64(overall[c + 1]) / (np.float64(overall[0]) + shrinkage)
     for k in range(component.shape[0]):
@@ -160,9 +161,9 @@ def _learn(
     last = features.shape[1] - 1
     for k in range(features.shape[0]):
         features[k, last - 2], features[k, last - 1] = beyond[k, 0], beyond[k, 1]
-    for i in range(view[0].size):
-        k = view[0][i]
-        view[3][i, TERMS - 1], view[3][i, TERMS - 2] = beyond[k, 0], beyond[k, 1]
+    for i in range(view.slot.size):
+        k = view.slot[i]
+        view.terms[i, TERMS - 1], view.terms[i, TERMS - 2] = beyond[k, 0], beyond[k, 1]
 
 
 @part
@@ -175,7 +176,7 @@ def _rows(predicted, depth, variance, network_variance, supported, rows):
             others += 1
             r = depth[i] / predicted[i] - 1
             squares[i] = r * r
-    total = _folded(squares)
+    total = folded(squares.copy())
     others = max(others, 0)
     for i in range(n):
         rows[i, 0] = rows[i, 1] = rows[i, 2] = 0.0
@@ -191,23 +192,6 @@ def _rows(predicted, depth, variance, network_variance, supported, rows):
         rows[i, 0], rows[i, 1], rows[i, 2] = w, w * r, w * (r * r - claim)
         used += w >= COUNTS
     return used
-
-
-@part
-def _folded(values):
-    """The sum in the order of ``fixed_order.total``: of two halves, for a length rounded up to a power of two."""
-    n = values.size
-    if n == 0:
-        return 0.0
-    values = values.copy()
-    while n > 1:
-        half = 1
-        while 2 * half < n:
-            half *= 2
-        for i in range(half, n):
-            values[i - half] += values[i]
-        n = half
-    return values[0]
 
 
 @part
@@ -227,12 +211,12 @@ def _distribute(index, predicted, chosen, rows, K, width, view, sums):
     retained, work = np.empty(visible.size, np.int64), np.empty(8 + capacity, packed.dtype)
     near, density, added = np.empty((FIELDS, capacity)), np.empty(capacity), np.empty((3, capacity))
     point, row = np.empty(3), np.empty(4)
-    row[3] = settings[0]
+    row[3] = settings.prior_weight
     for cell in range(start.size - 1):
         if start[cell] == start[cell + 1]:
             continue
         box = _box(points, order, start[cell], start[cell + 1])
-        count = cull(packed, visible.size, settings[4], box, settings, work, retained)
+        count = cull(packed, visible.size, settings.among, box, settings, work, retained)
         n = padded(count)
         for i in range(count):
             for field in range(FIELDS):

@@ -17,7 +17,7 @@ from torch import Tensor
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels.compile_cpu import contracted, kernel
 from ufmstar_torch.kernels.cpu.calls import array, each, shares_of_stream
-from ufmstar_torch.kernels.cpu.regress_cull import in_view
+from ufmstar_torch.kernels.cpu.regress_cull import View, in_view
 from ufmstar_torch.kernels.cpu.regress_near import near
 from ufmstar_torch.kernels.cpu.regress_tiles import exact, exact_at
 from ufmstar_torch.steps.regress import HALF, Regression
@@ -25,8 +25,6 @@ from ufmstar_torch.steps.regress import HALF, Regression
 # Share of the denominator that culling may leave out: about the rounding of a sum in the dtype, so that culling is no
 # coarser than the arithmetic itself.
 EPSILON = {torch.float32: 1e-6, torch.float64: 1e-14}
-
-View = tuple[Any, ...]  # what `in_view` returns
 
 
 class Seen(NamedTuple):

@@ -56,13 +56,13 @@ def _statistics(values, out, counts):
                 count += 1
         number = values.dtype.type(count)
         counts[row] = count
-        mean = out[0, row] = _folded(terms) / number
+        mean = out[0, row] = folded(terms) / number
         for i in range(n):
             difference = values[row, i] - mean
             terms[i] = difference * difference if difference == difference else 0
         out[1, row] = out[2, row] = out[3, row] = np.nan
         if count > 1:
-            out[1, row] = _folded(terms) / (number - values.dtype.type(1))
+            out[1, row] = folded(terms) / (number - values.dtype.type(1))
         if count > 0:
             out[2, row] = _smallest(present, count, (count - 1) // 2)
             largest = present[0]
@@ -72,9 +72,11 @@ def _statistics(values, out, counts):
 
 
 @leaf
-def _folded(values):
-    """The sum in the order of ``fixed_order.total``; overwrites the values."""
+def folded(values):
+    """The sum in the order of ``fixed_order.total``, 0 of no values; overwrites the values."""
     n = values.size
+    if n == 0:
+        return values.dtype.type(0)
     while n > 1:
         half = 1
         while 2 * half < n:
