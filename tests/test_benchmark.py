@@ -93,6 +93,9 @@ def bench(path, *words):
     return json.loads(path.read_text())
 
 
+RATIOS = ("mean of 1,000 pixels / step", "check and average / step")
+
+
 def test_a_tiny_run_from_end_to_end(tmp_path, capsys):
     report = bench(tmp_path / "bench.json", "--sizes", "64", "96", "--backends", "auto", "torch", "--streams", "1", "3")
     assert [result["map"] for result in report["results"]] == ["64 x 64", "96 x 96"]
@@ -121,6 +124,14 @@ def test_a_tiny_run_from_end_to_end(tmp_path, capsys):
     assert all(line["step"]["count"] == 2 and line["step"]["min_ms"] > 0 for line in small["streams"])
     assert printed.out.count("\n3 streams at once: step ") == 2
     assert "fastdepth 96 x 96, 5 frames" in printed.err
+    assert small["ratios"].keys() == {
+        *RATIOS,
+        *(f"{name} / network" for name in ("step", "step with corners", "default")),
+    }
+    for name, ratio in small["ratios"].items():
+        assert f"\n{name}: {ratio:.3f}\n" in printed.out
+    assert small["ratios"]["step / network"] == plain["ratios_to_depth"]["multiview"]["median"]
+    assert small["ratios"]["default / network"] == posterior["ratios_to_depth"]["multiview"]["median"]
 
 
 def test_a_network_of_ones_own_on_a_recording(tmp_path):
@@ -131,6 +142,10 @@ def test_a_network_of_ones_own_on_a_recording(tmp_path):
     assert result["map"] == "224 x 224"
     assert result["sequence"]["layout"] == "tum"
     assert result["networks"]["depth_only"]["latency"]["once"]["count"] == 2
+    overlapped = result["overlapped"]
+    assert overlapped["latency"]["count"] == overlapped["ratio_to_network"]["count"] == 1, "nothing overlaps the last"
+    assert len(result["ratios"]) == 6
+    assert overlapped["ratio_to_network"]["median"] in result["ratios"].values()
     assert cli.main(["bench", "--sequence", "nowhere"]) == 2
 
 

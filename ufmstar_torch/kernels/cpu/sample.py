@@ -10,6 +10,7 @@ from torch import Tensor
 from ufmstar_torch.frames.output import SampleStatistics
 from ufmstar_torch.kernels.compile_cpu import kernel, leaf
 from ufmstar_torch.kernels.cpu.arrays import array
+from ufmstar_torch.kernels.cpu.sums import folded
 from ufmstar_torch.steps.sample import random_order
 
 
@@ -56,33 +57,19 @@ def _statistics(values, out, counts):
                 count += 1
         number = values.dtype.type(count)
         counts[row] = count
-        mean = out[0, row] = _folded(terms) / number
+        mean = out[0, row] = folded(terms) / number
         for i in range(n):
             difference = values[row, i] - mean
             terms[i] = difference * difference if difference == difference else 0
         out[1, row] = out[2, row] = out[3, row] = np.nan
         if count > 1:
-            out[1, row] = _folded(terms) / (number - values.dtype.type(1))
+            out[1, row] = folded(terms) / (number - values.dtype.type(1))
         if count > 0:
             out[2, row] = _smallest(present, count, (count - 1) // 2)
             largest = present[0]
             for i in range(1, count):
                 largest = max(largest, present[i])
             out[3, row] = largest
-
-
-@leaf
-def _folded(values):
-    """The sum in the order of ``fixed_order.total``; overwrites the values."""
-    n = values.size
-    while n > 1:
-        half = 1
-        while 2 * half < n:
-            half *= 2
-        for i in range(half, n):
-            values[i - half] += values[i]
-        n = half
-    return values[0]
 
 
 @leaf
