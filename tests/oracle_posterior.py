@@ -24,7 +24,7 @@ REACH, RADIUS, NEAR, WEAK, CLIP, APART = 1.0, 0.15, 0.05, 0.25**2, 9.0, 0.5
 
 
 def start():
-    return {"frames": 0, "m0": 0.0, "b": np.zeros(4), "C": np.diag(PRIOR),
+    return {"frames": 0, "m0": 0.0, "slopes": np.zeros(3), "b": np.zeros(4), "C": np.diag(PRIOR),
             "sums": {k: [v * n, n] for k, (v, n, _, _) in START.items()}}  # fmt: skip
 
 
@@ -182,7 +182,9 @@ def update(state, depth, claimed, pixel, g, variance, motion=None):
         new[name] = (weights * (part + square - total) * unit).sum(), weights.sum()
     z2 = np.minimum(residual**2 / total, CLIP)
     new |= discs(state, logs, Q, mean0, H, y, weight, noise, z2, node, u, v, stated - 1 / N, away)
-    after = {"frames": state["frames"] + 1, "m0": m0, "b": mean[:4], "C": C[:4, :4], "sums": {}}
+    weights = 3 + sum(MEMORY**k for k in range(state["frames"] + 1))
+    slopes = state["slopes"] * (1 - 1 / weights) + mean[1:4] / weights
+    after = {"frames": state["frames"] + 1, "m0": m0, "slopes": slopes, "b": mean[:4], "C": C[:4, :4], "sums": {}}
     after["scores"] = new.pop("scores")
     for name, (value, prior, low, high) in START.items():
         above, below = state["sums"][name]
@@ -204,6 +206,8 @@ def update(state, depth, claimed, pixel, g, variance, motion=None):
         p = 1 - (1 - p) * (1 - moving(motion, depth.shape, logs, offset, share, ratio(after, "between")))
     alone = [second_moment(0.0, *each) for each in zip(spread, offset, wide, strict=True)]
     spread = [second_moment(*each) for each in zip(p, spread, offset, wide, strict=True)]
+    for k, x in enumerate(HX[:, 1:4]):
+        offset[k] += share[k] ** 2 / (share[k] ** 2 + 0.3**2) * (x @ (slopes - mean[1:4]))
     posterior, variance, outlier = read(depth, np.nan_to_num(claimed), logs, mean[:4], offset, spread, p, share)
     _, inlier, _ = read(depth, 0 * depth, logs, mean[:4], offset, alone, p, share)
     return after, posterior, variance, inlier, outlier

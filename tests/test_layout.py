@@ -155,7 +155,7 @@ def test_kernels_import_back_only_plain_types():
             continue  # calls the kernels; all else is the reference's code
         for module, names in imported(path):
             if module.startswith("ufmstar_torch.") and "kernels" not in module:
-                allowed = {n for n in names if n in plain or module == "ufmstar_torch.steps.segment_input"}
+                allowed = {n for n in names if n in plain}
                 assert set(names) == allowed, f"{path} imports {names} from {module}"
 
 

@@ -13,7 +13,7 @@ from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.anchors.anchors import check_anchors
 from ufmstar_torch.frames.frame import check_frame
-from ufmstar_torch.kernels.host import moved
+from ufmstar_torch.kernels.select import moved
 from ufmstar_torch.posterior import field
 from ufmstar_torch.posterior.running import FEATURES, SIZE, Running
 from ufmstar_torch.posterior.scene import SIDE, elsewhere_variance, second_moments
@@ -156,11 +156,32 @@ def test_on_device_meta_the_results_have_shapes():
         assert (value.shape, value.dtype) == (same.shape, same.dtype)
 
 
-def updated(depth, anchors, claimed=None, packed=None):
+def updated(depth, anchors, claimed=None, packed=None, config=MODEL):
     """State and posterior after a frame of one stream."""
     packed = torch.zeros(1, SIZE, dtype=torch.float64) if packed is None else packed
     claimed = np.zeros_like(depth) if claimed is None else claimed
-    return update(packed, *checked(depth, *anchors), torch.from_numpy(claimed)[None], MODEL)
+    return update(packed, *checked(depth, *anchors), torch.from_numpy(claimed)[None], config)
+
+
+def test_far_from_evidence_the_slopes_are_the_stream_s_mean():
+    """Ten frames show a network of right shape; then anchors in the left quarter show errors that fall to the right.
+    At the right border, the correction is nearer to the network's shape than to the line through these anchors."""
+    depth, everywhere = (
+        np.full((36, 48), 2.0),
+        np.stack([x.ravel() for x in np.mgrid[1:48:3, 1:36:3]], -1).astype(float),
+    )
+    left, none = everywhere[everywhere[:, 0] < 12], np.zeros(len(everywhere))
+    frames = [(everywhere, none)] * 10 + [(left, 0.5 - left[:, 0] / 48)]
+    outs = []
+    for config in (MODEL, type("Extrapolated", (PosteriorConfig,), {"slope_reach": 1e9})()):
+        packed = None
+        for pixel, y in frames:
+            packed, out = updated(depth, (pixel, 2 * np.exp(y), np.full(len(y), 1e-4)), packed=packed, config=config)
+        outs.append(out)
+    near, far = (np.log([o.depth[0, :, column].mean() / 2 for o in outs]) for column in (6, 47))
+    assert near[0] == pytest.approx(near[1], abs=0.02)
+    assert far[1] < -0.1
+    assert far[0] > far[1] / 2
 
 
 def test_without_anchors_the_slopes_of_the_correction_revert_and_its_scale_remains():

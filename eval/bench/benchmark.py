@@ -14,7 +14,6 @@ from ufmstar_torch.eval.bench.networks import ONCE, TimedNetwork
 from ufmstar_torch.eval.bench.overlap import time_overlap
 from ufmstar_torch.eval.bench.parts import MULTIVIEW
 from ufmstar_torch.eval.bench.settings import ARCHITECTURES, TOUR, BenchSettings
-from ufmstar_torch.eval.bench.streams import time_streams
 from ufmstar_torch.eval.bench.timing import most_threads
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.methods.method import BASES, Method
@@ -60,9 +59,6 @@ def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None
             None if isinstance(network, _Random) else time_overlap(network, sequence, device=device, plan=plan)
         )
         result["ratios"] = _ratios(result)
-        result["streams"] = []
-        if options.streams:
-            result["streams"] = time_streams(network, sequence, options.streams, device=device, plan=plan)
         results.append(result)
     used = {name: str(value) for name, value in vars(options).items() if value is not None}
     return {"schema": 2, "date": datetime.now(UTC).isoformat(timespec="seconds"), "options": used, "results": results}
@@ -162,7 +158,4 @@ def _lines(result: Mapping[str, Any]) -> list[str]:
             stages = row["stages"]["stages"].items()
             lines.append(f"stages of {row['row']}: " + ", ".join(f"{n} {t['median_ms']:.2f}" for n, t in stages))
     lines += [f"{name}: {ratio:.3f}" for name, ratio in result["ratios"].items()]
-    for line in result["streams"]:
-        forms = (f"{name} {line[name]['median_ms']:.2f} ms" for name in ("step", "graph") if name in line)
-        lines.append(f"{line['streams']} streams at once: {', '.join(forms)}")
     return [*lines, *(f"no energy of the {unit}: {why}" for unit, why in result["power"]["missing"].items())]

@@ -5,16 +5,17 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from ufmstar_torch.eval.commands.errors import usage_errors
-from ufmstar_torch.eval.commands.opening import OpeningOptions
+from ufmstar_torch.eval.commands.opening import Recording
 from ufmstar_torch.eval.commands.options import (
     Count,
     Flag,
     MachineOptions,
     Text,
     Words,
+    arg,
     as_dict,
     joined,
     reader,
@@ -142,9 +143,9 @@ class EvalOptions(MachineOptions):
     processes: int = 1
     scheduler: Text = None
     dry_run: Flag = False
-    what: SuiteOptions
+    what: Annotated[SuiteOptions, arg(name="suite")]
     data: DataOptions
-    opening: OpeningOptions
+    opening: Recording
     output: EvalOutputOptions
 
     def __post_init__(self) -> None:
@@ -235,10 +236,10 @@ def _evaluate(options: EvalOptions) -> int:
 
 def _report(job: EvalJob, outcome: EvalOutcome, options: EvalOptions) -> int:
     """Print the table, measure, draw the report, print the failures. Returns the exit code."""
+    from ufmstar_torch.eval.engine.record import ResultsError
     from ufmstar_torch.eval.report.data import load_results
     from ufmstar_torch.eval.report.text import summary, written
     from ufmstar_torch.eval.report.write import write_report
-    from ufmstar_torch.eval.suite.record import ResultsError
 
     try:
         print(summary(load_results(job.out, with_sums=False)))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from ufmstar_torch.eval.commands.depth import NetworkOptions, PosteriorOptions
 from ufmstar_torch.eval.commands.errors import usage_errors
-from ufmstar_torch.eval.commands.opening import OpeningOptions
+from ufmstar_torch.eval.commands.opening import Recording
 from ufmstar_torch.eval.commands.options import (
     File,
     Flag,
@@ -87,7 +87,7 @@ class LiveOptions(MachineOptions):
     overwrite: Flag = False
     view: Flag = False
     json: Flag = False
-    opening: OpeningOptions
+    opening: Recording
     network: NetworkOptions
     uncertainty: PosteriorOptions
 
@@ -122,9 +122,9 @@ read = reader(LiveOptions, "ufmstar live")
 
 def main(options: LiveOptions) -> int:
     """Run until the source ends, and print the real-time table; the exit code."""
+    from ufmstar_torch.eval.engine.files import write_json_atomic
     from ufmstar_torch.eval.engine.realtime import RealTime
     from ufmstar_torch.eval.report.text import realtime_table
-    from ufmstar_torch.eval.run.files import write_json_atomic
     from ufmstar_torch.eval.run.folder import FolderKind, output_folder
     from ufmstar_torch.eval.run.machine import share_threads
     from ufmstar_torch.eval.run.rerun_log import RerunLog, open_viewer
@@ -259,7 +259,7 @@ def _write(out: Path, result: LiveResult) -> None:
     """Write the maps of an image to OUT/STAMP.npz."""
     import numpy as np
 
-    from ufmstar_torch.eval.run.files import write_atomic
+    from ufmstar_torch.eval.engine.files import write_atomic
 
     of = result.out
     maps = {"depth": of.depth, "variance": of.variance, "disagreement": of.disagreement}

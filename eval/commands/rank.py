@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -89,7 +90,6 @@ def _scores(options: RankOptions) -> ImageScores:
     """Stream the sequences."""
     from ufmstar_torch.eval.engine.progress import frame_progress
     from ufmstar_torch.eval.engine.stream import Stopped, frame_results
-    from ufmstar_torch.eval.run.depth_check import DepthCheck
     from ufmstar_torch.eval.run.rank import ImageScores, require_part
     from ufmstar_torch.eval.run.run import warm_up_job
     from ufmstar_torch.frames.warnings import LOGGER
@@ -106,17 +106,14 @@ def _scores(options: RankOptions) -> ImageScores:
             source, scores.sequence = job.source, path
             if job.image_fit is not None and job.image_fit.problem:
                 LOGGER.warning("%s: %s", path, job.image_fit.problem)
-            check, shown = DepthCheck(job), frame_progress(bars.show, len(job.indices))
+            shown = frame_progress(bars.show, len(job.indices))
             try:
                 with closing(frame_results(job.sequence, job.indices, [job.row()[0]], stop=stop)) as results:
                     for result in results:
                         scores.add(result)
-                        check.add(result)
                         shown(result)
             except Stopped:
                 raise KeyboardInterrupt from None
-            if (fit := check.fit()) is not None and fit.problem:
-                LOGGER.warning("%s: %s", path, fit.problem)
     return scores
 
 
@@ -124,9 +121,8 @@ def _write(options: RankOptions, scores: ImageScores) -> int:
     """Write scores.csv, the contact sheet and rank.json, and print the first images; the exit code."""
     import pandas as pd
 
-    from ufmstar_torch.eval.report.table import csv_text
-    from ufmstar_torch.eval.report.text import aligned
-    from ufmstar_torch.eval.run.files import write_bytes_atomic, write_json_atomic
+    from ufmstar_torch.eval.engine.files import write_bytes_atomic, write_json_atomic
+    from ufmstar_torch.eval.report.table import aligned, csv_text
     from ufmstar_torch.eval.run.panels import contact_sheet
     from ufmstar_torch.eval.run.pictures import SHEET
 
@@ -150,4 +146,7 @@ def _write(options: RankOptions, scores: ImageScores) -> int:
     print("\n".join(aligned(shown)))
     above = f", the first {_SHOWN} above" if len(chosen) > _SHOWN else ""
     print(f"{out}: {', '.join(files)}; {len(lines)} images, {len(chosen)} with a rank{above}")
+    if unmeasured := sum(math.isnan(image.score) for image in scores.images):
+        seen = f"less than {options.measured:.0%} of their pixels were seen from two places (--measured)"
+        print(f"{unmeasured} of them cannot be ranked: {seen}")
     return 0 if chosen else 1

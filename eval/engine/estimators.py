@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import MISSING, fields, replace
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
@@ -20,10 +20,8 @@ from ufmstar_torch.eval.methods.setting import configured
 from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.frames.output import FrameStatistics, UncertaintyOutput
 from ufmstar_torch.frames.prediction import DepthPrediction
-from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.posterior.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar
-from ufmstar_torch.uncertain_depth import maps_of
 
 
 class Estimator(ABC):
@@ -102,12 +100,12 @@ def ufm_star_config(row: Row) -> UfMStarConfig:
 
 
 def output_of(depth: Tensor, variance: Tensor | None, valid: Tensor, **maps: Tensor | None) -> UncertaintyOutput:
-    """The output of a method other than UfM*, from maps [1, h, w]: NaN where not valid; all counts but that of the
-    valid pixels are 0. ``variance``: None = the method states none."""
+    """The output of a method other than UfM*, from maps [1, h, w]: NaN where not valid, and no components.
+    ``variance``: None = the method states none."""
     variance = torch.full_like(depth, torch.nan) if variance is None else variance
     none = torch.zeros(len(depth), dtype=torch.int64)
-    counts = {f.name: none for f in fields(FrameStatistics) if f.default is MISSING}
-    statistics = FrameStatistics(**{**counts, "valid_pixels": valid.sum((1, 2)).cpu()})
+    counts = dict.fromkeys(("components", "segments", "matched"), none)
+    statistics = FrameStatistics({**counts, "valid_pixels": valid.sum((1, 2)).cpu()})
     named = {name: value for name, value in maps.items() if value is not None}
     return UncertaintyOutput(depth, torch.where(valid, variance, torch.nan), valid, named, statistics)
 
@@ -179,16 +177,11 @@ class Gaussians(Estimator):
     def update(
         self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None
     ) -> UncertaintyOutput:
-        maps = maps_of(self.used(prediction), self.ufm)
+        maps = self.used(prediction).arguments(confidence=self.ufm.uses_confidence)
         out = self.ufm(pose=T_world_cam, intrinsics=prediction.K, anchors=anchors, **maps)
         used = out.statistics.anchors_used
         self._anchors = 0 if used is None else int(used[0])
         return out
-
-    def mixture_world(self) -> GaussianMixture:
-        """[1, K] M_i in the world's frame, float64; after a frame."""
-        T = self.ufm.T_world_first.double()
-        return self.ufm.mixture.to(torch.float64).rigid(T[:, :3, :3], T[:, :3, 3])
 
     def memory(self) -> dict[str, float]:
         """Bytes and number of the occupied components, anchor terms included; bytes of the moving average."""

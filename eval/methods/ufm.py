@@ -94,7 +94,7 @@ class UfM:
             stated = [value.detach() for value in (frame.aleatoric, frame.epistemic) if value is not None]
             s2 = sum(stated, start=torch.zeros_like(frame.depth))
             views = map(View, frame.depth, s2, frame.valid, frame.intrinsics, *relative_pose(frame.T_world_cam, first))
-            taken = [take_in(cloud, view, self.max_points) for cloud, view in zip(clouds, views, strict=True)]
-            variance = torch.stack([variance for _, variance in taken]).to(frame.depth.dtype)
-        self.clouds, self.T_world_first = tuple(cloud for cloud, _ in taken), first
+            steps = [take_in(cloud, view, self.max_points) for cloud, view in zip(clouds, views, strict=True)]
+            variance = torch.stack([variance for _, variance in steps]).to(frame.depth.dtype)
+        self.clouds, self.T_world_first = tuple(cloud for cloud, _ in steps), first
         return UfMOutput(variance, frame.valid)

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.run.files import remove_temporaries, to_json, write_json_atomic
-from ufmstar_torch.files.lock import hold as hold
+from ufmstar_torch.eval.engine.files import remove_temporaries, to_json, write_json_atomic
+from ufmstar_torch.files.write import hold as hold
 from ufmstar_torch.runtime.checked import flat
 
 _SHOWN = 5  # number of differences in a message

@@ -91,7 +91,7 @@ def read(path: Path, options: Options) -> FrameSequence:
             entries.append(Skipped(name, "the image's header cannot be read"))
             continue
         depth = None if _SIGMA in frame else frame.get("depth_file_path")
-        load_depth = depth_loader(listed_file(file.parent, depth), scale, scale) if isinstance(depth, str) else None
+        load_depth = depth_loader(listed_file(file.parent, depth), scale) if isinstance(depth, str) else None
         entries.append(Entry(name, _pose(frame, offset, file), partial(read_color, image_file), load_depth))
     if any(_SIGMA in frame for frame in frames):
         LOGGER.warning("%s: no ground truth: its depth is a prediction, with a sigma beside it", file)

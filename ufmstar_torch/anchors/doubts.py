@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ufmstar_torch.anchors.anchors import FARTHEST_OFF, Anchors
 from ufmstar_torch.anchors.epipolar import median
 from ufmstar_torch.frames.frame import AnchorInput
-from ufmstar_torch.kernels.cpu.arrays import array
+from ufmstar_torch.kernels.cpu.calls import array
 
 _LOG = logging.getLogger("ufmstar_torch")
 _FEW = 8  # least anchors of a frame that are judged

@@ -18,7 +18,7 @@ from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.anchors.landmarks import Landmarks, LandmarkSource
 from ufmstar_torch.anchors.names import CORNERS, DENSE, FILE_TYPES
 from ufmstar_torch.anchors.tracker import LandmarkTracker
-from ufmstar_torch.files.arrays import read_npz
+from ufmstar_torch.files.read import read_npz
 from ufmstar_torch.gaussians.camera import invert_rigid
 
 # Largest number of landmarks in one image; a tracker follows 300.

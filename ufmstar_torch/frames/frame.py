@@ -129,6 +129,13 @@ class FrameInput:
         """Image height and width [px]."""
         return self.depth.shape[-2], self.depth.shape[-1]
 
+    @property
+    def informative_depth(self) -> Tensor:
+        """The depth to segment [B, H, W]: 0 where not valid, and everywhere in an image that shows nothing."""
+        if self.informative is None:
+            return self.depth
+        return torch.where(self.informative[:, None, None], self.depth, torch.zeros_like(self.depth))
+
 
 def check_values(
     depth: Tensor,

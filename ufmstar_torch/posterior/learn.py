@@ -47,8 +47,9 @@ def learnt(
     ``away`` [R C]: distance of every node from evidence."""
     sums, scores = _of_discs(scene, weight, left_out, running, away)
     above, below = running.added(_of_neighbours(scene, left_out, running) | sums)
-    first = [running.frames + 1, scene.grid.mean]
-    return np.concatenate([first, above, below, field.coefficients, field.covariance.ravel()]), scores
+    first, b = [running.frames + 1, scene.grid.mean], field.coefficients
+    memory = [first, above, below, running.with_slopes(b[1:]), b, field.covariance.ravel()]
+    return np.concatenate(memory), scores
 
 
 def _of_neighbours(scene: Scene, left_out: LeftOut, running: Running) -> dict[str, tuple[float, float]]:

@@ -213,6 +213,14 @@ def wrong_factor(config: PosteriorConfig, away: Floats, scale: Floats) -> Floats
     return factor
 
 
+def slopes_away(config: PosteriorConfig, x: Floats, away: Floats, slopes: Floats, mean: Floats) -> Floats:
+    """[n] change of y at nodes with features ``x`` [n, 4] and distances ``away`` [n] from evidence, where the ``mean``
+    slopes [3] of the stream replace those of the frame: what its anchors show is no evidence far from them."""
+    share = away**2 / (away**2 + config.slope_reach**2)
+    change: Floats = share * (x[:, 1:] @ (mean - slopes))
+    return change
+
+
 def unmeasured(config: PosteriorConfig, variance: float) -> float:
     """Share in [0, 1] of the prior that is left: the squared share of the ``variance`` of b's constant in that before
     the first anchor."""

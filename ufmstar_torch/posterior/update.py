@@ -5,8 +5,12 @@ At an anchor of depth g the network's error is y = log(g/d). Its model over the 
     y = b . (1, log d - m_0, u, v) + f.
 
 b's constant follows a random walk from frame to frame; its slopes revert to 0, so that without evidence the depth fades
-to the network's shape at the stream's scale. f is a Gaussian field on a grid whose links are weaker across edges of the
-predicted depth (``grid``, ``field``). An anchor of standard deviation s observes y with the variance
+to the network's shape at the stream's scale. At the distance a from evidence the slopes are those of the frame and the
+mean slopes of the stream (``running``), with the shares l^2/(a^2 + l^2) and a^2/(a^2 + l^2), l = ``slope_reach``: in a
+turn, anchors at one side of the image are no evidence of the network's shape at the other.
+
+f is a Gaussian field on a grid whose links are weaker across edges of the predicted depth (``grid``, ``field``). An
+anchor of standard deviation s observes y with the variance
 
     n = roughness + blur^2 + noise s^2/g^2 + alone/N.
 
@@ -70,8 +74,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.frames.frame import AnchorInput, FrameInput
-from ufmstar_torch.kernels.cpu.arrays import array
-from ufmstar_torch.kernels.cpu.threads import each
+from ufmstar_torch.kernels.cpu.calls import array, each
 from ufmstar_torch.posterior.cells import cell_means, features, read
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.field import at
@@ -92,6 +95,7 @@ from ufmstar_torch.posterior.scene import (
     misscaled,
     scene_of,
     second_moments,
+    slopes_away,
     spread_around,
     steepness,
     unmeasured,
@@ -212,6 +216,7 @@ def _of_stream(
         P = probability(offset, grid.log_depth, away / config.reach, tests, updated.ratios["between"], (rows, cols))
         p = 1 - (1 - p) * (1 - P)
     variance, inlier = second_moments(config, scale * variance, p, offset, wide)
+    offset = offset + slopes_away(config, x, away, b[1:], updated.slopes)
     nodes = np.stack([grid.log_depth, offset, variance, inlier, p, away / config.reach], 1)
     depth, spread, inlier, p = read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
     return memory, depth, spread, p, inlier, updated, scores

@@ -21,13 +21,12 @@ from ufmstar_torch.anchors.learn import Learnt
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.frame import AnchorInput, FrameInput
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, part
-from ufmstar_torch.kernels.cpu.arrays import array
+from ufmstar_torch.kernels.cpu.calls import array, each
 from ufmstar_torch.kernels.cpu.regress import Seen, View
 from ufmstar_torch.kernels.cpu.regress_cull import FIELDS, cull
 from ufmstar_torch.kernels.cpu.regress_vectors import TERMS, add_shares
 from ufmstar_torch.kernels.cpu.rigid import padded
-from ufmstar_torch.kernels.cpu.sums import folded
-from ufmstar_torch.kernels.cpu.threads import each
+from ufmstar_torch.kernels.cpu.sample import folded
 
 _PER_CELL = 16  # mean number of anchors in a cell of the search for components
 _NEGLIGIBLE = 1e-30  # smaller means become 0, before single precision loses them
@@ -153,7 +152,7 @@ def _learn(
     for c in range(3):  # rounded to the state's dtype
         for i in range(valid.size):
             column[i] = rows[i, c]
-        overall[c] = fade * overall_before[c] + (folded(column) if valid.size > 0 else 0.0)
+        overall[c] = fade * overall_before[c] + folded(column)
     for c in range(2):
         stream[c] = np.float64(overall[c + 1]) / (np.float64(overall[0]) + shrinkage)
     for k in range(component.shape[0]):
@@ -167,9 +166,9 @@ def _learn(
     last = features.shape[1] - 1
     for k in range(features.shape[0]):
         features[k, last - 2], features[k, last - 1] = beyond[k, 0], beyond[k, 1]
-    for i in range(view[0].size):
-        k = view[0][i]
-        view[3][i, TERMS - 1], view[3][i, TERMS - 2] = beyond[k, 0], beyond[k, 1]
+    for i in range(view.slot.size):
+        k = view.slot[i]
+        view.terms[i, TERMS - 1], view.terms[i, TERMS - 2] = beyond[k, 0], beyond[k, 1]
 
 
 @part
@@ -183,7 +182,7 @@ def _rows(predicted, depth, variance, network_variance, supported, rows):
             others += 1
             r = depth[i] / predicted[i] - 1
             squares[i] = terms[i] = r * r
-    total = folded(terms) if n > 0 else 0.0
+    total = folded(terms)
     others = max(others, 0)
     for i in range(n):
         rows[i, 0] = rows[i, 1] = rows[i, 2] = 0.0
@@ -219,12 +218,12 @@ def _distribute(index, predicted, chosen, rows, K, width, view, sums):
     near, added = empty((FIELDS, capacity), np.float64), empty((3, capacity), np.float64)
     density = empty(capacity, np.float64)
     point, row = empty(3, np.float64), empty(4, np.float64)
-    row[3] = settings[0]
+    row[3] = settings.prior_weight
     for cell in range(start.size - 1):
         if start[cell] == start[cell + 1]:
             continue
         box = _box(points, order, start[cell], start[cell + 1])
-        count = cull(packed, visible.size, settings[4], box, settings, work, retained)
+        count = cull(packed, visible.size, settings.among, box, settings, work, retained)
         n = padded(count)
         for i in range(count):
             for field in range(FIELDS):

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
-from ufmstar_torch.steps.views import COMPLETE, LEAST
+from ufmstar_torch.steps.fuse import COMPLETE, LEAST
 
 _SWEEPS = 12  # an upper bound: the loops end when a sweep no longer rotates
 _NEGLIGIBLE = 16 * np.finfo(np.float64).eps
@@ -164,7 +164,7 @@ def lift(mean, covariance, weight, near, focal, widening, epsilon):
 
 @leaf
 def view_weight(mean, reference, view, baseline, near):
-    """w of a comparison of a component with a new view (``steps.views``); ``baseline`` 0 = the paper's 1."""
+    """w of a comparison of a component with a new view (``steps.fuse``); ``baseline`` 0 = the paper's 1."""
     if baseline == 0 or reference[3] != view[3]:
         return 1.0
     moved = reach = 0.0

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from ufmstar_torch.frames.output import SampleStatistics
 from ufmstar_torch.kernels.compile_cpu import kernel, leaf
-from ufmstar_torch.kernels.cpu.arrays import array
-from ufmstar_torch.kernels.cpu.sums import folded
+from ufmstar_torch.kernels.cpu.calls import array
 from ufmstar_torch.steps.sample import random_order
 
 
@@ -70,6 +69,22 @@ def _statistics(values, out, counts):
             for i in range(1, count):
                 largest = max(largest, present[i])
             out[3, row] = largest
+
+
+@leaf
+def folded(values):
+    """The sum in the order of ``fixed_order.total``, 0 of no values; overwrites the values."""
+    n = values.size
+    if n == 0:
+        return values.dtype.type(0)
+    while n > 1:
+        half = 1
+        while 2 * half < n:
+            half *= 2
+        for i in range(half, n):
+            values[i - half] += values[i]
+        n = half
+    return values[0]
 
 
 @leaf

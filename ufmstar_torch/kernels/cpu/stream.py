@@ -75,7 +75,7 @@ def join(pose, first, member, slots, segments, pairs, distance, new, occupied, s
         new: [C] which segments to append, from slot ``occupied`` on.
         settings: as :func:`fuse_pairs`: whether weighted by overlap, epsilon, b_0 (0 = the paper) and near plane.
         extra: number of columns after the mixture's features. The last one is the feature of
-            ``unmeasured.before_regression``; the others are not written.
+            ``regress.with_measured_share``; the others are not written.
 
     Returns:
         The n components by field [13, n and more], their disagreement [n] and features [n, F] for the regression.

@@ -25,8 +25,7 @@ from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.kernels.triton.launch import launch, power_of_two
 from ufmstar_torch.kernels.triton.listing import EPSILON, FIELDS, PRIOR, prepare
 from ufmstar_torch.kernels.triton.matrices import lowest_bit
-from ufmstar_torch.steps import unmeasured
-from ufmstar_torch.steps.regress import Regression
+from ufmstar_torch.steps.regress import HALF, Regression
 
 _SIDE = 16  # pixels of a tile
 _CHUNK = 32  # components bounded at a time, the bits of a mask
@@ -126,7 +125,7 @@ def _launch(
         least=math.log2(PRIOR * config.prior_weight), share=math.log2(EPSILON[depth.dtype] / 3) - 0.01,
         slack=16 * torch.finfo(depth.dtype).eps, channels=channels, padded=power_of_two(channels), side=_SIDE,
         chunk=_CHUNK, subset=subset, stepped=stepped is not None, alpha=alpha, mode=_UNMEASURED[config.unmeasured],
-        relative=config.unmeasured_relative, half=unmeasured.HALF, near=near, stride=FIELDS[near],
+        relative=config.unmeasured_relative, half=HALF, near=near, stride=FIELDS[near],
         near_radius=config.near_radius, far_radius=config.far_radius,
     )  # fmt: skip
 
