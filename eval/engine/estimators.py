@@ -104,7 +104,7 @@ def output_of(depth: Tensor, variance: Tensor | None, valid: Tensor, **maps: Ten
     ``variance``: None = the method states none."""
     variance = torch.full_like(depth, torch.nan) if variance is None else variance
     none = torch.zeros(len(depth), dtype=torch.int64)
-    counts = dict.fromkeys(("components", "segments", "matched"), none)
+    counts = dict.fromkeys(("fault", "components", "segments", "matched"), none)
     statistics = FrameStatistics({**counts, "valid_pixels": valid.sum((1, 2)).cpu()})
     named = {name: value for name, value in maps.items() if value is not None}
     return UncertaintyOutput(depth, torch.where(valid, variance, torch.nan), valid, named, statistics)
