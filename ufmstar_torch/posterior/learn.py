@@ -48,8 +48,8 @@ def learnt(
     sums, scores = _of_discs(scene, weight, left_out, running, away)
     above, below = running.added(_of_neighbours(scene, left_out, running) | sums)
     first, b = [running.frames + 1, scene.grid.mean], field.coefficients
-    memory = [first, above, below, running.with_slopes(b[1:]), b, field.covariance.ravel()]
-    return np.concatenate(memory), scores
+    slopes = running.with_slopes(b[1:])
+    return np.concatenate([first, above, below, slopes, b, field.covariance.ravel()]), scores
 
 
 def _of_neighbours(scene: Scene, left_out: LeftOut, running: Running) -> dict[str, tuple[float, float]]:
