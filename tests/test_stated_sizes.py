@@ -169,8 +169,9 @@ def test_a_tensor_inside_an_onnx_graph(tmp_path, kind):
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
-        ({"fusion_hidden_size": 40_000}, "config.json states a model of [0-9,]+ bytes, its weights have [0-9,]+"),
+        ({"fusion_hidden_size": 40_000}, r"config\.json states a model of [0-9,]+ bytes, its weights have [0-9,]+"),
         ({"backbone_config": {"num_hidden_layers": 10**9}}, "states 1000000000 layers, at most 1000 can be"),
+        ({"fusion_hidden_size": -3}, r"cannot be loaded as a depth model"),
     ],
 )
 def test_a_configuration_of_transformers(tmp_path, changes, match):
