@@ -93,6 +93,9 @@ def bench(path, *words):
     return json.loads(path.read_text())
 
 
+RATIOS = ("mean of 1,000 pixels / step", "check and average / step")
+
+
 def test_a_tiny_run_from_end_to_end(tmp_path, capsys):
     report = bench(tmp_path / "bench.json", "--sizes", "64", "--backends", "auto", "torch")
     (small,) = report["results"]
@@ -118,6 +121,14 @@ def test_a_tiny_run_from_end_to_end(tmp_path, capsys):
     printed = capsys.readouterr()
     assert "UfM*-DepthOnly (anchors corners)" in printed.out
     assert "fastdepth 64 x 64, 4 frames" in printed.err
+    assert small["ratios"].keys() == {
+        *RATIOS,
+        *(f"{name} / network" for name in ("step", "step with corners", "default")),
+    }
+    for name, ratio in small["ratios"].items():
+        assert f"\n{name}: {ratio:.3f}\n" in printed.out
+    assert small["ratios"]["step / network"] == plain["ratios_to_depth"]["multiview"]["median"]
+    assert small["ratios"]["default / network"] == posterior["ratios_to_depth"]["multiview"]["median"]
 
 
 def test_each_size_has_its_table(tmp_path, capsys):
@@ -134,6 +145,10 @@ def test_a_network_of_ones_own_on_a_recording(tmp_path):
     assert result["map"] == "224 x 224"
     assert result["sequence"]["layout"] == "tum"
     assert result["networks"]["depth_only"]["latency"]["once"]["count"] == 2
+    overlapped = result["overlapped"]
+    assert overlapped["latency"]["count"] == overlapped["ratio_to_network"]["count"] == 1, "nothing overlaps the last"
+    assert len(result["ratios"]) == 6
+    assert overlapped["ratio_to_network"]["median"] in result["ratios"].values()
     assert cli.main(["bench", "--sequence", "nowhere"]) == 2
 
 

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
-from torchmetrics import Metric
+
+from ufmstar_torch.eval.metrics.torchmetrics_import import Metric
 
 COUNT, SUM = torch.int64, torch.float64  # kinds of states
 
