@@ -309,7 +309,7 @@ def read_checkpoint(name_or_dir: str | Path, revision: str | None = None, local_
 
 def _require_size(checkpoint: Checkpoint, dtype: torch.dtype) -> None:
     """Raises CheckpointError: the configuration of a directory states a model that is much larger than its weights, or
-    than the limit of layers; it is built without memory, on the device "meta"."""
+    than the limit of layers, or that cannot be built; it is built without memory, on the device "meta"."""
     from huggingface_hub.errors import StrictDataclassError
     from transformers import CONFIG_MAPPING, AutoModelForDepthEstimation
 
@@ -325,13 +325,17 @@ def _require_size(checkpoint: Checkpoint, dtype: torch.dtype) -> None:
         with torch.device("meta"):
             config = CONFIG_MAPPING[checkpoint.model_type].from_dict(checkpoint.config)
             model: nn.Module = AutoModelForDepthEstimation.from_config(config, dtype=dtype)
-    except (*DAMAGE, NotImplementedError, StrictDataclassError):
-        return  # the size is unknown; the loader builds the same model next, and its error names the fault
+    except (*DAMAGE, NotImplementedError, StrictDataclassError) as error:
+        raise _unbuilt(checkpoint, error) from error
     size = sum(tensor.nbytes for tensor in (*model.parameters(), *model.buffers()))
     stored = sum(file.stat().st_size for file in folder.iterdir() if file.suffix in (".safetensors", ".bin"))
     if size > max(MOST_BYTES, 4 * stored):  # 4: weights in 8 bits
         stated = f"a model of {size:,} bytes, its weights have {stored:,}"
         raise CheckpointError(f"{checkpoint.name}: config.json states {stated}: the files do not belong together")
+
+
+def _unbuilt(checkpoint: Checkpoint, error: Exception) -> CheckpointError:
+    return CheckpointError(f"{checkpoint.name} ({checkpoint.model_type}) cannot be loaded as a depth model: {error}")
 
 
 def _numbers(config: Any, key: str = "") -> Iterator[tuple[str, int]]:
@@ -363,9 +367,7 @@ def _load_model(checkpoint: Checkpoint, dtype: torch.dtype, allow_missing: tuple
             checkpoint.name, dtype=dtype, output_loading_info=True, **checkpoint.options
         )
     except (*DAMAGE, UnpicklingError, SafetensorError, StrictDataclassError) as error:
-        raise CheckpointError(
-            f"{checkpoint.name} ({checkpoint.model_type}) cannot be loaded as a depth model: {error}"
-        ) from error
+        raise _unbuilt(checkpoint, error) from error
     missing = sorted(key for key in report["missing_keys"] if not key.startswith(tuple(allow_missing)))
     if missing:
         raise CheckpointError(

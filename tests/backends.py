@@ -25,6 +25,7 @@ from ufmstar_torch.kernels.cpu import fuse as fuse_cpu
 from ufmstar_torch.kernels.cpu import regress as regress_cpu
 from ufmstar_torch.kernels.cpu import rigid as rigid_cpu
 from ufmstar_torch.kernels.cpu import segment as segment_cpu
+from ufmstar_torch.kernels.cpu import stream as stream_cpu
 from ufmstar_torch.kernels.select import moved, select_frame, select_kernels
 from ufmstar_torch.steps.correspond import Correspondence
 from ufmstar_torch.steps.step import REFERENCE, Kernels
@@ -146,7 +147,7 @@ def _floored(cov, floor):
     out, mean = cov.clone(), torch.zeros(*cov.shape[:-2], 3, dtype=cov.dtype)
     mean[..., 2] = floor.sqrt()  # a camera whose pixel is 1 wide at depth 1
     arrays = (value.numpy() for value in (mean.view(-1, 3), out.view(-1, 3, 3), torch.ones_like(floor).view(-1)))
-    fuse_cpu.lift(*arrays, 0.0, 1.0, 1.0, 0.0)
+    stream_cpu.lift(*arrays, 0.0, 1.0, 1.0, 0.0)
     return out
 
 

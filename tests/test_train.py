@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from onnx_files import write_fastdepth
 from shared_data import require_shared
 from trainings import RECIPE, SPEC, logged, scenes, tiny_job, trained, with_network, write_frames
 
@@ -318,12 +319,11 @@ def test_a_start_that_does_not_fit_is_refused(tmp_path):
 
 
 def test_the_shared_weights_are_starts():
-    spec = NetworkSpec(widths="pruned", norm=False)
+    spec = NetworkSpec(widths="pruned")
     onnx, resnet = require_shared("weights/fastdepth_nyu.onnx"), "weights/resnet50_v1_imagenet_fp16_nofc.pth"
-    try:
-        network = starting_network(spec, onnx)
-    except CheckpointError:
-        network = starting_network(replace(spec, norm=True), onnx)
+    network = starting_network(spec, onnx)
+    with pytest.raises(ValueError, match=r"has batch norms: --set network\.norm=true fits"):
+        starting_network(replace(spec, norm=False), onnx)
     from ufmstar_torch.models.fastdepth import FastDepth
 
     for key, value in FastDepth.from_onnx(onnx).state_dict().items():
@@ -335,6 +335,15 @@ def test_the_shared_weights_are_starts():
     network = starting_network(spec, require_shared(resnet))
     first = next(key for key in weights if key.endswith("conv1.weight"))
     assert torch.equal(network.backbone.encoder.state_dict()[first], weights[first].float())
+
+
+def test_a_file_with_folded_batch_norms_names_the_remedy(tmp_path):
+    source = build_network(SPEC).eval().backbone
+    path = write_fastdepth(tmp_path / "folded.onnx", source.folded(), SPEC.size[0])
+    with pytest.raises(ValueError, match=r"folded\.onnx has folded batch norms: --set network\.norm=false fits"):
+        starting_network(SPEC, path)
+    network = starting_network(replace(SPEC, norm=False), path)
+    assert torch.equal(network.backbone.head.conv.weight, source.folded().head.conv.weight)
 
 
 def test_only_the_named_part_is_trained(frames, tmp_path):

@@ -13,9 +13,8 @@ from torch import Tensor, nn
 from torch.nn.utils import get_total_norm
 from torch.optim import Adam
 from torch.optim.lr_scheduler import CosineAnnealingLR, LinearLR, LRScheduler, SequentialLR
-from torchmetrics import MetricCollection
 
-from ufmstar_torch.eval.metrics import NLL, RMSE, AbsRel, Delta1
+from ufmstar_torch.eval.metrics import NLL, DepthAccuracy
 from ufmstar_torch.frames.prediction import stated_range
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble
 from ufmstar_torch.models.distribution import DepthDistribution, GaussianDepth
@@ -56,7 +55,7 @@ class TrainingModule(pl.LightningModule):
         self.recipe = recipe
         self.total_steps = total_steps
         self.seed = seed
-        self.accuracy = MetricCollection([Delta1(), RMSE(), AbsRel()])
+        self.accuracy = DepthAccuracy()
         self.likelihood = NLL()
         self.figures: dict[str, float] = {}
         # Not a submodule: it has no state between steps.

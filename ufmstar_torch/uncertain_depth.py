@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
+from types import NoneType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
@@ -157,9 +158,8 @@ class UncertainDepth(NetworksInTurn):
         _require_passes(members, mode, samples)
         super().__init__(members or None, samples=samples, preprocess=preprocess)
         self._caller, self.mode = OneCaller(), mode
-        for name, value, kind in (("config", config, UfMStarConfig), ("recalibration", recalibration, Recalibration)):
-            if value is not None and not isinstance(value, kind):
-                raise TypeError(f"{name} must be a {kind.__name__} or None, got {type(value).__name__}")
+        require_kind("config", config, (UfMStarConfig, NoneType), "a UfMStarConfig or None")
+        require_kind("recalibration", recalibration, (Recalibration, NoneType), "a Recalibration or None")
         config, source = _with_evidence(
             config or UfMStarConfig(), networks, require_flag("posterior", posterior), anchors
         )

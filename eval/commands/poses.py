@@ -91,7 +91,7 @@ def main(options: PosesOptions) -> int:
     from ufmstar_torch.eval.run.folder import FolderError, output_folder
 
     require_pycolmap()
-    with usage_errors(FolderError, FileNotFoundError, ValueError):
+    with usage_errors(FolderError, FileNotFoundError, NotADirectoryError, ValueError):
         images, size = _images(options)
         with output_folder(options.out, POSES, {}, overwrite=options.overwrite):
             result = _reconstruct(options, images, size)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ufmstar_torch.eval.engine.files import write_atomic, write_json_atomic
 from ufmstar_torch.eval.methods.row import Row, row_from
+from ufmstar_torch.files.limits import read_text
 from ufmstar_torch.files.read import read_tensors
 
 FORMAT = 1
@@ -92,7 +93,7 @@ class Record:
         """Read a record. Raises ResultsError: the file is not a record of this format, or its row does not exist; the
         message names the file."""
         try:
-            values = json.loads(path.read_text(encoding="utf-8"))
+            values = json.loads(read_text(path))
         except (ValueError, RecursionError) as error:
             raise ResultsError(f"{path} is not a record: {error}") from error
         names = {f.name for f in fields(cls)} - set(_NOT_STORED)

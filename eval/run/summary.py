@@ -22,6 +22,7 @@ from ufmstar_torch.eval.run.run_folder import RUN, RunFolder
 from ufmstar_torch.eval.run.writers import frame_file, read_frame
 from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.eval.sequences.intrinsics import pinhole
+from ufmstar_torch.files.limits import read_text
 from ufmstar_torch.frames.warnings import hardly_compared
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 
@@ -80,7 +81,7 @@ def write_summary(folder: RunFolder, mixture: GaussianMixture, state: str, reaso
 def read_summary(out: Path) -> dict[str, Any]:
     """The summary of a run. Raises ValueError: it cannot be read."""
     try:
-        return dict(json.loads((out / SUMMARY).read_text(encoding="utf-8")))
+        return dict(json.loads(read_text(out / SUMMARY)))
     except (OSError, ValueError, TypeError, RecursionError) as error:
         raise ValueError(f"{out}/{SUMMARY} is not that of a run: {error}") from error
 

@@ -23,6 +23,7 @@ from ufmstar_torch.eval.engine.record import FORMAT, Record, ResultsError
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
 from ufmstar_torch.eval.suite.work_items import WorkItem
+from ufmstar_torch.files.limits import read_text
 
 FAILED, CACHE, STOP = "failed.json", "cache", "eval.stop"
 # Files of a report; --overwrite removes them.
@@ -108,7 +109,7 @@ class EvalFolder:
         reasons = {}
         for path in sorted(self.path.glob(f"records/*/*/{FAILED}")):
             try:
-                stored = json.loads(path.read_text(encoding="utf-8"))
+                stored = json.loads(read_text(path))
                 dataset, sequence, reason = (stored[name] for name in ("dataset", "sequence", "reason"))
                 if not all(isinstance(text, str) for text in (dataset, sequence, reason)):
                     raise TypeError("a data set, a sequence and a reason are texts")
