@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 from datetime import UTC, datetime
 from typing import Any
 
@@ -58,7 +58,7 @@ def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None
         result["overlapped"] = (
             None if isinstance(network, _Random) else time_overlap(network, sequence, device=device, plan=plan)
         )
-        result["ratios"] = _ratios(result)
+        result["ratios"] = _ratios(result, {row.label for row in rows if not row.setting.overrides})
         results.append(result)
     used = {name: str(value) for name, value in vars(options).items() if value is not None}
     return {"schema": 2, "date": datetime.now(UTC).isoformat(timespec="seconds"), "options": used, "results": results}
@@ -75,11 +75,12 @@ def _rows(base: str, backends: tuple[str, ...]) -> list[tuple[str, Setting]]:
     return rows
 
 
-def _ratios(result: Mapping[str, Any]) -> dict[str, float]:
-    """The figures to compare between machines and versions: medians of ratios within one frame."""
+def _ratios(result: Mapping[str, Any], labels: Set[str]) -> dict[str, float]:
+    """The figures of the rows of UfM* with these ``labels`` to compare between machines and versions: medians of ratios
+    within one frame."""
     ratios = {}
     for row in result["rows"]:
-        if row["setting"].get("overrides") or row["method"].startswith("UfM-"):
+        if row["row"] not in labels or row["method"].startswith("UfM-"):
             continue
         kind = {"": "step", "corners": "step with corners", "dense": "default"}[row["setting"].get("anchors", "")]
         ratios[f"{kind} / network"] = row["ratios_to_depth"][MULTIVIEW]["median"]
