@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -219,7 +219,9 @@ class UncertainDepth(NetworksInTurn):
     if TYPE_CHECKING:
         __call__ = forward
 
-    def stream(self, frames: Iterable[tuple[ImageLike, CameraLike, CameraLike]]) -> Iterator[UncertaintyOutput]:
+    def stream(
+        self, frames: Iterable[tuple[ImageLike, CameraLike, CameraLike]]
+    ) -> Generator[UncertaintyOutput, None, None]:
         """The predictions of a video, in order, with the networks one image ahead of UfM*.
 
         Both run at the same time: networks on a GPU with ``multiview_device="cpu"``, those on the CPU in a thread of

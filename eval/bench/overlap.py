@@ -48,8 +48,8 @@ def time_overlap(network: TimedNetwork, sequence: FrameSequence, *, device: torc
     return {"latency": spread(whole[counted]), "ratio_to_network": paired_ratio(whole[counted], alone[counted])}
 
 
-def _inputs(frames: Sequence[Frame], device: torch.device) -> Iterator[tuple[torch.Tensor, ...]]:
+def _inputs(frames: Sequence[Frame], device: torch.device) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
     """Image, pose and intrinsics of each frame."""
     for frame in frames:
-        camera = torch.from_numpy(frame.T_world_cam), torch.from_numpy(frame.intrinsics)
-        yield image_tensor(frame).to(device), *camera
+        pose, K = torch.from_numpy(frame.T_world_cam), torch.from_numpy(frame.intrinsics)
+        yield image_tensor(frame).to(device), pose, K

@@ -20,7 +20,7 @@ class _Waiting(ModuleType):
     """A package that is initialised when an attribute is missing."""
 
     def __getattr__(self, name: str) -> Any:
-        self.__class__ = ModuleType
+        self.__class__ = ModuleType  # type: ignore[assignment]  # a module's class may change to its base
         spec = self.__spec__
         assert spec is not None
         assert spec.loader is not None
