@@ -23,10 +23,10 @@ COMPILE = Path(__file__).with_name("compile_kernels.py")
 COMPILERS: pytest.StashKey[list[subprocess.Popen[bytes]]] = pytest.StashKey()
 
 settings.register_profile("fast", deadline=None, max_examples=25)
-settings.register_profile("thorough", deadline=None, max_examples=75, print_blob=True)
-settings.register_profile("interpreted", deadline=None, max_examples=3)
+settings.register_profile("thorough", deadline=None, max_examples=50, print_blob=True)
+settings.register_profile("few", deadline=None, max_examples=3)
 # --hypothesis-profile=thorough loads another one.
-settings.load_profile("interpreted" if os.environ.get("TRITON_INTERPRET") == "1" else "fast")
+settings.load_profile("few" if os.environ.get("TRITON_INTERPRET") == "1" else "fast")
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -99,7 +99,7 @@ def test_every_kernel_compiles_for_hopper():
     folder = Path(__file__).parent
     environment = {**os.environ, "PYTHONPATH": str(folder)} | {"TRITON_INTERPRET": "0"}
     command = [sys.executable, str(folder / "triton_compile.py"), "-v"]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=280)
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr[-3000:]
     for name in KERNELS:
         lines = [line for line in done.stdout.splitlines() if line.startswith(f"compiled {name} ")]

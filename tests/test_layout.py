@@ -194,6 +194,13 @@ def test_generic_names_are_not_importable(tmp_path):
     assert done.stdout.strip() == "[None, None, None]"
 
 
+def test_oracles_import_numpy_and_each_other_alone():
+    oracles = sorted((ROOT / "tests").glob("oracle*.py"))
+    allowed = {"numpy", *sys.stdlib_module_names, *(path.stem for path in oracles)}
+    for path in oracles:
+        assert {module.partition(".")[0] for module, _ in imported(path)} <= allowed, path
+
+
 def test_every_module_has_a_docstring():
     for path in sources():
         assert ast.get_docstring(tree(path)) or path.read_text() == "", path

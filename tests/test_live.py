@@ -1,80 +1,20 @@
-"""``LiveDepth``: processed and dropped images, late and missing poses, errors, saving, signals."""
+"""``LiveDepth``: processed and dropped images, late and missing poses, errors (its state: test_live_state.py)."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-import textwrap
 import threading
 import time
 
 import numpy as np
 import pytest
 import torch
+from live_model import HANGS, PICTURE, K, Network, at, compiled, model, network, require_all_counted, show, stamps
 
-from ufmstar_torch import AnchorConfig, DepthPrediction, LiveDepth, UfMStarConfig, UncertainDepth
+from ufmstar_torch import AnchorConfig, LiveDepth, UfMStarConfig, UncertainDepth
 from ufmstar_torch.frames.clock import StreamClock, Verdict
 from ufmstar_torch.live import BACKWARDS, CLOSED, DOUBTFUL, GAP, LATE, LOST, NEWER
 
-K = (50.0, 50.0, 31.5, 23.5)
-PICTURE = np.zeros((48, 64, 3), np.uint8)
-HANGS = 250  # [s] longer than any wait on a loaded machine
-
-
-class Network(torch.nn.Module):
-    """Predicts 2 m everywhere. A call sets ``entered`` and waits for ``gate``."""
-
-    def __init__(self):
-        super().__init__()
-        self.gate, self.entered = threading.Event(), threading.Event()
-        self.gate.set()
-
-    def forward(self, x):
-        self.entered.set()
-        assert self.gate.wait(HANGS)
-        if x.float().mean() > 0.8:
-            raise OSError("the network failed")
-        return DepthPrediction(torch.full((len(x), 48, 64), 2.0))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled():
-    """Compile all kernels before the first image of a test."""
-    UncertainDepth(Network())(PICTURE, np.eye(4), K)
-
-
-@pytest.fixture
-def network():
-    return Network()
-
-
-@pytest.fixture
-def model(network):
-    return UncertainDepth(network)
-
-
-def at(x):
-    T = np.eye(4)
-    T[0, 3] = x
-    return T
-
-
-def show(live, stamp, picture=PICTURE, x=0.0):
-    """Push a pose and an image with its stamp, and wait until both are processed."""
-    live.push_pose(stamp, at(x))
-    live.push_image(stamp, picture)
-    assert live.wait_idle(HANGS)
-
-
-def stamps(results):
-    return [result.stamp for result in results]
-
-
-def require_all_counted(live):
-    counts = live.statistics
-    assert counts.images == counts.results + sum(counts.dropped.values()) + sum(counts.skipped.values())
-    return counts
+__all__ = ["compiled", "model", "network"]
 
 
 def test_a_result_has_the_pose_at_its_stamp(model):
@@ -231,37 +171,6 @@ def test_a_slow_stream_and_a_pause_are_no_jump(monkeypatch):
     for stamp in (1e9, 5e8, 7e8, 1e5):  # damaged stamps that do not agree
         assert clock.judge(stamp, now + 3600.0) == Verdict.WAIT
     assert clock.judge(3872.0, now + 3600.0) == Verdict.USE
-
-
-def test_a_second_process_may_not_write_the_same_state(model, tmp_path):
-    """Temporary files of a killed one are removed at the start, other files stay."""
-    file = tmp_path / "s.pt"
-    left, other = tmp_path / ".s.pt.0123456789ab.tmp", tmp_path / ".other.pt.0123456789ab.tmp"
-    left.write_text("half a state")
-    other.write_text("of another program")
-    code = f"""
-import sys, torch
-from ufmstar_torch import DepthPrediction, LiveDepth, UncertainDepth
-class Network(torch.nn.Module):
-    def forward(self, x): return DepthPrediction(torch.full((1, 8, 8), 2.0))
-with LiveDepth(UncertainDepth(Network()), print, state={str(file)!r}):
-    print("holds it", flush=True)
-    sys.stdin.read()
-"""
-    words = [sys.executable, "-P", "-c", code]
-    first = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    try:
-        assert first.stdout.readline() == "holds it\n"
-        assert (left.exists(), other.exists()) == (False, True)
-        with pytest.raises(ValueError, match=r"state: another process is writing .*s\.pt"):
-            LiveDepth(model, print, K, state=file)
-    finally:
-        first.kill()
-        first.communicate()
-    with LiveDepth(model, print, K, state=file):
-        (tmp_path / "link.pt").symlink_to(file)
-        with pytest.raises(ValueError, match="another process is writing"):
-            LiveDepth(model, print, K, state=tmp_path / "link.pt")
 
 
 def test_a_reset_forgets_views_and_times(model):
@@ -425,71 +334,3 @@ def test_impossible_settings_are_refused(model, tmp_path):
         LiveDepth(model, print, state=tmp_path)
     with pytest.raises(FileNotFoundError, match="state: no such folder"):
         LiveDepth(model, print, state=tmp_path / "nowhere" / "state.pt")
-
-
-def test_the_state_goes_on_where_it_ended(model, tmp_path):
-    with LiveDepth(model, lambda _: None, K, state=tmp_path / "state.pt", save_every=0) as live:
-        for n in range(3):
-            show(live, n, x=n / 100)
-    assert live.statistics.saved == 3
-    again = UncertainDepth(Network())
-    with LiveDepth(again, print, K, state=tmp_path / "state.pt"):
-        assert int(again.image_index) == 3
-    assert live.statistics.saved == 3  # no change, so nothing is written
-    torch.testing.assert_close(
-        again(PICTURE, at(0.03), K).variance, model(PICTURE, at(0.03), K).variance, rtol=0, atol=0
-    )
-    assert sorted(path.name for path in tmp_path.iterdir()) == [".state.pt.lock", "state.pt"]
-    with LiveDepth(model, print, K, state=tmp_path / "other.pt"):
-        pass  # no change, so no file is overwritten
-    assert not (tmp_path / "other.pt").exists()
-
-
-def test_a_state_that_does_not_fit_is_refused_and_stays(model, tmp_path):
-    file, before = tmp_path / "state.pt", {name: value.clone() for name, value in model.stream_state().items()}
-    plain = UncertainDepth(Network(), posterior=False)
-    torch.save(plain.stream_state(), file)
-    (tmp_path / "damaged.pt").write_bytes(file.read_bytes()[:500])
-    for path, words in ((file, "the state must hold"), (tmp_path / "damaged.pt", "damaged")):
-        content = path.read_bytes()
-        with pytest.raises(
-            ValueError, match=rf"state .*{path.name} cannot be continued: (.|\n)*{words}(.|\n)*Delete the"
-        ):
-            LiveDepth(model, print, K, state=path)
-        assert path.read_bytes() == content
-    after = model.stream_state()
-    assert all(torch.equal(after[name], value) for name, value in before.items())
-
-
-def test_a_state_that_cannot_be_written_is_an_error(model, tmp_path):
-    live = LiveDepth(model, lambda _: None, K, state=tmp_path / "state.pt")
-    (tmp_path / "state.pt").mkdir()
-    show(live, 0)
-    with pytest.raises(OSError, match=r"state\.pt"):
-        live.close()
-
-
-@pytest.mark.slow
-def test_sigterm_as_an_exception_saves_the_state(tmp_path):
-    """As in docs/live.md."""
-    script = textwrap.dedent(
-        f"""
-        import signal, sys, time
-        sys.path.insert(0, {str(os.path.dirname(__file__))!r})
-        import test_live as t
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
-        model = t.UncertainDepth(t.Network())
-        ready, state = lambda _: print("ready", flush=True), {str(tmp_path / "state.pt")!r}
-        with t.LiveDepth(model, ready, t.K, state=state) as live:
-            live.push_pose(0, t.at(0)); live.push_image(0, t.PICTURE)
-            time.sleep(60)
-        """
-    )
-    process = subprocess.Popen(
-        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    )
-    assert process.stdout.readline() == "ready\n"
-    process.terminate()
-    assert process.wait(HANGS) != 0
-    process.stdout.close()
-    assert "image_index" in torch.load(tmp_path / "state.pt")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from types import NoneType
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 from ufmstar_torch.anchors.anchors import Anchors, check_anchors
 from ufmstar_torch.anchors.doubts import AnchorDoubts
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.frames.arguments import Array, CameraLike, as_device, as_tensor, require_flag
+from ufmstar_torch.frames.arguments import Array, CameraLike, as_device, as_tensor, require_flag, require_kind
 from ufmstar_torch.frames.frame import FrameInput, as_confidence, check_frame, raise_faults
 from ufmstar_torch.frames.output import MeanUncertainty, UncertaintyOutput
 from ufmstar_torch.frames.warnings import StreamWarnings
@@ -66,8 +67,7 @@ class UfMStar(StatefulModule):
         device: torch.device | str | None = None,
     ) -> None:
         super().__init__()
-        if config is not None and not isinstance(config, UfMStarConfig):
-            raise TypeError(f"config must be a UfMStarConfig or None, got {type(config).__name__}")
+        require_kind("config", config, (UfMStarConfig, NoneType), "a UfMStarConfig or None")
         if not isinstance(dtype, torch.dtype) or dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         self.config = config if config is not None else UfMStarConfig()

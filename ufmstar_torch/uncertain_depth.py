@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
+from types import NoneType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
@@ -156,9 +158,8 @@ class UncertainDepth(NetworksInTurn):
         _require_passes(members, mode, samples)
         super().__init__(members or None, samples=samples, preprocess=preprocess)
         self._caller, self.mode = OneCaller(), mode
-        for name, value, kind in (("config", config, UfMStarConfig), ("recalibration", recalibration, Recalibration)):
-            if value is not None and not isinstance(value, kind):
-                raise TypeError(f"{name} must be a {kind.__name__} or None, got {type(value).__name__}")
+        require_kind("config", config, (UfMStarConfig, NoneType), "a UfMStarConfig or None")
+        require_kind("recalibration", recalibration, (Recalibration, NoneType), "a Recalibration or None")
         config, source = _with_evidence(
             config or UfMStarConfig(), networks, require_flag("posterior", posterior), anchors
         )
@@ -221,8 +222,8 @@ class UncertainDepth(NetworksInTurn):
     def stream(self, frames: Iterable[tuple[ImageLike, CameraLike, CameraLike]]) -> Iterator[UncertaintyOutput]:
         """The predictions of a video, in order, with the networks one image ahead of UfM*.
 
-        With networks on a GPU and ``multiview_device="cpu"``, both run at the same time. Each result is yielded after
-        the next frame has been read.
+        Both run at the same time: networks on a GPU with ``multiview_device="cpu"``, those on the CPU in a thread of
+        their own. Each result is yielded after the next frame has been read.
 
         Args:
             frames: image, pose and intrinsics of each frame, as in :meth:`forward`.
@@ -233,15 +234,29 @@ class UncertainDepth(NetworksInTurn):
         waiting: _Predicted | None = None
         if isinstance(frames, Tensor | np.ndarray):
             raise TypeError(f"frames must be an iterable of (image, pose, intrinsics), got {type(frames).__name__}")
-        for frame in require_kind("frames", frames, Iterable, "an iterable of (image, pose, intrinsics)"):
-            if not isinstance(frame, tuple | list) or len(frame) != 3:
-                raise TypeError(f"frames must yield (image, pose, intrinsics), got {type(frame).__name__}")
-            ahead = self._predicted(*frame, ahead=waiting is not None)
-            if waiting is not None:
-                yield self._fused(waiting)
-            waiting = ahead
+        with ThreadPoolExecutor(1, thread_name_prefix="network") as pool:
+            for frame in require_kind("frames", frames, Iterable, "an iterable of (image, pose, intrinsics)"):
+                if not isinstance(frame, tuple | list) or len(frame) != 3:
+                    raise TypeError(f"frames must yield (image, pose, intrinsics), got {type(frame).__name__}")
+                if waiting is None or not self._networks_on_cpu():
+                    ahead = self._predicted(*frame, ahead=waiting is not None)
+                    if waiting is not None:
+                        yield self._fused(waiting)
+                    waiting = ahead
+                    continue
+                predicting = pool.submit(self._predict, *frame, number=self._next + 1)
+                out = self._fused(waiting)
+                wait([predicting])  # the networks are idle while the caller has the result
+                yield out
+                waiting = predicting.result()
         if waiting is not None:
             yield self._fused(waiting)
+
+    def _networks_on_cpu(self) -> bool:
+        """True if a second thread may run the networks: those on an accelerator run beside the CPU anyway, and autocast
+        holds for one thread."""
+        device = self._device()
+        return (device is None or device.type == "cpu") and not torch.is_autocast_enabled("cpu")
 
     def update(
         self,
@@ -423,18 +438,30 @@ class UncertainDepth(NetworksInTurn):
         ahead: bool = False,
     ) -> _Predicted:
         """The prediction for the next image, or, with ``ahead``, for the one after that."""
+        return self._predict(image, pose, intrinsics, features, number=self._next + ahead)
+
+    def _predict(
+        self,
+        image: ImageLike,
+        pose: CameraLike,
+        intrinsics: CameraLike,
+        features: Array | None = None,
+        *,
+        number: int,
+    ) -> _Predicted:
+        """The prediction for the image of an index."""
         if not self.networks:
             raise ValueError("UncertainDepth(None) has no networks: pass predictions to update")
         picture, T, K_image = as_image(image), as_pose(pose), as_intrinsics(intrinsics)
-        if self._next == 0 and not ahead:
+        if number == 0:
             warn_of_range(picture)
         if not isinstance(image, Tensor):  # a tensor's device is the caller's choice
             picture = picture.to(self._device() or picture.device)
-        member = None if self.mode == "full" else self.turn(self._next + ahead)
+        member = None if self.mode == "full" else self.turn(number)
         with torch.no_grad():
             x, K = self.prepare(picture, K_image.expand(len(picture), 3, 3))
             prediction = self.every(x, K) if member is None else self.member(x, K, member)
-        index = 0 if member is None else (self._next + ahead) % SAMPLES if self.stochastic else member
+        index = 0 if member is None else number % SAMPLES if self.stochastic else member
         prediction = replace(prediction, member=index)
         tensors = {name: value for name, value in vars(prediction).items() if isinstance(value, Tensor)}
         if features is not None:

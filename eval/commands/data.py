@@ -45,7 +45,7 @@ read = reader(CheckOptions, "ufmstar data")
 def main(options: CheckOptions) -> int:
     """Check, and print the reports. Returns the exit code."""
     from ufmstar_torch.eval.check.data_check import lines, page
-    from ufmstar_torch.eval.run.files import to_json
+    from ufmstar_torch.eval.engine.files import to_json
 
     with usage_errors(OSError, ValueError):
         reports, several = _check(options)

@@ -125,9 +125,8 @@ def _write(options: RankOptions, scores: ImageScores) -> int:
     """Write scores.csv, the contact sheet and rank.json, and print the first images; the exit code."""
     import pandas as pd
 
-    from ufmstar_torch.eval.report.table import csv_text
-    from ufmstar_torch.eval.report.text import aligned
-    from ufmstar_torch.eval.run.files import write_bytes_atomic, write_json_atomic
+    from ufmstar_torch.eval.engine.files import write_bytes_atomic, write_json_atomic
+    from ufmstar_torch.eval.report.table import aligned, csv_text
     from ufmstar_torch.eval.run.panels import contact_sheet
     from ufmstar_torch.eval.run.pictures import SHEET
 

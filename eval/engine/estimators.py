@@ -18,9 +18,8 @@ from ufmstar_torch.eval.methods.method import ALONE, RELATIVE, RHO, UFM, UFM_STA
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import configured
 from ufmstar_torch.eval.methods.ufm import UfM
-from ufmstar_torch.frames.output import FrameStatistics, UncertaintyOutput
+from ufmstar_torch.frames.output import EVERY_FRAME, FrameStatistics, UncertaintyOutput
 from ufmstar_torch.frames.prediction import DepthPrediction
-from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.posterior.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar
 
@@ -101,11 +100,11 @@ def ufm_star_config(row: Row) -> UfMStarConfig:
 
 
 def output_of(depth: Tensor, variance: Tensor | None, valid: Tensor, **maps: Tensor | None) -> UncertaintyOutput:
-    """The output of a method other than UfM*, from maps [1, h, w]: NaN where not valid, and no components.
-    ``variance``: None = the method states none."""
+    """The output of a method other than UfM*, from maps [1, h, w]: NaN where not valid; all counts but that of the
+    valid pixels are 0. ``variance``: None = the method states none."""
     variance = torch.full_like(depth, torch.nan) if variance is None else variance
     none = torch.zeros(len(depth), dtype=torch.int64)
-    counts = dict.fromkeys(("components", "segments", "matched"), none)
+    counts = dict.fromkeys(EVERY_FRAME, none)
     statistics = FrameStatistics({**counts, "valid_pixels": valid.sum((1, 2)).cpu()})
     named = {name: value for name, value in maps.items() if value is not None}
     return UncertaintyOutput(depth, torch.where(valid, variance, torch.nan), valid, named, statistics)
@@ -183,11 +182,6 @@ class Gaussians(Estimator):
         used = out.statistics.anchors_used
         self._anchors = 0 if used is None else int(used[0])
         return out
-
-    def mixture_world(self) -> GaussianMixture:
-        """[1, K] M_i in the world's frame, float64; after a frame."""
-        T = self.ufm.T_world_first.double()
-        return self.ufm.mixture.to(torch.float64).rigid(T[:, :3, :3], T[:, :3, 3])
 
     def memory(self) -> dict[str, float]:
         """Bytes and number of the occupied components, anchor terms included; bytes of the moving average."""

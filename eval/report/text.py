@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.engine.judge import POSTERIOR
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.names import count
-from ufmstar_torch.eval.report.table import markdown
+from ufmstar_torch.eval.report.quantities import count
+from ufmstar_torch.eval.report.table import aligned
 from ufmstar_torch.eval.report.tables import main_table
 from ufmstar_torch.eval.report.write import Report
 from ufmstar_torch.eval.run.frame_record import NEAR_ZERO
@@ -36,7 +36,7 @@ _FOUND = {
 def summary(results: Results) -> str:
     """The main table of an evaluation, failed and missing sequences, and notes."""
     shown = [None] if None in results.tabulated else results.tabulated
-    parts = [markdown(main_table(results, dataset)) for dataset in shown]
+    parts = [main_table(results, dataset).text() for dataset in shown]
     if results.failed:
         parts.append("failed:\n" + "\n".join(f"  {f.dataset}, {f.sequence}: {f.reason}" for f in results.failed))
     if results.missing:
@@ -194,12 +194,3 @@ def realtime_table(summary: Mapping[str, Any]) -> str:
 def number(value: float | None) -> str:
     """Three digits, a dash for no value."""
     return "-" if value is None or math.isnan(value) else f"{value:.3g}"
-
-
-def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table: the first column to the left, the others to the right."""
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return [
-        "  ".join(cell.rjust(w) if i else cell.ljust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True)))
-        for row in rows
-    ]

@@ -23,8 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range
 from ufmstar_torch.eval.run.export import RunFrame, export_folder, points_of
-from ufmstar_torch.eval.run.gaussians import RADIUS, Components
-from ufmstar_torch.eval.run.offset import offset_text, world_offset
+from ufmstar_torch.eval.run.gaussians import RADIUS, Components, offset_text, world_offset
 from ufmstar_torch.eval.run.writers import fitting_unit
 from ufmstar_torch.files.read import read_npz_whole
 from ufmstar_torch.gaussians.mixture import GaussianMixture

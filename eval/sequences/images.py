@@ -111,7 +111,7 @@ def read_depth(
 
 def require_scale(path: str | Path, scale: float | None, stated: float | None) -> None:
     """Raises FrameError: a given ``scale`` contradicts the one that the file states [m per unit]."""
-    if None not in (scale, stated) and not np.isclose(scale, stated, rtol=1e-6, atol=0):
+    if scale is not None and stated is not None and not np.isclose(scale, stated, rtol=1e-6, atol=0):
         unit = f"its text {SCALE_KEY} states {stated:g} metres per unit, which contradicts the given {scale:g}"
         raise FrameError(path, f"{unit}: leave that out")
 
@@ -244,6 +244,8 @@ def _plain_png(path: Path) -> np.ndarray | None:
 
     try:
         return np.asarray(io.read_image_png_u8(str(path), "rgb"))
+    except UnicodeEncodeError:  # a name that is not UTF-8
+        return None
     except Exception as error:
         # kornia_rs raises a plain Exception for a file that it cannot decode.
         if type(error) is not Exception:

@@ -23,8 +23,8 @@ _NO_ANCHORS_YET = (
 )
 
 
-# Every count of a frame, per stream [B], in the order of files. The step counts the first 13 in every frame.
-COUNTS: dict[str, str] = {
+# The counts that every frame has, per stream [B], in the order of files.
+EVERY_FRAME: dict[str, str] = {
     "components": "K, occupied components after the frame.",
     "segments": "C, Gaussians segmented from the frame.",
     "matched": "segments that match at least one earlier component.",
@@ -50,6 +50,9 @@ COUNTS: dict[str, str] = {
     ),
     "fault": "index into ``ufmstar_torch.frames.frame.FRAME_FAULTS``; not 0 = the frame was skipped.",
     "rotation_deviation": "max |R^T R - I| of the pose, removed by projection onto SO(3).",
+}
+# Every count of a frame; the further ones need anchors.
+COUNTS: dict[str, str] = EVERY_FRAME | {
     "anchors": "usable anchors (0, for example, while the camera stands still). None without ``config.anchors``.",
     "anchors_used": (
         "usable anchors without gross outliers. If 0, the frame adds no evidence: B follows from earlier frames, and "

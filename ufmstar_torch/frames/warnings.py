@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.frames.frame import FrameInput, doubtful_centre
+from ufmstar_torch.frames.frame import FrameInput
 from ufmstar_torch.frames.output import FrameStatistics
 
 # Least frames and components before a warning about views, and the largest share of components seen in only one view.
@@ -39,6 +39,9 @@ _CLIP, _IN_ORDER, _STEP, _TURN = 5, 0.8, 0.25, 0.35
 # Shares of pixels: of valid ones, below which ``valid`` may be inverted; of those with the largest depth, if it is the
 # same in every frame.
 _SPARSE, _SATURATED = 0.1, 0.2
+# The principal point of real cameras and usual crops lies within these shares of the image; that of a K for twice or
+# half the size does not.
+CENTRE_RANGE = (0.2, 0.8)
 # Stride of the depth maps' rows in these checks.
 _ROWS = 8
 # On an accelerator, reading the counts synchronises: only every so many frames, and not while a graph is recorded.
@@ -318,3 +321,15 @@ def hardly_compared(alone: int, components: int, frames: int, travelled: float) 
         f"after {frames} frames {alone} of {components} Gaussians were seen in one view alone, so hardly anything is "
     )
     return text + f"compared between views. {_CAUSES}, or views that do not overlap"
+
+
+def doubtful_centre(K: Sequence[Sequence[float]], size: tuple[int, int]) -> str:
+    """A warning if the principal point of K [px] is implausible for a map of ``size`` (H, W), else "": it lies near the
+    border, or the product of its shares is about 1/4, as with swapped cx and cy."""
+    x, y = (K[0][2] + 0.5) / size[1], (K[1][2] + 0.5) / size[0]
+    low, high = CENTRE_RANGE
+    swapped = min(abs(x - 0.5), abs(y - 0.5)) > 0.08 and abs(4 * x * y - 1) < 0.15
+    if low < min(x, y) and max(x, y) < high and not swapped:
+        return ""
+    where = f"the principal point lies at {x:.2f} of the width and {y:.2f} of the height, far from the middle"
+    return f"{where}: are cx and cy swapped, or are these the intrinsics of an image of another size?"

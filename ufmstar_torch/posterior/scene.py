@@ -17,8 +17,8 @@ from ufmstar_torch.posterior.cells import features, local_variance, ranges
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.field import Field, Observed, Prior, at, conditioned, distance
 from ufmstar_torch.posterior.moments import moments
+from ufmstar_torch.posterior.nodes import link, scale, spread
 from ufmstar_torch.posterior.running import Floats, Running
-from ufmstar_torch.posterior.windows import scale, spread
 
 # Largest number of nodes in a row and in a column (the field's window allows 31 in a row).
 SIDE = 28
@@ -73,13 +73,9 @@ class Grid(NamedTuple):
     @classmethod
     def of(cls, log_depth: Floats, rows: int, cols: int, config: PosteriorConfig) -> Grid:
         """The links between cells of mean ``log_depth`` [R C]."""
-        across, along = np.full((2, rows, cols), np.inf)
-        across[:, :-1] = config.jump * np.abs(np.diff(log_depth.reshape(rows, cols), axis=1))
-        along[:-1] = config.jump * np.abs(np.diff(log_depth.reshape(rows, cols), axis=0))
-        edges = across.ravel(), along.ravel()
-        right, down = (config.link_variance + config.edge_variance * x**2 for x in edges)
-        far = (1 / n + edge for n, edge in zip((cols, rows), edges, strict=True))
-        return cls(rows, cols, log_depth, float(log_depth.mean()), right, down, *far)
+        links = np.empty((4, rows, cols))
+        link(log_depth.reshape(rows, cols), config.jump, config.link_variance, config.edge_variance, *links)
+        return cls(rows, cols, log_depth, float(log_depth.mean()), *links.reshape(4, -1))
 
 
 class Scene(NamedTuple):

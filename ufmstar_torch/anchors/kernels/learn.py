@@ -20,7 +20,7 @@ from ufmstar_torch.anchors.kernels.neighbours import grid, supported
 from ufmstar_torch.anchors.learn import Learnt
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.frame import AnchorInput, FrameInput
-from ufmstar_torch.kernels.compile_cpu import kernel, leaf, part
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, part
 from ufmstar_torch.kernels.cpu.calls import array, each
 from ufmstar_torch.kernels.cpu.regress import Seen, View
 from ufmstar_torch.kernels.cpu.regress_cull import FIELDS, cull
@@ -139,15 +139,20 @@ def _learn(
     width, memory, shrinkage, component, overall, used, beyond, stream,
 ):  # fmt: skip
     """One stream of N anchors and K components; only the components of ``view`` can explain a point."""
-    chosen = np.empty(valid.size, np.bool_)
-    rows, sums = np.empty((valid.size, 3)), np.zeros((component.shape[0], 3))
+    chosen = empty(valid.size, np.bool_)
+    rows, column = empty((valid.size, 3), np.float64), empty(valid.size, np.float64)
+    sums = empty((component.shape[0], 3), np.float64)
+    for k in range(component.shape[0]):
+        sums[k, 0] = sums[k, 1] = sums[k, 2] = 0.0
     supported(pixel, predicted, depth, variance, valid, chosen)
     used[0] = _rows(predicted, depth, variance, network_variance, chosen, rows)
     if valid.size > 0:
         _distribute(index, predicted, chosen, rows, K, width, view, sums)
     fade = memory if used[0] > 0 else 1.0
     for c in range(3):  # rounded to the state's dtype
-        overall[c] = fade * overall_before[c] + folded(rows[:, c].copy())
+        for i in range(valid.size):
+            column[i] = rows[i, c]
+        overall[c] = fade * overall_before[c] + folded(column)
     for c in range(2):
         stream[c] = np.float64(overall[c + 1]) / (np.float64(overall[0]) + shrinkage)
     for k in range(component.shape[0]):
@@ -170,13 +175,14 @@ def _learn(
 def _rows(predicted, depth, variance, network_variance, supported, rows):
     """Write w (1, r, e) [N, 3] of the anchors, 0 where not supported; return how many are used."""
     n = supported.size
-    squares, used, others = np.zeros(n), 0, -1
+    squares, terms, used, others = empty(n, np.float64), empty(n, np.float64), 0, -1
     for i in range(n):
+        squares[i] = terms[i] = 0.0
         if supported[i]:
             others += 1
             r = depth[i] / predicted[i] - 1
-            squares[i] = r * r
-    total = folded(squares.copy())
+            squares[i] = terms[i] = r * r
+    total = folded(terms)
     others = max(others, 0)
     for i in range(n):
         rows[i, 0] = rows[i, 1] = rows[i, 2] = 0.0
@@ -201,16 +207,17 @@ def _distribute(index, predicted, chosen, rows, K, width, view, sums):
     Components are culled for a cell of anchors as the regression culls them for a tile.
     """
     visible, fields, packed, _, settings = view
-    points, pixel = np.empty((chosen.size, 3)), np.empty((chosen.size, 2))
+    points, pixel = empty((chosen.size, 3), np.float64), empty((chosen.size, 2), np.float64)
     for i in range(chosen.size):
         u, v, z = np.float64(index[i] % width), np.float64(index[i] // width), predicted[i]
         pixel[i, 0], pixel[i, 1] = u, v
         points[i, 0], points[i, 1], points[i, 2] = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z
     start, order = grid(pixel, chosen, _PER_CELL)[4:]
     capacity = packed.shape[1]
-    retained, work = np.empty(visible.size, np.int64), np.empty(8 + capacity, packed.dtype)
-    near, density, added = np.empty((FIELDS, capacity)), np.empty(capacity), np.empty((3, capacity))
-    point, row = np.empty(3), np.empty(4)
+    retained, work = empty(visible.size, np.int64), empty(8 + capacity, packed.dtype)
+    near, added = empty((FIELDS, capacity), np.float64), empty((3, capacity), np.float64)
+    density = empty(capacity, np.float64)
+    point, row = empty(3, np.float64), empty(4, np.float64)
     row[3] = settings.prior_weight
     for cell in range(start.size - 1):
         if start[cell] == start[cell + 1]:

@@ -38,7 +38,8 @@ def sample_statistics(values: Tensor) -> SampleStatistics:
     x = array(values)
     statistics, counts = np.empty((4, *x.shape[:-1]), x.dtype), np.empty(x.shape[:-1], np.int64)
     _statistics(x.reshape(-1, x.shape[-1]), statistics.reshape(4, -1), counts.reshape(-1))
-    return SampleStatistics(*map(torch.from_numpy, statistics), torch.from_numpy(counts))
+    mean, variance, median, maximum = map(torch.from_numpy, statistics)
+    return SampleStatistics(mean, variance, median, maximum, torch.from_numpy(counts))
 
 
 @kernel

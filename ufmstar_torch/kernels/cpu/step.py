@@ -26,11 +26,10 @@ from ufmstar_torch.gaussians.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.gaussians.state import UfMStarState
 from ufmstar_torch.kernels.cpu.calls import array, each
-from ufmstar_torch.kernels.cpu.fuse import lift
 from ufmstar_torch.kernels.cpu.regress import Seen, View, fill_and_smooth, regress_maps, views_of
 from ufmstar_torch.kernels.cpu.rigid import COVARIANCE, FIELDS, WEIGHT, padded
 from ufmstar_torch.kernels.cpu.segment import gaussians
-from ufmstar_torch.kernels.cpu.stream import join, match
+from ufmstar_torch.kernels.cpu.stream import join, lift, match
 from ufmstar_torch.steps.disagree import overlap_disagreement
 from ufmstar_torch.steps.fuse import make_room
 from ufmstar_torch.steps.regress import at_pixels, distribute, memory_for, with_pixels

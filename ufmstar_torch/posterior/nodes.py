@@ -1,10 +1,10 @@
-"""Gaussian windows around every node over a frame's anchors (numba)."""
+"""Gaussian windows around every node over a frame's anchors, and the links between nodes (numba)."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import part
+from ufmstar_torch.kernels.compile_cpu import kernel, part
 from ufmstar_torch.posterior.field import fast
 
 
@@ -70,3 +70,15 @@ def _blur(cells, row_window, col_window):
                     line[c] += weight * across[j, c]
             for c in range(cols):
                 cells[layer, i, c] = line[c]
+
+
+@kernel
+def link(log_depth, jump, least, by_square, right, down, far_right, far_down):
+    """Write the links [R, C] of :class:`ufmstar_torch.posterior.scene.Grid` between nodes of mean log d [R, C]."""
+    rows, cols = log_depth.shape
+    for i in range(rows):
+        for j in range(cols):
+            edge = jump * abs(log_depth[i, j + 1] - log_depth[i, j]) if j + 1 < cols else np.inf
+            right[i, j], far_right[i, j] = least + by_square * edge * edge, 1 / cols + edge
+            edge = jump * abs(log_depth[i + 1, j] - log_depth[i, j]) if i + 1 < rows else np.inf
+            down[i, j], far_down[i, j] = least + by_square * edge * edge, 1 / rows + edge
