@@ -34,11 +34,13 @@ def test_sixteen_bits_stay_positive(tmp_path):
     np.testing.assert_allclose(read_depth(tmp_path / "d.png"), values / 1000.0, rtol=1e-7)
 
 
-def test_scale_from_the_png_text_is_second_to_the_argument(tmp_path):
+def test_the_scale_of_the_png_text_wins_over_a_default_and_must_be_that_of_the_argument(tmp_path):
     write_depth_png(tmp_path / "d.png", np.full((2, 3), 2.0), 4000, scale_text="0.00025")
     assert (read_depth(tmp_path / "d.png") == 2.0).all()
     assert (read_depth(tmp_path / "d.png", default_scale=1 / 5000) == 2.0).all()
-    np.testing.assert_allclose(read_depth(tmp_path / "d.png", scale=0.001), 8.0)
+    np.testing.assert_allclose(read_depth(tmp_path / "d.png", scale=0.00025), 2.0)
+    with pytest.raises(FrameError, match=r"states 0\.00025 metres per unit, which contradicts the given 0\.001"):
+        read_depth(tmp_path / "d.png", scale=0.001)
 
 
 @pytest.mark.parametrize("suffix", ["npy", "npz", "tif"])
