@@ -279,10 +279,15 @@ def second_moments(
     """Variances over the squared depth: in total, and if the local correction holds. With probability ``p`` the local
     correction ``offset`` does not hold, and y has the variance ``wide`` instead of ``variance``. The limit of errors
     disappears with the ``share`` that is ``unmeasured``."""
+    inlier = moment_elsewhere(config, np.zeros_like(variance), np.minimum(variance, config.widest), share)
+    return (1 - p) * inlier + p * moment_elsewhere(config, offset, wide, share), inlier
+
+
+def moment_elsewhere(config: PosteriorConfig, offset: Floats, wide: Floats, share: float = 0.0) -> Floats:
+    """Second moment of the relative error if y is normal with the variance ``wide`` about the stated one less
+    ``offset``."""
     limit = math.log(config.farthest) / max(1 - share, LEAST_MEASURED)
-    inlier = _second_moment(np.minimum(variance, config.widest), np.zeros_like(variance), limit)
-    tail = _second_moment(wide, np.clip(offset, -limit, limit), limit)
-    return (1 - p) * inlier + p * tail, inlier
+    return _second_moment(wide, np.clip(offset, -limit, limit), limit)
 
 
 def _second_moment(variance: Floats, offset: Floats, limit: float) -> Floats:

@@ -52,7 +52,9 @@ a is the variance of the anchors' y in a Gaussian window: depths differ more bet
 farther the evidence, the more surfaces lie between. v and w are at most ``widest``. Contradictory evidence thus limits
 the certainty of every pixel.
 
-Anchors that matching has measured are wrong on surfaces that move: p then includes the probability of ``motion``.
+Anchors that matching has measured are wrong on surfaces that move. With the probability P of ``motion``, the depth is
+that of the prediction at the scale of most surfaces: the variance becomes (1 - P) V + P tail, with the tail about
+their ratio instead of b . x, and p includes P.
 
 A stream whose anchors were all invalid so far has the network's depth with the variance of a node without evidence. A
 stream without anchors has UfM*'s output.
@@ -76,7 +78,7 @@ from ufmstar_torch.posterior.cells import cell_means, features, read
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.field import at
 from ufmstar_torch.posterior.learn import learnt
-from ufmstar_torch.posterior.motion import probability, tests_at
+from ufmstar_torch.posterior.motion import in_image, probability, surfaces, tests_at
 from ufmstar_torch.posterior.running import Floats, Running
 from ufmstar_torch.posterior.scene import (
     MOST_WRONG,
@@ -90,6 +92,7 @@ from ufmstar_torch.posterior.scene import (
     inlier_factor,
     local_scale,
     misscaled,
+    moment_elsewhere,
     scene_of,
     second_moments,
     spread_around,
@@ -189,9 +192,9 @@ def _of_stream(
     scene = scene_of(grid, depth, valid, anchors, running)
     field, left_out, weight = fitted(scene)
     away = away_from(scene, weight * config.weak_sigma**2 >= 1)
-    scores = np.zeros((2, 0))
+    scores, (c, of_surfaces) = np.zeros((2, 0)), surfaces(scene, field.coefficients, running)
     if has_valid:
-        memory, scores = learnt(scene, field, weight, left_out, running, away)
+        memory, scores = learnt(scene, field, weight, left_out, running, away, of_surfaces)
     else:
         memory = running.drifted(grid.mean) if running.frames and valid.any() else packed
     node = np.arange(rows * cols)
@@ -207,11 +210,12 @@ def _of_stream(
     scale = local_scale(scene, left_out, all_anchors)
     p = np.minimum(updated.ratios["wrong"] * wrong_factor(config, away, scale), MOST_WRONG)
     p, wide = misscaled(config, share, p, wide)
+    variance, inlier = second_moments(config, scale * variance, p, offset, wide, share)
     if anchors.motion is not None:
         tests = tests_at(anchors.motion, depth.shape[0], depth.shape[1], rows, cols)
-        P = probability(offset, grid.log_depth, away / config.reach, tests, updated.ratios["between"], (rows, cols))
-        p = 1 - (1 - p) * (1 - P)
-    variance, inlier = second_moments(config, scale * variance, p, offset, wide, share)
+        e = mean - c - in_image(x, b)
+        P = probability(e, grid.log_depth, away / config.reach, tests, updated.ratios["between"], (rows, cols))
+        p, variance = 1 - (1 - p) * (1 - P), (1 - P) * variance + P * moment_elsewhere(config, e, wide, share)
     nodes = np.stack([grid.log_depth, offset, variance, inlier, p, away / config.reach], 1)
     depth, spread, inlier, p = read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
     return memory, depth, spread, p, inlier, updated, scores
