@@ -208,7 +208,11 @@ def update(state, depth, claimed, pixel, g, variance, motion=None):
         e = offset + mean[0] + X[:, 1] * mean[1] - c
         P = moving(motion, depth.shape, logs, e, share, ratio(after, "between"))
         elsewhere_ = [second_moment(1.0, 0.1, *each, unmeasured) for each in zip(e, wide, strict=True)]
-        p, spread = 1 - (1 - p) * (1 - P), (1 - P) * spread + P * elsewhere_
+        p, spread = 1 - (1 - p) * (1 - P), (1 - P) * np.array(spread) + P * np.array(elsewhere_)
+    alone, spread = np.array(alone), np.array(spread)
+    beyond = np.maximum((spread - (1 - p) * alone) / np.maximum(p, 1e-12), alone)
+    alone = np.minimum(alone, np.quantile(alone, 0.7))
+    p = np.maximum(p, np.clip((spread - alone) / np.maximum(np.maximum(beyond, 4 * alone) - alone, 1e-12), 0, 1))
     posterior, variance, outlier = read(depth, np.nan_to_num(claimed), logs, mean[:4], offset, spread, p, share)
     _, inlier, _ = read(depth, 0 * depth, logs, mean[:4], offset, alone, p, share)
     return after, posterior, variance, inlier, outlier

@@ -234,7 +234,9 @@ def test_a_thing_that_walks_ahead_neither_shifts_the_scale_nor_escapes_however_l
 
 
 def test_an_exact_network_s_posterior_covers_what_moves_in_a_tour(moving_tour):
+    """And an outlier of the inliers' sigma is as probable there as stated."""
     ufm, moving, still = UfMStar(UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())), [], []
+    probabilities, outliers = [], []
     for i, (frame, landmarks) in enumerate(zip(*moving_tour, strict=True)):
         camera, seen = torch.from_numpy(frame.intrinsics)[None], frame.depth > 0
         depth = np.where(seen, 1.35 * frame.depth, 3.0)
@@ -244,10 +246,18 @@ def test_an_exact_network_s_posterior_covers_what_moves_in_a_tour(moving_tour):
         if i >= 8:
             moving.append(z2[seen & frame.moving])
             still.append(z2[seen & ~frame.moving])
+            error2 = (out.depth[0].numpy() - frame.depth)[seen] ** 2
+            outliers.append(error2 > 9 * out.posterior_inlier_variance[0].numpy()[seen])
+            probabilities.append(out.posterior_outlier[0].numpy()[seen])
     moving, still = np.concatenate(moving), np.concatenate(still)
     assert moving.mean() ** 0.5 < 2
     assert np.mean(moving > 16) < 0.03
     assert still.mean() ** 0.5 < 1
+    p, outlier = np.concatenate(probabilities), np.concatenate(outliers)
+    assert p[outlier].mean() > 5 * p[~outlier].mean()
+    high = p > 0.5
+    assert outlier[high].mean() > 0.15
+    assert outlier[p < 0.05].mean() < 0.05
 
 
 def test_motion_widens_the_variance_and_a_range_sensor_s_anchors_need_none():

@@ -31,8 +31,10 @@ Variance over the squared depth at a node, with share = min(1, distance/reach):
   Gaussian window of width ``near``, and of one virtual anchor with z^2 = 1.
 - ``steepness`` is the variance of f over a node and its neighbours: a depth edge may be one node off in f.
 - m exceeds v where v is large, because the error of the depth is log-normal. Errors beyond a factor F (``farthest``) do
-  not count: without this limit, errors that never occur would decide the variance. The output ``inlier`` is m(v).
-- p is the probability that the depth is of another surface than its evidence: the output ``outlier``.
+  not count: without this limit, errors that never occur would decide the variance. The output ``inlier`` is m(v), at
+  most its 70 % quantile over the image.
+- p is the probability that the depth is of another surface than its evidence. Where the inliers' variance exceeds the
+  usual one of the image, a larger output ``outlier`` stands for the difference (``distribution.divided``).
 - The ratios include the held-out anchors of this frame.
 
 Before the first anchor the network may be off by any factor. The squared share of the variance of b's constant in that
@@ -76,6 +78,7 @@ from ufmstar_torch.kernels.cpu.arrays import array
 from ufmstar_torch.kernels.cpu.threads import each
 from ufmstar_torch.posterior.cells import cell_means, features, read
 from ufmstar_torch.posterior.config import PosteriorConfig
+from ufmstar_torch.posterior.distribution import divided
 from ufmstar_torch.posterior.field import at
 from ufmstar_torch.posterior.learn import learnt
 from ufmstar_torch.posterior.motion import in_image, probability, surfaces, tests_at
@@ -113,8 +116,8 @@ class Posterior:
         variance: [B, H, W] [m^2]; UfM*'s in a stream without anchors.
         calibration: [B] running mean z^2 of held-out anchors: 1 = as predicted, above = too certain; NaN before any.
         unseen: [B] variance of y per image width of distance from evidence.
-        outlier: [B, H, W] probability in [0, 1] that a pixel lies on another surface than its evidence; NaN where not
-            valid or in a stream without anchors.
+        outlier: [B, H, W] probability in [0, 1] that the error is not one of the inliers: the pixel lies on another
+            surface than its evidence, or the surface moves; NaN where not valid or in a stream without anchors.
         inlier: [B, H, W] variance if the pixel does not [m^2]; UfM*'s in a stream without anchors.
         scores: for each stream, [2, M] scores of the frame's held-out anchors and their weights (``conformal``).
     """
@@ -216,6 +219,7 @@ def _of_stream(
         e = mean - c - in_image(x, b)
         P = probability(e, grid.log_depth, away / config.reach, tests, updated.ratios["between"], (rows, cols))
         p, variance = 1 - (1 - p) * (1 - P), (1 - P) * variance + P * moment_elsewhere(config, e, wide, share)
+    inlier, p = divided(variance, inlier, p)
     nodes = np.stack([grid.log_depth, offset, variance, inlier, p, away / config.reach], 1)
     depth, spread, inlier, p = read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
     return memory, depth, spread, p, inlier, updated, scores
