@@ -27,18 +27,20 @@ flat:
 types: flat
 	$(BIN)/mypy build/flat/ufmstar_torch
 
-# The documentation, in build/site; a warning is an error.
+# The documentation, in build/site; a warning is an error, and the reference must have content.
 site: flat
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+	grep -q 'id="ufmstar_torch.ufmstar.UfMStar"' build/site/reference/core.html
+	grep -qF "[B, H, W]" build/site/reference/core.html
 
-# The wheel and the sdist, each installed over the editable package, imported from elsewhere, and taken back.
+# The wheel and the sdist, each installed into a folder of its own and imported from there.
 package:
 	rm -rf dist build/lib
 	$(BIN)/python -m build --outdir dist .
 	for archive in dist/*.whl dist/*.tar.gz; do \
-		$(BIN)/pip install --quiet --no-deps --force-reinstall $$archive && $(BIN)/python -P tests/installed.py || exit 1; \
+		rm -rf build/archive && $(BIN)/pip install --quiet --no-deps --target build/archive $$archive && \
+		PYTHONPATH=$(CURDIR)/build/archive $(BIN)/python -P tests/installed.py || exit 1; \
 	done
-	$(BIN)/pip install --quiet --no-deps -e .
 
 bench:
 	$(BIN)/ufmstar bench

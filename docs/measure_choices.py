@@ -19,7 +19,6 @@ from clips import Clip, add_sources, clips, estimate, judge, line, shown
 
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.kernels.cpu.segment import segment
-from ufmstar_torch.steps.segment_input import SegmentInput
 
 PAPER = UfMStarConfig.paper()
 
@@ -45,10 +44,10 @@ def searches(clip: Clip, stride: int) -> None:
 def gaussians(depth: np.ndarray, K: np.ndarray) -> tuple[int, int]:
     """Gaussians of a depth map of at least 2,000 pixels that have 32 merged segments, and that cover 32 image rows."""
     maps = torch.from_numpy(depth)[None], torch.from_numpy(K)[None]
-    inputs = SegmentInput.of(*maps, replace(PAPER.segment, min_rows=1), None)
-    labels = segment(inputs)[1][0]
+    size = maps[0].shape[1:]
+    labels = segment(*maps, replace(PAPER.segment, min_rows=1).scaled_to(*size))[1][0]
     rows = [int((labels == label).any(1).sum()) for label in range(int(labels.max()) + 1)]
-    merged = segment(SegmentInput.of(*maps, PAPER.segment, None))[0]
+    merged = segment(*maps, PAPER.segment.scaled_to(*size))[0]
     return int(merged.components[0]), sum(count >= PAPER.segment.min_rows for count in rows)
 
 

@@ -9,7 +9,7 @@ its last ten frames), and the pixels that gates on sigma / depth keep, plain and
 it prints false and missed stops: the truth is a stop if more than 1 % of the middle of the image is nearer than
 ``--nearer``; a rule stops if it says so of more than 1 % of these pixels. ``--noise``: rotation noise of every pose
 [degrees]. ``--fit`` also prints the factors of ``posterior.conformal.TRANSFER`` with which the mean coverage is that of
-``TARGETS``; those in use are FastDepth's. ``--figure`` writes coverage and gates as pictures,
+``TARGETS``; those in use are FastDepth's. ``--figure`` draws the gates,
 ``--picture`` the maps of the first sequence's last frame.
 """
 
@@ -32,7 +32,7 @@ from ufmstar_torch.eval.methods.perturb import perturbed
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report import style
-from ufmstar_torch.eval.report.figures_gates import gates_figure, intervals_figure
+from ufmstar_torch.eval.report.figures_error import gates_figure
 from ufmstar_torch.eval.report.style import new_figure
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.open import open_sequence
@@ -249,9 +249,8 @@ def draw_maps(file: Path, frame: Frame, nearer: float) -> None:
 
 
 def draw(file: Path, curves: dict[str, dict[str, list[float]]]) -> None:
-    """Two pictures: FILE with gates, and FILE-intervals."""
+    """The picture of gates."""
     style.save_figure(gates_figure(curves, "Gates on sigma / depth, posterior"), file)
-    style.save_figure(intervals_figure(curves, "Central intervals"), file.with_stem(f"{file.stem}_intervals"))
 
 
 if __name__ == "__main__":

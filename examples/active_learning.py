@@ -12,7 +12,7 @@ import torch
 import tyro
 
 from ufmstar_torch import UfMStar
-from ufmstar_torch.eval.metrics import RMSE, mean_and_ci
+from ufmstar_torch.eval.metrics import DepthAccuracy, mean_and_ci
 from ufmstar_torch.eval.tour import tour_sequence
 from ufmstar_torch.frames.choose import choose
 from ufmstar_torch.models import load_trained
@@ -56,15 +56,15 @@ def main(seeds: int = 4, frames: int = 160, labels: int = 12, steps: int = 60) -
     for seed in range(200_001, 200_001 + seeds):
         pool, held_back = (walk(seed, path, frames, start) for path in (0, 1))
         for name, rows in results.items():
-            network, chosen, rng, rmse = start, list[int](), np.random.default_rng(seed), RMSE()
+            network, chosen, rng, errors = start, list[int](), np.random.default_rng(seed), DepthAccuracy()
             for _ in range(0 if name == "before" else 2):
                 score = np.array(scores(network, pool, PARTS[name]) if name in PARTS else rng.random(frames))
                 score[chosen] = np.nan
                 chosen += choose(torch.from_numpy(score), labels // 2, poses=torch.stack([one[2] for one in pool]))
                 network = trained(deepcopy(network), [pool[i] for i in chosen], steps, rng)
             for x, truth, *_ in held_back:
-                rmse.update(torch.no_grad()(network)(x).depth, None, truth)
-            rows.append(float(rmse.compute()["rmse"]))
+                errors.update(torch.no_grad()(network)(x).depth, None, truth)
+            rows.append(float(errors.compute()["rmse"]))
     print(f"{'choice':8} {'RMSE [m]':>9}  difference to random [m]{', 95 % interval' * (seeds > 1)}")
     for name, rows in results.items():
         mean, interval = mean_and_ci(np.subtract(rows, results["random"]))

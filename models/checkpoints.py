@@ -14,10 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.files.atomic import write_atomic
-from ufmstar_torch.files.tensors import DAMAGE as DAMAGE
-from ufmstar_torch.files.tensors import CheckpointError as CheckpointError
-from ufmstar_torch.files.tensors import read_tensors
+from ufmstar_torch.files.read import DAMAGE as DAMAGE
+from ufmstar_torch.files.read import CheckpointError as CheckpointError
+from ufmstar_torch.files.read import read_tensors
+from ufmstar_torch.files.write import write_atomic
 from ufmstar_torch.frames.arguments import as_path, require_kind
 from ufmstar_torch.runtime.optional import optional
 

@@ -6,7 +6,6 @@ must agree. ``transformers`` initialises missing weights randomly; this module r
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +13,6 @@ from pickle import UnpicklingError
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ufmstar_torch.files.limits import MOST_BYTES
@@ -29,24 +27,17 @@ from ufmstar_torch.runtime.optional import optional
 
 MOST_LAYERS = 1000  # of a model
 _LINEAR, _CUBIC = 2, 3  # Pillow's numbers, which the configurations use
-# The supported architectures, and whether they always predict metric depth. Others, such as models with a second input,
-# raise.
-_ALWAYS_METRIC = {"depth_anything": False, "depth_pro": True, "dpt": False, "glpn": False, "zoedepth": True}
+# The supported architectures: their image processor, and whether they always predict metric depth. Others, such as
+# models with a second input, raise.
+_SUPPORTED = {
+    "depth_anything": ("DPTImageProcessor", False),
+    "depth_pro": ("DepthProImageProcessor", True),
+    "dpt": ("DPTImageProcessor", False),
+    "glpn": ("GLPNImageProcessor", False),
+    "zoedepth": ("ZoeDepthImageProcessor", True),
+}
 # "depth_estimation_type" in the terms of this package; "relative" is inverse depth in all of them.
 _DECLARED = {"metric": METRIC, "relative": "inverse"}
-# Image processors of all published checkpoints, used if preprocessor_config.json is missing.
-_PUBLISHED: dict[str, dict[str, Any]] = {
-    "depth_anything": {
-        "size": {"height": 518, "width": 518},
-        "keep_aspect_ratio": True,
-        "image_mean": [0.485, 0.456, 0.406],
-        "image_std": [0.229, 0.224, 0.225],
-        "resample": _CUBIC,
-    }
-}
-# [1/m] Range to which Depth Pro's inverse depth is clamped: 0.1 mm to 10 km.
-_INVERSE_RANGE = (1e-4, 1e4)
-_PADDING = 3.0  # [sqrt(px)] ZoeDepth pads each border by this times the square root of half the side
 
 
 @dataclass(frozen=True)
@@ -102,44 +93,39 @@ class Checkpoint:
 class RawDepth(nn.Module):
     """A model of ``transformers`` as an image-to-map network, in the model's units and the input's resolution.
 
-    Computes the same as the image processor's ``post_process_depth_estimation``. Depth Pro (Bochkovskii et al. 2025)
-    predicts inverse depth for a focal length of one image width; its field of view makes it metric. ZoeDepth (Bhat et
-    al. 2023) needs an image with reflected borders, which are cropped from its depth.
+    The model's image processor converts the output, and pads the input of ZoeDepth (Bhat et al. 2023). Depth Pro
+    (Bochkovskii et al. 2025) predicts inverse depth for a focal length of one image width; its field of view makes it
+    metric.
 
     Args:
         model: returns ``predicted_depth`` [B, h, w] for ``pixel_values``.
+        processor: its image processor.
         multiple: [px] required divisor of the input's sides.
-        canonical: the output is Depth Pro's.
         padded: the model expects ZoeDepth's borders.
     """
 
-    def __init__(self, model: nn.Module, multiple: int = 1, *, canonical: bool = False, padded: bool = False) -> None:
+    def __init__(self, model: nn.Module, processor: Any, multiple: int = 1, padded: bool = False) -> None:
         super().__init__()
-        self.model, self.multiple, self.canonical, self.padded = model, multiple, canonical, padded
+        self.model, self.processor, self.multiple, self.padded = model, processor, multiple, padded
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> Tensor:
         """[B, H, W], at least in float32, of ``image`` [B, 3, H, W]; a smaller output is enlarged. ``intrinsics``
         [B, 3, 3] [px] replace Depth Pro's estimate of the field of view. Raises ValueError: the image has another
         shape, or sides that are no multiples of ``multiple``."""
         height, width = require_image(image, self.multiple)
-        down, right = (int(math.sqrt(side / 2) * _PADDING) if self.padded else 0 for side in (height, width))
         if self.padded:
-            padded = F.pad(image, (right, right, down, down), mode="reflect")
-            image = F.interpolate(padded, (height, width), mode="bilinear", align_corners=True)
+            exact = {"size": {"height": height, "width": width}, "keep_aspect_ratio": False, "ensure_multiple_of": 1}
+            as_it_is = {"do_rescale": False, "do_normalize": False, "return_tensors": "pt"}
+            image = self.processor(list(image), **exact, **as_it_is)["pixel_values"]
         outputs = self.model(pixel_values=image.to(next(self.model.parameters()).dtype))
         depth = as_map(outputs.predicted_depth, "predicted_depth")
-        depth = depth if depth.dtype == torch.float64 else depth.float()
-        if self.canonical and intrinsics is not None:
-            depth = depth * (width / intrinsics[..., 0, 0].to(depth)).reshape(-1, 1, 1)
-        elif self.canonical:
-            width_per_focal = 2 * (outputs.field_of_view.to(depth) * (math.pi / 360)).tan()
-            depth = depth * width_per_focal.reshape(-1, 1, 1)
-        size = (height + 2 * down, width + 2 * right)
-        if depth.shape[-2:] != size:
-            mode = "bicubic" if self.padded else "bilinear"
-            depth = F.interpolate(depth[:, None], size, mode=mode, align_corners=False)[:, 0]
-        depth = depth[:, down : down + height, right : right + width]
-        return 1 / depth.clamp(*_INVERSE_RANGE) if self.canonical else depth
+        outputs.predicted_depth = depth if depth.dtype == torch.float64 else depth.float()
+        if intrinsics is not None:
+            half = (width / (2 * intrinsics[..., 0, 0].to(outputs.predicted_depth))).atan()
+            outputs.field_of_view = (2 * half).rad2deg().expand(len(image))
+        sizes = {"source_sizes" if self.padded else "target_sizes": [(height, width)] * len(image)}
+        maps = self.processor.post_process_depth_estimation(outputs, **sizes)
+        return torch.stack([one["predicted_depth"] for one in maps])
 
 
 class HuggingFaceDepth(DepthNetwork):
@@ -168,10 +154,11 @@ class HuggingFaceDepth(DepthNetwork):
         self.kind, self.scale, self.source = _kind(checkpoint, spec), spec.scale, checkpoint.name
         if spec.preprocess is not None and (spec.size is not None or spec.keep_aspect is not None):
             raise ValueError("preprocess excludes size and keep_aspect: set them in preprocess")
-        self.preprocess = spec.preprocess or _preprocess(checkpoint, spec.size, spec.keep_aspect)
+        processor = image_processor(checkpoint)
+        self.preprocess = spec.preprocess or _preprocess(checkpoint, processor, spec.size, spec.keep_aspect)
         model = _load_model(checkpoint, dtype, spec.allow_missing) if model is None else model
-        padded = checkpoint.model_type == "zoedepth" and checkpoint.processor.get("do_pad", True)
-        self.raw = RawDepth(model, checkpoint.patch, canonical=checkpoint.model_type == "depth_pro", padded=padded)
+        padded = checkpoint.model_type == "zoedepth" and processor.do_pad
+        self.raw = RawDepth(model, processor, checkpoint.patch, padded)
         self.takes_intrinsics = spec.takes_intrinsics
         if checkpoint.config.get("depth_estimation_type") == METRIC:
             self.max_depth = spec.scale * float(checkpoint.config["max_depth"])
@@ -322,7 +309,7 @@ def read_checkpoint(name_or_dir: str | Path, revision: str | None = None, local_
 
 def _require_size(checkpoint: Checkpoint, dtype: torch.dtype) -> None:
     """Raises CheckpointError: the configuration of a directory states a model that is much larger than its weights, or
-    than the limit of layers; it is built without memory, on the device "meta"."""
+    than the limit of layers, or that cannot be built; it is built without memory, on the device "meta"."""
     from huggingface_hub.errors import StrictDataclassError
     from transformers import CONFIG_MAPPING, AutoModelForDepthEstimation
 
@@ -338,13 +325,17 @@ def _require_size(checkpoint: Checkpoint, dtype: torch.dtype) -> None:
         with torch.device("meta"):
             config = CONFIG_MAPPING[checkpoint.model_type].from_dict(checkpoint.config)
             model: nn.Module = AutoModelForDepthEstimation.from_config(config, dtype=dtype)
-    except (*DAMAGE, NotImplementedError, StrictDataclassError):
-        return  # the size is unknown; the loader builds the same model next, and its error names the fault
+    except (*DAMAGE, NotImplementedError, StrictDataclassError) as error:
+        raise _unbuilt(checkpoint, error) from error
     size = sum(tensor.nbytes for tensor in (*model.parameters(), *model.buffers()))
     stored = sum(file.stat().st_size for file in folder.iterdir() if file.suffix in (".safetensors", ".bin"))
     if size > max(MOST_BYTES, 4 * stored):  # 4: weights in 8 bits
         stated = f"a model of {size:,} bytes, its weights have {stored:,}"
         raise CheckpointError(f"{checkpoint.name}: config.json states {stated}: the files do not belong together")
+
+
+def _unbuilt(checkpoint: Checkpoint, error: Exception) -> CheckpointError:
+    return CheckpointError(f"{checkpoint.name} ({checkpoint.model_type}) cannot be loaded as a depth model: {error}")
 
 
 def _numbers(config: Any, key: str = "") -> Iterator[tuple[str, int]]:
@@ -376,9 +367,7 @@ def _load_model(checkpoint: Checkpoint, dtype: torch.dtype, allow_missing: tuple
             checkpoint.name, dtype=dtype, output_loading_info=True, **checkpoint.options
         )
     except (*DAMAGE, UnpicklingError, SafetensorError, StrictDataclassError) as error:
-        raise CheckpointError(
-            f"{checkpoint.name} ({checkpoint.model_type}) cannot be loaded as a depth model: {error}"
-        ) from error
+        raise _unbuilt(checkpoint, error) from error
     missing = sorted(key for key in report["missing_keys"] if not key.startswith(tuple(allow_missing)))
     if missing:
         raise CheckpointError(
@@ -391,46 +380,53 @@ def _load_model(checkpoint: Checkpoint, dtype: torch.dtype, allow_missing: tuple
     return network
 
 
-def _preprocess(checkpoint: Checkpoint, size: tuple[int, int] | None, keep_aspect: bool | None) -> Preprocess:
-    """The preprocessing of a checkpoint's image processor. Raises ValueError: its description is incomplete, or
-    contains a step that ``Preprocess`` does not support."""
-    processor, name = checkpoint.processor or _PUBLISHED.get(checkpoint.model_type, {}), checkpoint.name
+def image_processor(checkpoint: Checkpoint) -> Any:
+    """The image processor of ``transformers`` as the checkpoint describes it, with the defaults of its class. Raises
+    CheckpointError: the description has impossible values."""
+    import transformers
+
+    try:
+        return getattr(transformers, _SUPPORTED[checkpoint.model_type][0])(**checkpoint.processor)
+    except DAMAGE as error:
+        raise CheckpointError(f"{checkpoint.name}: preprocessor_config.json cannot be used: {error}") from error
+
+
+def _preprocess(
+    checkpoint: Checkpoint, processor: Any, size: tuple[int, int] | None, keep_aspect: bool | None
+) -> Preprocess:
+    """The preprocessing of a checkpoint's image processor. Raises ValueError: its description is missing, or contains a
+    step that ``Preprocess`` does not support."""
+    name, stated = checkpoint.name, getattr(processor, "size", None)
     declare = (
         'in a spec: {"preprocess": {"size": [518, 518], "mean": [...], "std": [...]}}, or preprocess=Preprocess(...)'
     )
-    if not processor:
+    if not checkpoint.processor:
         raise ValueError(
             f"{name} has no preprocessor_config.json, which states how images are resized and normalised: copy it "
             f"there from the source of the weights, or declare it {declare}"
         )
-    unknown = [option for option in ("do_center_crop", "do_flip_channel_order") if processor.get(option)]
-    resample = processor.get("resample", _CUBIC)
-    if unknown or resample not in (_LINEAR, _CUBIC):
+    unknown = [option for option in ("do_center_crop", "do_flip_channel_order") if getattr(processor, option, None)]
+    if unknown or processor.resample not in (_LINEAR, _CUBIC):
         raise ValueError(
-            f"{name}: its image processor needs {unknown or f'resample {resample}'}, which is not supported: "
+            f"{name}: its image processor needs {unknown or f'resample {processor.resample}'}, which is not supported: "
             f"declare another one {declare}"
         )
-    stated = processor.get("size")
-    if size is None and isinstance(stated, dict) and {"height", "width"} <= set(stated):
-        size = (int(stated["height"]), int(stated["width"]))
     if size is None:
-        raise ValueError(f"{name}: preprocessor_config.json states no size with height and width: declare it {declare}")
-    keep = bool(processor.get("keep_aspect_ratio")) if keep_aspect is None else keep_aspect
-    divisor = int(processor.get("ensure_multiple_of") or processor.get("size_divisor") or 1)
-    mean, std = processor.get("image_mean"), processor.get("image_std")
-    if not processor.get("do_normalize", True):
-        mean, std = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-    if mean is None or std is None:
-        raise ValueError(f"{name}: its image processor normalises, but names no image_mean and image_std")
-    factor = float(processor.get("rescale_factor", 1 / 255)) if processor.get("do_rescale", True) else 1.0
+        if not (stated and stated.height and stated.width):
+            expected = f"preprocessor_config.json states no size with height and width: declare it {declare}"
+            raise ValueError(f"{name}: {expected}")
+        size = (int(stated.height), int(stated.width))
+    keep = bool(getattr(processor, "keep_aspect_ratio", False)) if keep_aspect is None else keep_aspect
+    divisors = (getattr(processor, option, None) or 1 for option in ("ensure_multiple_of", "size_divisor"))
+    mean, std = (processor.image_mean, processor.image_std) if processor.do_normalize else ((0.0,) * 3, (1.0,) * 3)
     return Preprocess(
         size=size,
-        aspect_multiple=max(checkpoint.patch, divisor) if keep else None,
-        value_range=255 * factor,
+        aspect_multiple=int(max(checkpoint.patch, *divisors)) if keep else None,
+        value_range=255 * processor.rescale_factor if processor.do_rescale else 255.0,
         mean=tuple(mean),
         std=tuple(std),
         antialias=checkpoint.model_type != "depth_pro",
-        cubic=resample == _CUBIC,
+        cubic=processor.resample == _CUBIC,
     )
 
 
@@ -438,8 +434,8 @@ def _kind(checkpoint: Checkpoint, spec: HuggingFaceSpec) -> str:
     """The kind of depth, from the configuration, the architecture and the declaration."""
     config, name, model_type = checkpoint.config, checkpoint.name, checkpoint.model_type
     kind, takes_intrinsics = spec.kind, spec.takes_intrinsics
-    if model_type not in _ALWAYS_METRIC:
-        names = ", ".join(_ALWAYS_METRIC)
+    if model_type not in _SUPPORTED:
+        names = ", ".join(_SUPPORTED)
         raise CheckpointError(f"{name} ({model_type}) cannot be loaded as a depth model: covered are {names}")
     if takes_intrinsics and model_type != "depth_pro":
         raise ValueError(
@@ -455,7 +451,7 @@ def _kind(checkpoint: Checkpoint, spec: HuggingFaceSpec) -> str:
         raise ValueError(f"{name}: depth_estimation_type must be one of {list(_DECLARED)}, got {stated!r}")
     if stated == METRIC and "max_depth" not in config:
         raise ValueError(f"{name} states metric depth, but not the max_depth [m] that its output is a share of")
-    stated_kind = METRIC if _ALWAYS_METRIC[model_type] else _DECLARED.get(str(stated))
+    stated_kind = METRIC if _SUPPORTED[model_type][1] else _DECLARED.get(str(stated))
     if stated_kind is None and kind is None:
         raise ValueError(
             f"{name} ({model_type}) does not state whether its depth is metric: declare kind='metric', 'inverse' "

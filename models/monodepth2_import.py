@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.files.tensors import read_tensors
+from ufmstar_torch.files.read import read_tensors
 from ufmstar_torch.models.alignment import AlignedNetwork, Alignment
 from ufmstar_torch.models.checkpoints import channels_of, fill, load_state_dict_file
 from ufmstar_torch.models.monodepth2 import (

@@ -150,11 +150,16 @@ class Preprocess(Checked):
 
     def apply_image(self, image: ImageLike) -> Tensor:
         """The network's input without intrinsics; shapes, types and errors as in :meth:`__call__`."""
-        x = self._resampled(as_image(image))
+        return self.normalized(self.resampled(as_image(image)))
+
+    def normalized(self, x: Tensor) -> Tensor:
+        """The network's input of colours [B, 3, h, w] in [0, 1] at its size, on any device."""
         if self.value_range != 1.0:
             x = x * self.value_range
         if any(self.mean) or any(s != 1.0 for s in self.std):
-            x = (x - x.new_tensor(self.mean)[:, None, None]) / x.new_tensor(self.std)[:, None, None]
+            # Numbers as arguments of kernels: a tensor of them would have to be copied to the device.
+            channels = zip(x.unbind(-3), self.mean, self.std, strict=True)
+            x = torch.stack([(channel - mean) / std for channel, mean, std in channels], -3)
         return x.contiguous()
 
     def apply_intrinsics(self, intrinsics: Tensor, height: int, width: int) -> Tensor:
@@ -173,25 +178,28 @@ class Preprocess(Checked):
         columns = _source_index(g.final[1], g.cropped[1], g.left, g.resized[1], g.image[1])
         return depth[..., rows.to(depth.device)[:, None], columns.to(depth.device)]
 
-    def _resampled(self, image: Tensor) -> Tensor:
-        """[B, 3, h, w] in [0, 1]; a kernel resamples bytes on the CPU linearly (``preprocess_cpu``)."""
+    def resampled(self, image: Tensor) -> Tensor:
+        """[B, 3, h, w] in [0, 1], resized, cropped and resized. Bytes on the CPU: a kernel resamples them linearly
+        (``preprocess_cpu``); torch cubically, rounding as the image processors of ``transformers`` do."""
         _check(image)
-        g = self.geometry(*image.shape[-2:])
-        single = torch.get_default_dtype() == torch.float32
-        if image.dtype == torch.uint8 and image.is_cpu and self.antialias and not self.cubic and single and len(image):
+        as_bytes = image.dtype == torch.uint8 and image.is_cpu and self.antialias
+        if as_bytes and not self.cubic and torch.get_default_dtype() == torch.float32 and len(image):
             from ufmstar_torch.models.preprocess_cpu import resample
 
+            g = self.geometry(*image.shape[-2:])
             once = g.resized == g.cropped == g.image
             steps = (g.final, 0, 0, g.final, g.final) if once else (g.resized, g.top, g.left, g.cropped, g.final)
             pixels = image.permute(0, 2, 3, 1).contiguous().numpy()
             return torch.stack([torch.from_numpy(resample(one, *steps)) for one in pixels])
-        return self.resampled(image)
+        return _unit(self._steps(image)) if as_bytes and self.cubic else self.by_torch(image)
 
-    def resampled(self, image: Tensor) -> Tensor:
-        """[B, 3, h, w] in [0, 1], resized, cropped and resized: the reference for all devices, dtypes and filters."""
-        x = image.to(torch.get_default_dtype()) / 255 if image.dtype == torch.uint8 else image
+    def by_torch(self, image: Tensor) -> Tensor:
+        """As :meth:`resampled`, in floats: the reference for all devices, dtypes and filters."""
         if image.dtype in (torch.float16, torch.bfloat16):  # not supported by torch on the CPU
-            return self.resampled(image.float()).to(image.dtype)
+            return self.by_torch(image.float()).to(image.dtype)
+        return self._steps(image if image.is_floating_point() else _unit(image))
+
+    def _steps(self, x: Tensor) -> Tensor:
         g = self.geometry(*x.shape[-2:])
         x = self._resize(x, g.resized)
         x = x[..., g.top : g.top + g.cropped[0], g.left : g.left + g.cropped[1]]
@@ -202,7 +210,12 @@ class Preprocess(Checked):
             return x
         mode = "bicubic" if self.cubic else "bilinear"
         resized = F.interpolate(x, size, mode=mode, align_corners=False, antialias=self.antialias)
-        return resized.clamp(0, 1) if self.cubic else resized
+        return resized.clamp(0, 1) if self.cubic and x.is_floating_point() else resized
+
+
+def _unit(image: Tensor) -> Tensor:
+    """Bytes as floats in [0, 1]."""
+    return image.to(torch.get_default_dtype()) / 255
 
 
 def _is_number(value: object) -> TypeGuard[int | float]:

@@ -1,6 +1,6 @@
 """Resizing, cropping and resizing of 8-bit images, compiled, on one CPU thread.
 
-The reference is ``Preprocess.resampled``, with the same weights and the same order of summation in float32. The results
+The reference is ``Preprocess.by_torch``, with the same weights and the same order of summation in float32. The results
 differ at most by the rounding of a fused multiplication.
 """
 

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -20,16 +19,16 @@ from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.frames.frame import CheckKernel
 from ufmstar_torch.gaussians import gaussian
 from ufmstar_torch.gaussians.mixture import GaussianMixture
+from ufmstar_torch.kernels.compile_cpu import kernel
 from ufmstar_torch.kernels.cpu import correspond as correspond_cpu
 from ufmstar_torch.kernels.cpu import fuse as fuse_cpu
 from ufmstar_torch.kernels.cpu import regress as regress_cpu
 from ufmstar_torch.kernels.cpu import rigid as rigid_cpu
 from ufmstar_torch.kernels.cpu import segment as segment_cpu
-from ufmstar_torch.kernels.host import moved
-from ufmstar_torch.kernels.select import select_frame, select_kernels
+from ufmstar_torch.kernels.cpu import stream as stream_cpu
+from ufmstar_torch.kernels.select import moved, select_frame, select_kernels
 from ufmstar_torch.steps.correspond import Correspondence
-from ufmstar_torch.steps.segment_input import SegmentInput
-from ufmstar_torch.steps.step_parts import REFERENCE, Kernels
+from ufmstar_torch.steps.step import REFERENCE, Kernels
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"  # must be set before triton is imported
 
@@ -53,7 +52,7 @@ class Backend:
 
     def spgf(self, depth, intrinsics, config, *, features=None):
         """Segment depth maps [B, H, W] (step 2)."""
-        return self.kernels.spgf(SegmentInput.of(depth, intrinsics, config, features))
+        return self.kernels.spgf(depth, intrinsics, config.scaled_to(*depth.shape[1:]), features)
 
     def module(self, config: UfMStarConfig, dtype: torch.dtype = torch.float32) -> Callable[..., Any]:
         """UfM* on this backend, with CPU tensors as arguments and results; ``ufm`` is the wrapped module."""
@@ -87,8 +86,13 @@ def make_backend(name: str) -> Backend:
 
 @functools.cache
 def compiled(part: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap a function of the compiled kernels so that Python can call it."""
-    return numba.njit(lambda *arguments: part(*arguments))
+    """Make a kernel of a part, cached on disk, so that Python can call it."""
+
+    def call(*arguments: Any) -> Any:
+        return part(*arguments)
+
+    call.__qualname__ = part.__qualname__  # the name of the files in the cache
+    return kernel(call)
 
 
 def _on(device: str, kernel: Callable[..., Any]) -> Any:
@@ -143,7 +147,7 @@ def _floored(cov, floor):
     out, mean = cov.clone(), torch.zeros(*cov.shape[:-2], 3, dtype=cov.dtype)
     mean[..., 2] = floor.sqrt()  # a camera whose pixel is 1 wide at depth 1
     arrays = (value.numpy() for value in (mean.view(-1, 3), out.view(-1, 3, 3), torch.ones_like(floor).view(-1)))
-    fuse_cpu.lift(*arrays, 0.0, 1.0, 1.0, 0.0)
+    stream_cpu.lift(*arrays, 0.0, 1.0, 1.0, 0.0)
     return out
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import resource
 import subprocess
@@ -22,10 +23,10 @@ COMPILE = Path(__file__).with_name("compile_kernels.py")
 COMPILERS: pytest.StashKey[list[subprocess.Popen[bytes]]] = pytest.StashKey()
 
 settings.register_profile("fast", deadline=None, max_examples=25)
-settings.register_profile("thorough", deadline=None, max_examples=75, print_blob=True)
-settings.register_profile("interpreted", deadline=None, max_examples=3)
+settings.register_profile("thorough", deadline=None, max_examples=50, print_blob=True)
+settings.register_profile("few", deadline=None, max_examples=3)
 # --hypothesis-profile=thorough loads another one.
-settings.load_profile("interpreted" if os.environ.get("TRITON_INTERPRET") == "1" else "fast")
+settings.load_profile("few" if os.environ.get("TRITON_INTERPRET") == "1" else "fast")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -55,6 +56,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     left_out = [item for item in items if any(map(item.get_closest_marker, markers))]
     config.hook.pytest_deselected(items=left_out)
     items[:] = [item for item in items if item not in set(left_out)]
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Leave all imported modules out of later garbage collections, which take a second with them: each warm-up collects
+    once."""
+    gc.collect()
+    gc.freeze()
+
+
+def pytest_sessionfinish() -> None:
+    """Modules that count their objects at the end find them collected."""
+    gc.unfreeze()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -12,13 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ufmstar_torch.eval.engine.files import write_json_atomic
+from ufmstar_torch.eval.engine.record import Record
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.run.files import write_json_atomic
-from ufmstar_torch.eval.suite.record import Record
+from ufmstar_torch.eval.report.table import Table
 from ufmstar_torch.eval.suite.work_items import WorkItem
 
 Maps = tuple[Tensor, Tensor | None, Tensor]
@@ -46,25 +47,15 @@ def folder_of(out: Path, dataset: str, sequence: str) -> Path:
 
 
 def write_examples(out: Path, dataset: str, sequence: str, rows: Sequence[Row]) -> None:
-    """Write an example frame "7" with maps of the rows, and a room for the last row."""
+    """Write an example frame "7" with maps of the rows."""
     folder = folder_of(out, dataset, sequence)
-    for name in ("examples", "room"):
-        (folder / name).mkdir(parents=True)
+    (folder / "examples").mkdir(parents=True)
     K = np.array([[20.0, 0, 7.5], [0, 20, 5.5], [0, 0, 1]])
     truth = np.full(SHAPE, 3.0, np.float32)
     np.savez(folder / "examples" / "7.npz", image=np.zeros((*SHAPE, 3), np.uint8), truth=truth, K=K)
     for n, row in enumerate(rows):
         maps = {"depth": truth - 1 + 0.1 * np.float32(n), "variance": np.full(SHAPE, 0.1 + n, np.float32)}
         np.savez(folder / "examples" / f"7@{row.slug}.npz", **maps)
-    covariance = np.eye(3)[None].repeat(2, 0)
-    room = {
-        "mean_world": np.ones((2, 3)),
-        "covariance_world": covariance,
-        "disagreement": [0, 1.0],
-        "views": [1, 2.0],
-    }
-    room["path"] = np.zeros((1, 3))
-    np.savez(folder / "room" / f"{rows[-1].slug}_7.npz", **room, T_world_cam=np.eye(4))
 
 
 def draw_maps(row: Row, sequence: str, pixels: int = 800) -> Maps:
@@ -81,8 +72,8 @@ def draw_maps(row: Row, sequence: str, pixels: int = 800) -> Maps:
     return torch.tensor(depth), torch.tensor(sigma**2), torch.tensor(truth)
 
 
-def judge(maps: Maps, references: Mapping[str, Tensor]) -> tuple[Record, dict[str, dict[str, Tensor]]]:
-    """The figures and curves of a record, and the sums they are computed from."""
+def judge(maps: Maps, references: Mapping[str, Tensor]) -> Record:
+    """A record with figures, curves and the sums they are computed from."""
     depth, variance, truth = maps
     metrics = SequenceMetrics(with_variance=variance is not None)
     metrics.update(depth, variance, truth)
@@ -93,7 +84,7 @@ def judge(maps: Maps, references: Mapping[str, Tensor]) -> tuple[Record, dict[st
         by_error.update(depth, variance, truth, confident)
         curves[f"nll_by_error:{name}"] = by_error.compute()["nll_by_error"].tolist()
         sums[f"nll_by_error:{name}"] = dict(by_error.state_dict())
-    return Record("", "", "", "", "", figures=metrics.compute(), curves=curves), sums
+    return Record("", figures=metrics.compute(), curves=curves, sums=sums)
 
 
 def confident(variance: Tensor) -> Tensor:
@@ -115,8 +106,8 @@ def write_sequence(
         if variance is not None
     }
     for row in rows:
-        judged, sums = judge(draw_maps(row, sequence), references)
-        record_of(suite, dataset, sequence, row, judged, network).save(folder / f"{row.slug}.json", sums)
+        judged = judge(draw_maps(row, sequence), references)
+        record_of(suite, dataset, sequence, row, judged, network).save(folder / f"{row.slug}.json")
 
 
 def record_of(suite: str, dataset: str, sequence: str, row: Row, judged: Record, network: str = NETWORK) -> Record:
@@ -134,6 +125,7 @@ def record_of(suite: str, dataset: str, sequence: str, row: Row, judged: Record,
         frames={"selected": 42, "done": 40, "skipped": 2, "reasons": {"pose is not finite": 2}},
         figures=judged.figures,
         curves=judged.curves,
+        sums=judged.sums,
         state=state if size else {},
         ms={"network": 9.0 * members, "uncertainty": {ALONE: 0.2, UFM: 14.0, UFM_STAR: 10.0}[row.method.fusion]},
         provenance={"device": "cpu"},
@@ -145,8 +137,7 @@ def in_memory(
 ) -> Results:
     """Results without curves. ``figures`` maps row and (data set, sequence), in that order, to figures."""
     records = [
-        record_of(suite, *where, row, Record("", "", "", "", "", figures=dict(values)))
-        for (row, where), values in figures.items()
+        record_of(suite, *where, row, Record("", figures=dict(values))) for (row, where), values in figures.items()
     ]
     rows = dict.fromkeys(row for row, _ in figures)
     listed = [{"method": row.method.name, "setting": row.setting.to_dict()} for row in rows]
@@ -198,12 +189,11 @@ def write_evaluation(
     return out
 
 
-def parsed(text: str) -> dict[str, dict[str, str]]:
-    """Cells of a Markdown table by the first cell of their row and by heading, without the marks of bold type."""
-    lines = [line.strip("|").split(" | ") for line in text.splitlines() if line.startswith("|")]
-    head, _, *rows = [[cell.strip() for cell in line] for line in lines]
-    plain = [[cell.replace("**", "").replace("\\", "") for cell in row] for row in rows]
-    return {row[0]: dict(zip(head[1:], row[1:], strict=True)) for row in plain}
+def parsed(table: Table) -> dict[str, dict[str, str]]:
+    """The cells of a table by label and "GROUP: HEADING"."""
+    headings = [f"{group}: {name}" if group else name for group, name in table.cells.columns]
+    lines = zip(table.cells.index, table.cells.to_numpy(), strict=True)
+    return {label: dict(zip(headings, cells, strict=True)) for (_, label), cells in lines}
 
 
 def check_latex(text: str) -> None:

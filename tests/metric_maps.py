@@ -8,9 +8,7 @@ from torch import Tensor
 
 from ufmstar_torch.eval.metrics import (
     NLL,
-    RMSE,
-    AbsRel,
-    Delta1,
+    DepthAccuracy,
     ECEDelta,
     ECEQuantile,
     EntropyHistogram,
@@ -22,9 +20,9 @@ from ufmstar_torch.eval.metrics.base import SumMetric
 
 RANKING = [Sparsification, SpearmanCorrelation, NLLByError]
 
-ALL = [Delta1, AbsRel, RMSE, NLL, ECEDelta, ECEQuantile, EntropyHistogram, *RANKING]
+ALL = [DepthAccuracy, NLL, ECEDelta, ECEQuantile, EntropyHistogram, *RANKING]
 
-UNCERTAIN = ALL[3:]
+UNCERTAIN = ALL[1:]
 
 JUDGED = [kind for kind in ALL if kind is not EntropyHistogram]  # on pixels with ground truth alone
 

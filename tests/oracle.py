@@ -69,11 +69,11 @@ def bhattacharyya(mean_a, cov_a, mean_b, cov_b):
     return float(np.exp(-d @ np.linalg.solve(S, d) / 8 - log_ratio / 2))
 
 
-def project(mean, cov, K):
+def project(mean, cov, K, pixel_variance=PIXEL_VARIANCE):
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     x, y, z = mean
     A = np.array([[fx / z, 0, -fx * x / z**2], [0, fy / z, -fy * y / z**2]])
-    return np.array([fx * x / z + cx, fy * y / z + cy]), A @ cov @ A.T + PIXEL_VARIANCE * np.eye(2)
+    return np.array([fx * x / z + cx, fy * y / z + cy]), A @ cov @ A.T + pixel_variance * np.eye(2)
 
 
 def floor_eigenvalues(cov, floor):
@@ -108,7 +108,7 @@ class Segmentation:
         return not drops[self.prune]
 
 
-def segment(depth, K, segmentation, *, valid=None, features=None, near=0.05):
+def segment(depth, K, segmentation, *, valid=None, features=None, near=0.05, pixel_variance=PIXEL_VARIANCE):
     """C_i. The covariance floor is the footprint of a pixel, at no less than the near plane's depth.
 
     features [F, H, W] are averaged over the pixels of a component.
@@ -120,7 +120,7 @@ def segment(depth, K, segmentation, *, valid=None, features=None, near=0.05):
         if not segmentation.keeps(piece):
             continue
         rows, columns = np.array(piece.pixels).T
-        floor = (max(piece.mu[2], near) / min(K[0, 0], K[1, 1])) ** 2 * PIXEL_VARIANCE
+        floor = (max(piece.mu[2], near) / min(K[0, 0], K[1, 1])) ** 2 * pixel_variance
         components.append({
             "mean": piece.mu,
             "cov": floor_eigenvalues(piece.covariance, floor),
@@ -131,20 +131,20 @@ def segment(depth, K, segmentation, *, valid=None, features=None, near=0.05):
     return components
 
 
-def candidate(component_cam, K, size, near):
+def candidate(component_cam, K, size, near, pixel_variance):
     if component_cam["mean"][2] <= near:
         return None
-    mean, cov = project(component_cam["mean"], component_cam["cov"], K)
+    mean, cov = project(component_cam["mean"], component_cam["cov"], K, pixel_variance)
     inside = -0.5 <= mean[0] < size[1] - 0.5 and -0.5 <= mean[1] < size[0] - 0.5
     return (mean, cov) if inside else None
 
 
-def correspond(previous_cam, current_cam, K, size, eta, eta_occl, near):
+def correspond(previous_cam, current_cam, K, size, eta, eta_occl, near, pixel_variance=PIXEL_VARIANCE):
     """For every c the list of matched k, and the overlaps."""
-    projected = [candidate(k, K, size, near) for k in previous_cam]
+    projected = [candidate(k, K, size, near, pixel_variance) for k in previous_cam]
     matches, overlaps = [], {}
     for c, component in enumerate(current_cam):
-        gaussian = candidate(component, K, size, near)
+        gaussian = candidate(component, K, size, near, pixel_variance)
         result = []
         for k, other in enumerate(projected):
             if gaussian is None or other is None:
@@ -211,100 +211,70 @@ def fuse(mixture, current, matches, overlaps, view, *, baseline=0.07, near=0.05,
     return fused
 
 
-def prepared(mixture):
-    """The mixture, with the inverse covariance and the normalisation of the density added to each component."""
-    return [
-        {**g, "inverse": np.linalg.inv(g["cov"]), "factor": 1 / np.sqrt((2 * np.pi) ** 3 * np.linalg.det(g["cov"]))}
-        for g in mixture
-    ]
+def evidence(points, mixture, neighbourhood=None):
+    """p_k(x) [K, P], the weight times the density of every component at points [P, 3]. With a neighbourhood (sigmas,
+    near, far), 0 for components whose box is farther than near, or than far where no box is as near."""
+    p, gap = np.zeros((2, len(mixture), len(points)))
+    for k, g in enumerate(mixture):
+        d = points - g["mean"]
+        exponent = -((d @ np.linalg.inv(g["cov"])) * d).sum(1) / 2
+        p[k] = g["weight"] * np.exp(exponent) / np.sqrt((2 * np.pi) ** 3 * np.linalg.det(g["cov"]))
+        if neighbourhood is not None:
+            gap[k] = (np.abs(d) - neighbourhood[0] * np.sqrt(np.diag(g["cov"]))).max(1)
+    if neighbourhood is None:
+        return p
+    near, far = (gap <= radius for radius in neighbourhood[1:])
+    return np.where(np.where(near.any(0), near, far), p, 0.0)
 
 
-def density(x, g):
-    d = x - g["mean"]
-    return g["factor"] * np.exp(-d @ g["inverse"] @ d / 2)
+def regress(points, mixture, values, prior, *, prior_weight, neighbourhood=None):
+    """(sum_k p_k h_k + pi_0 h_0) / (sum_k p_k + pi_0) at points [P, 3], for values h_k [K, C] and the prior's h_0."""
+    p = evidence(points, mixture, neighbourhood)
+    return (p.T @ np.reshape(values, (len(p), -1)) + prior_weight * prior) / (p.sum(0) + prior_weight)[:, None]
 
 
-def neighbours(x, mixture, sigmas, radius):
-    chosen = []
-    for g in mixture:
-        gap = np.abs(x - g["mean"]) - sigmas * np.sqrt(np.diag(g["cov"]))
-        if np.max(gap) <= radius:
-            chosen.append(g)
-    return chosen
+def points_of(depth, at, K):
+    """Points [P, 3] in the camera's frame of the pixels where the mask ``at`` is set."""
+    (v, u), d = np.nonzero(at), depth[at]
+    return np.stack([(u - K[0, 2]) / K[0, 0] * d, (v - K[1, 2]) / K[1, 1] * d, d], -1)
 
 
-def regress_point(x, mixture, *, prior_weight, prior_mean, neighbourhood=None):
-    """m_hat(x) and the features of a prepared mixture; neighbourhood = (sigmas, near, far), None = exact sum."""
-    used = mixture
-    if neighbourhood is not None:
-        sigmas, near, far = neighbourhood
-        used = neighbours(x, mixture, sigmas, near) or neighbours(x, mixture, sigmas, far)
-    evidence, m = prior_weight, prior_weight * prior_mean
-    features = np.zeros_like(mixture[0]["features"]) if mixture else np.zeros(0)
-    for g in used:
-        w = g["weight"] * density(x, g)
-        evidence += w
-        m += w * g["m"]
-        features = features + w * g["features"]
-    return m / evidence, features / evidence
-
-
-def dense(mixture_cam, depth, valid, K, **prior):
-    """m_hat at every valid pixel of a depth map, NaN elsewhere."""
+def regressed_map(mixture_cam, depth, valid, K, values, prior, **settings):
+    """:func:`regress` of one value at every valid pixel of a depth map, NaN elsewhere."""
     out = np.full(depth.shape, np.nan)
-    mixture_cam = prepared(mixture_cam)
-    for v in range(depth.shape[0]):
-        for u in range(depth.shape[1]):
-            if valid[v, u]:
-                d = depth[v, u]
-                x = np.array([(u - K[0, 2]) / K[0, 0] * d, (v - K[1, 2]) / K[1, 1] * d, d])
-                out[v, u] = regress_point(x, mixture_cam, **prior)[0]
-    return out
-
-
-def compared_share(mixture_cam, depth, valid, K, **prior):
-    """Share to which every valid pixel is measured, sum of w_k (1 - exp(-n_k)); NaN elsewhere."""
-    out = np.full(depth.shape, np.nan)
-    mixture = prepared([{**g, "features": np.array([1 - np.exp(-g["views"])])} for g in mixture_cam])
-    for v, u in np.argwhere(valid):
-        d = depth[v, u]
-        x = np.array([(u - K[0, 2]) / K[0, 0] * d, (v - K[1, 2]) / K[1, 1] * d, d])
-        out[v, u] = regress_point(x, mixture, **prior)[1][0] if mixture else 0.0
+    out[valid] = regress(points_of(depth, valid, K), mixture_cam, values, prior, **settings)[:, 0]
     return out
 
 
 def aleatoric_in_h(mixture_cam, depth, valid, K, aleatoric, *, prior_weight):
     """The aleatoric variance at every valid pixel, regressed from the first feature; the pixel's variance A has the
     prior's weight: (sum_k p_k a_k + pi_0 A) / (sum_k p_k + pi_0), exact sum."""
-    out = np.full(depth.shape, np.nan)
-    mixture = prepared(mixture_cam)
-    for v, u in np.argwhere(valid):
-        d = depth[v, u]
-        x = np.array([(u - K[0, 2]) / K[0, 0] * d, (v - K[1, 2]) / K[1, 1] * d, d])
-        parts = [(g["weight"] * density(x, g), g["features"][0]) for g in mixture]
-        parts.append((prior_weight, aleatoric[v, u]))
-        out[v, u] = sum(p * a for p, a in parts) / sum(p for p, _ in parts)
-    return out
+    values, prior = [g["features"][0] for g in mixture_cam], aleatoric[valid][:, None]
+    return regressed_map(mixture_cam, depth, valid, K, values, prior, prior_weight=prior_weight)
 
 
 class Oracle:
-    """The whole algorithm for one stream."""
+    """The whole algorithm for one stream. The paper's equations have no near plane, no variance of a pixel and no floor
+    of a covariance: near = pixel_variance = 0."""
 
     def __init__(self, spgf, *, eta=0.5, eta_occl=0.7, near=0.05, prior_weight=1.0, prior_mean=0.0,
                  alpha=0.5, overlap_weighted=False, neighbourhood=None, disagreement="w2",
-                 unmeasured="paper", unmeasured_relative=0.1, baseline=0.07):  # fmt: skip
-        self.baseline = baseline
+                 unmeasured="paper", unmeasured_relative=0.1, baseline=0.07,
+                 pixel_variance=PIXEL_VARIANCE):  # fmt: skip
+        self.baseline, self.pixel_variance = baseline, pixel_variance
         self.unmeasured, self.unmeasured_relative = unmeasured, unmeasured_relative
         self.disagreement = disagreement
         self.spgf, self.eta, self.eta_occl, self.near = spgf, eta, eta_occl, near
-        self.prior = {"prior_weight": prior_weight, "prior_mean": prior_mean, "neighbourhood": neighbourhood}
+        self.prior_mean = prior_mean
+        self.prior = {"prior_weight": prior_weight, "neighbourhood": neighbourhood}
         self.alpha, self.overlap_weighted = alpha, overlap_weighted
         self.mixture, self.T_first, self.smoothed = [], None, None
         self.matches = []
 
     def share(self):
-        """Return :func:`compared_share` [H, W] of the last frame."""
-        return self.informative * compared_share(*self.seen, **self.prior)
+        """Share to which every valid pixel of the last frame is measured, sum of w_k (1 - exp(-n_k)); NaN elsewhere."""
+        values = [1 - np.exp(-g["views"]) for g in self.mixture_cam]
+        return self.informative * regressed_map(*self.seen, values, 0.0, **self.prior)
 
     def step(self, depth, T_world_cam, K, aleatoric=None, epistemic=None, features=None, member=0, informative=True):
         self.informative = float(informative)
@@ -312,11 +282,15 @@ class Oracle:
         if self.T_first is None:
             self.T_first = T_world_cam
         shown = valid & informative
-        current = segment(np.where(shown, depth, 0.0), K, self.spgf, valid=shown, features=features)
+        current = segment(
+            np.where(shown, depth, 0.0), K, self.spgf, valid=shown, features=features,
+            pixel_variance=self.pixel_variance,
+        )  # fmt: skip
         to_cam = relative(self.T_first, T_world_cam)
         to_first = relative(T_world_cam, self.T_first)
         previous_cam = [transform(g, *to_cam) for g in self.mixture]
-        self.matches, overlaps = correspond(previous_cam, current, K, depth.shape, self.eta, self.eta_occl, self.near)
+        limits = self.eta, self.eta_occl, self.near, self.pixel_variance
+        self.matches, overlaps = correspond(previous_cam, current, K, depth.shape, *limits)
         current_first = [transform(g, *to_first) for g in current]
         distances = None
         if self.disagreement == "overlap":
@@ -340,7 +314,7 @@ class Oracle:
         )
         mixture_cam = self.mixture_cam = [transform(g, *to_cam) for g in self.mixture]
         self.seen = mixture_cam, depth, valid, K
-        M = dense(mixture_cam, depth, valid, K, **self.prior)
+        M = regressed_map(*self.seen, [g["m"] for g in mixture_cam], self.prior_mean, **self.prior)
         if self.unmeasured == "relative":
             M = M + (1 - self.share()) * (self.unmeasured_relative * depth) ** 2
         if self.unmeasured == "nan":

@@ -48,23 +48,16 @@ class AnchoredOracle(oracle.Oracle):
         """V, B and the expected r [H, W]; anchors are (u, v, depth, variance)."""
         network_variance = np.zeros_like(depth) if aleatoric is None else aleatoric
         V, M = self.step(depth, T_world_cam, K, aleatoric)
-        to_cam = oracle.relative(self.T_first, T_world_cam)
-        mixture = oracle.prepared([oracle.transform(g, *to_cam) for g in self.mixture])
-        self.sums += [np.zeros(3) for _ in range(len(mixture) - len(self.sums))]
-        self._learn(mixture, depth, network_variance, K, anchors)
-        r_stream, e_stream = self.total[1:] / (self.total[0] + self.kappa)
-        B, bias = np.full(depth.shape, np.nan), np.full(depth.shape, np.nan)
-        for v, u in np.argwhere(np.isfinite(M)):
-            shares = self._shares(mixture, depth, K, u, v)
-            r = e = 0.0
-            for w, (n, sum_r, sum_e) in zip(shares, self.sums, strict=True):
-                r += w * (sum_r + self.kappa * r_stream) / (n + self.kappa)
-                e += w * (sum_e + self.kappa * e_stream) / (n + self.kappa)
-            r, e = r + (1 - sum(shares)) * r_stream, e + (1 - sum(shares)) * e_stream
-            B[v, u], bias[v, u] = max(0.0, depth[v, u] ** 2 * e - M[v, u]), r
+        self.sums += [np.zeros(3) for _ in range(len(self.mixture) - len(self.sums))]
+        self._learn(depth, network_variance, K, anchors)
+        stream = self.total[1:] / (self.total[0] + self.kappa)
+        values = [(row[1:] + self.kappa * stream) / (row[0] + self.kappa) for row in self.sums]
+        B, bias, at = np.full(depth.shape, np.nan), np.full(depth.shape, np.nan), np.isfinite(M)
+        bias[at], e = oracle.regress(oracle.points_of(depth, at, K), self.mixture_cam, values, stream, **self.prior).T
+        B[at] = np.maximum(0.0, depth[at] ** 2 * e - M[at])
         return V + B, B, bias
 
-    def _learn(self, mixture, depth, network_variance, K, anchors):
+    def _learn(self, depth, network_variance, K, anchors):
         full = [(u, v, g, s2, depth[round(v), round(u)]) for u, v, g, s2 in anchors]
         used = [anchor for anchor, fine in zip(full, believed(full), strict=True) if fine]
         errors = [(g - d) / d for *_, g, _, d in used]
@@ -76,11 +69,8 @@ class AnchoredOracle(oracle.Oracle):
         for (u, v, *_), r, claim, own_weight in zip(used, errors, claims, weights, strict=True):
             row = own_weight * np.array([1.0, r, r**2 - claim])
             self.total = self.total + row
-            for k, w in enumerate(self._shares(mixture, depth, K, round(u), round(v))):
+            at = np.zeros(depth.shape, dtype=bool)
+            at[round(v), round(u)] = True
+            p = oracle.evidence(oracle.points_of(depth, at, K), self.mixture_cam)[:, 0]
+            for k, w in enumerate(p / (p.sum() + self.prior["prior_weight"])):
                 self.sums[k] = self.sums[k] + w * row
-
-    def _shares(self, mixture, depth, K, u, v):
-        d = depth[v, u]
-        x = np.array([(u - K[0, 2]) / K[0, 0] * d, (v - K[1, 2]) / K[1, 1] * d, d])
-        weights = [g["weight"] * oracle.density(x, g) for g in mixture]
-        return [w / (sum(weights) + self.prior["prior_weight"]) for w in weights]

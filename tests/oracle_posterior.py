@@ -25,7 +25,7 @@ REACH, RADIUS, NEAR, WEAK, CLIP, APART = 1.0, 0.15, 0.05, 0.25**2, 9.0, 0.5
 
 
 def start():
-    return {"frames": 0, "m0": 0.0, "b": np.zeros(4), "C": np.diag(PRIOR),
+    return {"frames": 0, "m0": 0.0, "slopes": np.zeros(3), "b": np.zeros(4), "C": np.diag(PRIOR),
             "sums": {k: [v * n, n] for k, (v, n, _, _) in START.items()}}  # fmt: skip
 
 
@@ -184,7 +184,9 @@ def update(state, depth, claimed, pixel, g, variance, motion=None):
     z2 = np.minimum(residual**2 / total, CLIP)
     new |= discs(state, logs, Q, mean0, H, y, weight, noise, z2, node, u, v, stated - 1 / N, away)
     c, new["centre"], new["between"] = surfaces(state, node, y - H[:, 2:4] @ mean[2:4], noise)
-    after = {"frames": state["frames"] + 1, "m0": m0, "b": mean[:4], "C": C[:4, :4], "sums": {}}
+    weights = 3 + sum(MEMORY**k for k in range(state["frames"] + 1))
+    slopes = state["slopes"] * (1 - 1 / weights) + mean[1:4] / weights
+    after = {"frames": state["frames"] + 1, "m0": m0, "slopes": slopes, "b": mean[:4], "C": C[:4, :4], "sums": {}}
     after["scores"] = new.pop("scores")
     for name, (value, prior, low, high) in START.items():
         above, below = state["sums"][name]
@@ -202,17 +204,19 @@ def update(state, depth, claimed, pixel, g, variance, motion=None):
     wide = [elsewhere(*each) for each in zip(around, unseen, strict=True)]
     p = np.where(p < 0.1, p + unmeasured * (0.1 - p), p)
     wide = [each + unmeasured * (2 - each) for each in wide]
-    alone = [second_moment(0.0, *each, unmeasured) for each in zip(spread, offset, wide, strict=True)]
-    spread = [second_moment(*each, unmeasured) for each in zip(p, spread, offset, wide, strict=True)]
+    alone = [second_moment(0.0, *each) for each in zip(spread, offset, wide, strict=True)]
+    spread = [second_moment(*each) for each in zip(p, spread, offset, wide, strict=True)]
     if motion is not None:
         e = offset + mean[0] + X[:, 1] * mean[1] - c
         P = moving(motion, depth.shape, logs, e, share, ratio(after, "between"))
-        elsewhere_ = [second_moment(1.0, 0.1, *each, unmeasured) for each in zip(e, wide, strict=True)]
+        elsewhere_ = [second_moment(1.0, 0.1, *each) for each in zip(e, wide, strict=True)]
         p, spread = 1 - (1 - p) * (1 - P), (1 - P) * np.array(spread) + P * np.array(elsewhere_)
     alone, spread = np.array(alone), np.array(spread)
     beyond = np.maximum((spread - (1 - p) * alone) / np.maximum(p, 1e-12), alone)
     alone = np.minimum(alone, np.quantile(alone, 0.7))
     p = np.maximum(p, np.clip((spread - alone) / np.maximum(np.maximum(beyond, 4 * alone) - alone, 1e-12), 0, 1))
+    for k, x in enumerate(HX[:, 1:4]):
+        offset[k] += share[k] ** 2 / (share[k] ** 2 + 0.3**2) * (x @ (slopes - mean[1:4]))
     posterior, variance, outlier = read(depth, np.nan_to_num(claimed), logs, mean[:4], offset, spread, p, share)
     _, inlier, _ = read(depth, 0 * depth, logs, mean[:4], offset, alone, p, share)
     return after, posterior, variance, inlier, outlier
@@ -309,10 +313,9 @@ def y_variance(shape, node, y, noise, used, centre):
     return out.ravel()
 
 
-def second_moment(p, variance, offset, wide, unmeasured=0.0):
-    """E[(e^n - 1)^2] for |n| up to log 6, n normal, or with the probability p of n - offset; a larger limit before
-    the first anchor."""
-    limit, moments = math.log(6) / max(1 - unmeasured, 0.05), []
+def second_moment(p, variance, offset, wide):
+    """E[(e^n - 1)^2] for |n| up to log 6, n normal, or with the probability p of n - offset."""
+    limit, moments = math.log(6), []
     for v, o in ((min(variance, 2), 0.0), (wide, min(max(offset, -limit), limit))):
         sigma = math.sqrt(v)
         mass, first, second = (

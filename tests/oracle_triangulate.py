@@ -1,11 +1,24 @@
-"""Triangulation in NumPy, all tracks at once: the oracle of ``ufmstar_torch.anchors.kernels.triangulate``."""
+"""Triangulation in NumPy, all tracks at once, from its derivation in ``ufmstar_torch/anchors/kernels/triangulate.py``;
+imports neither torch nor the package."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.anchors.kernels.triangulate import DAMPING, STEPS, Triangulated
+STEPS, DAMPING = 3, 1e-12  # Gauss-Newton steps; share of the normal matrix's trace that is added to its diagonal
+
+
+class Triangulated(NamedTuple):
+    """N points in world coordinates: position [N, 3] [m], covariance [N, 3, 3] [m^2] for a noise of one pixel, root
+    mean square error [N] [px], and whether in front of every camera that saw it [N]."""
+
+    point: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    error: NDArray[np.float64]
+    ahead: NDArray[np.bool_]
 
 
 def triangulate(

@@ -1,4 +1,4 @@
-"""Augmentation: re-projection of known points, no interpolation of depth, seeds, colour changes equal to Pillow's."""
+"""Augmentation: re-projection of known points, no interpolation of depth, seeds, colours as Pillow's, devices."""
 
 from __future__ import annotations
 
@@ -7,36 +7,39 @@ import pytest
 import torch
 from PIL import Image, ImageEnhance
 from test_preprocess import blob, centroid, project
-from torch import Tensor
 
 import scenes
 from ufmstar_torch.train import Augmentation, AugmentationConfig
-from ufmstar_torch.train.augment import Change, apply_colour, apply_geometry
 
 SIZE = (120, 160)
 # Non-square pixels, a principal point far from the centre, and skew, so that no error cancels by symmetry.
 K = torch.tensor([[130.0, 0.7, 70.0], [0.0, 141.0, 66.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 SIGMA = 3.0  # [px]
+STILL = {"scale": (1.0, 1.0), "rotation": 0.0, "flip": 0.0, "brightness": 0.0, "contrast": 0.0, "saturation": 0.0}
 
 CHANGES = {
-    "none": Change(),
-    "flip": Change(flip=True),
-    "zoom": Change(scale=1.5),
-    "roll": Change(angle=0.087),
-    "rollback": Change(angle=-0.087, flip=True),
-    "shift": Change(scale=1.3, shift=(11.0, -7.5)),
-    "all": Change(scale=1.4, angle=0.08, flip=True, shift=(-9.25, 6.5)),
+    "none": {},
+    "flip": {"flip": 1.0},
+    "zoom": {"scale": (1.5, 1.5)},
+    "roll": {"rotation": 5.0},
+    "all": {"scale": (1.2, 1.4), "rotation": 5.0, "flip": 1.0},
 }
 
 
-def seen_by_new_camera(point: Tensor, change: Change, zoom: str) -> Tensor:
-    """The point [3] in the augmented camera's frame, computed from the documented steps: roll, mirror, zoom."""
-    c, s = np.cos(change.angle), np.sin(change.angle)
-    x, y, z = point.tolist()
-    x, y = c * x - s * y, s * x + c * y
-    if change.flip:
-        x = -x
-    return torch.tensor([x, y, z / change.scale if zoom == "depth" else z], dtype=torch.float64)
+def changed(image, depth, intrinsics=K, seed=3, **change):  # the seed draws an angle of 4.96 degrees
+    """One image [3, H, W] changed, its depth and intrinsics, and the map M of its pixels."""
+    torch.manual_seed(seed)
+    augmentation = Augmentation(AugmentationConfig(**{**STILL, **change}))
+    result = augmentation(image[None], depth[None], intrinsics[None])
+    return *(part[0] for part in result), augmentation.transform.transform_matrix[0].double()
+
+
+def turn_of(M, new_K, zoom):
+    """The turn and mirror G of the camera, from M K = K' G, with K' of the unzoomed depth."""
+    optics = new_K.clone()
+    if zoom == "depth":
+        optics[:2, :2] *= M[:2, :2].det().abs().sqrt()
+    return torch.linalg.solve(optics, M @ K)
 
 
 @pytest.mark.parametrize("zoom", ["depth", "focal"])
@@ -45,14 +48,20 @@ def seen_by_new_camera(point: Tensor, change: Change, zoom: str) -> Tensor:
 def test_a_point_is_seen_where_the_new_intrinsics_project_it(pixel, change, zoom):
     """Image, depth and K' of one known 3D point agree; the blob's centre of mass to .02 px."""
     point = torch.linalg.solve(K, torch.tensor([*pixel, 1.0], dtype=torch.float64)) * 2.5
-    depth = torch.full(SIZE, 2.5, dtype=torch.float64)
     source = blob(*SIZE, torch.tensor(pixel), torch.full((2,), SIGMA))[0]
-    image, new_depth, new_K = apply_geometry(source, depth, K, change, zoom)
-    present = seen_by_new_camera(point, change, zoom)
-    where = project(present, new_K[None])
+    image, new_depth, new_K, M = changed(source, torch.full(SIZE, 2.5, dtype=torch.float64), zoom=zoom, **change)
+    G = turn_of(M, new_K, zoom)
+    torch.testing.assert_close(G @ G.mT, torch.eye(3, dtype=torch.float64), atol=1e-6, rtol=0)
+    torch.testing.assert_close(G[2], torch.eye(3, dtype=torch.float64)[2], atol=1e-6, rtol=0)
+    assert (new_K[0, 0] > 0) & (new_K[1, 1] > 0)
+    assert new_K[1, 0] == 0
+    seen = G @ point
+    if zoom == "depth":
+        seen[2] /= M[:2, :2].det().abs().sqrt()
+    where = project(seen, new_K[None])
     torch.testing.assert_close(centroid(image[None]), where, rtol=0, atol=0.02)
     column, row = where.round().long().tolist()
-    assert new_depth[row, column].item() == pytest.approx(present[2].item(), abs=1e-12)
+    assert new_depth[row, column].item() == pytest.approx(seen[2].item(), rel=1e-6)
 
 
 @pytest.mark.parametrize("zoom", ["depth", "focal"])
@@ -60,20 +69,19 @@ def test_a_rendered_room_is_the_room_seen_by_the_rolled_camera(zoom):
     """The augmented depth equals a ray-cast with K' and the rolled pose, except at edges (no flip: a mirrored room is
     another room)."""
     pose = scenes.camera_pose((0.2, 0.0, -0.1), 0.6, 0.1)
-    change = Change(scale=1.3, angle=0.08, shift=(5.0, 3.0))
     camera = K.clone()
-    camera[0, 1] = 0.0  # the renderer does not support skew
+    camera[0, 1], camera[1, 1] = 0.0, camera[0, 0]  # the renderer does not support skew, which a turn would give
     depth = torch.from_numpy(scenes.render(pose, camera.numpy(), *SIZE))
-    _, new_depth, new_K = apply_geometry(torch.zeros(3, *SIZE, dtype=torch.float64), depth, camera, change, zoom)
-    # The new camera's axes as columns in the old frame: points turn by +angle, so axes turn by -angle.
-    roll = np.eye(4)
-    cos, sin = np.cos(change.angle), np.sin(change.angle)
-    roll[:2, :2] = [[cos, sin], [-sin, cos]]
+    black = torch.zeros(3, *SIZE, dtype=torch.float64)
+    _, new_depth, new_K, M = changed(black, depth, camera, scale=(1.3, 1.3), rotation=5.0, zoom=zoom)
+    scale = M[:2, :2].det().sqrt()
     optics = new_K.clone()
     if zoom == "depth":  # the same pixels under a camera for which the points do not move
-        optics[:2, :2] *= change.scale
+        optics[:2, :2] *= scale
+    roll = np.eye(4)
+    roll[:3, :3] = torch.linalg.solve(optics, M @ camera).T.numpy()
     exact = torch.from_numpy(scenes.render(pose @ roll, optics.numpy(), *SIZE))
-    expected = exact / change.scale if zoom == "depth" else exact
+    expected = exact / scale if zoom == "depth" else exact
     valid = new_depth > 0
     error = (new_depth - expected).abs()[valid] / expected[valid]
     assert valid.float().mean() > 0.95
@@ -83,10 +91,11 @@ def test_a_rendered_room_is_the_room_seen_by_the_rolled_camera(zoom):
 
 def test_depth_is_copied_and_never_mixed():
     depth = torch.where(torch.arange(SIZE[1]) % 7 < 3, 1.0, 4.0).expand(SIZE)
-    change = Change(scale=1.37, angle=0.08)
-    _, new_depth, _ = apply_geometry(torch.zeros(3, *SIZE), depth, K, change, "focal")
-    assert set(new_depth.unique().tolist()) == {1.0, 4.0}
-    _, nearer, _ = apply_geometry(torch.zeros(3, *SIZE), depth, K, change, "depth")
+    change = {"scale": (1.37, 1.37), "rotation": 5.0}
+    _, new_depth, *_ = changed(torch.zeros(3, *SIZE), depth, zoom="focal", **change)
+    assert set(new_depth.unique().tolist()) <= {0.0, 1.0, 4.0}
+    assert (new_depth > 0).float().mean() > 0.99
+    _, nearer, *_ = changed(torch.zeros(3, *SIZE), depth, zoom="depth", **change)
     torch.testing.assert_close(nearer, new_depth / 1.37)
 
 
@@ -94,34 +103,47 @@ def test_the_rotation_is_applied_and_its_corners_have_no_depth():
     """The rolled frame differs from the original and has no depth in its corners (FastDepth's code discards its rotated
     image)."""
     image, depth = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(0)), torch.full(SIZE, 2.0)
-    rolled, new_depth, _ = apply_geometry(image, depth, K, Change(angle=0.087))
+    rolled, new_depth, *_ = changed(image, depth, rotation=5.0)
     assert (rolled - image).abs().mean() > 0.1
     assert new_depth[0, 0] == 0
     assert rolled[:, 0, 0].max() == 0
     assert (new_depth[40:80, 50:110] == 2).all()
 
 
-def test_seeds_decide_and_the_global_generators_do_not():
-    image, depth = torch.rand(3, *SIZE), torch.rand(SIZE) + 1
-    augmentation = Augmentation(AugmentationConfig(crop="random"))
-    torch.manual_seed(1)
-    state = torch.get_rng_state()
-    first = augmentation(image, depth, K, (7, 2, 40))
-    assert torch.equal(torch.get_rng_state(), state)
-    torch.manual_seed(99)
-    again = augmentation(image, depth, K, (7, 2, 40))
-    for a, b in zip(first, again, strict=True):
-        assert torch.equal(a, b)
-    for other in [(8, 2, 40), (7, 3, 40), (7, 2, 41), (2, 7, 40)]:
-        assert not torch.equal(augmentation(image, depth, K, other)[1], first[1])
+def test_a_seed_decides_and_every_image_of_a_batch_is_changed_differently():
+    image, depth = torch.rand(1, 3, *SIZE).expand(3, -1, -1, -1), torch.rand(1, *SIZE).expand(3, -1, -1) + 1
+    augmentation, results = Augmentation(), []
+    for seed in (7, 7, 8):
+        torch.manual_seed(seed)
+        results.append(augmentation(image, depth, K.expand(3, 3, 3)))
+    assert all(torch.equal(one, two) for one, two in zip(*results[:2], strict=True))
+    assert not torch.equal(results[0][2], results[2][2])
+    for part in results[0]:
+        assert not torch.equal(part[0], part[1])
+        assert not torch.equal(part[1], part[2])
+    assert torch.equal(image[0], image[1])  # the batch itself is unchanged
 
 
 @pytest.mark.parametrize("kind", ["brightness", "contrast", "saturation"])
-@pytest.mark.parametrize("factor", [0.6, 1.0, 1.4])
-def test_colour_is_changed_as_pillow_does(kind, factor):
+def test_colour_is_changed_as_pillow_does(kind):
     """Pillow works in bytes and rounds the mean and the grey image: 2 of 255 apart at most."""
     array = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
+    image = torch.from_numpy(array).permute(2, 0, 1).float() / 255
+    torch.manual_seed(1)
+    augmentation = Augmentation(AugmentationConfig(**{**STILL, kind: 0.4}))
+    new_image, *_ = augmentation(image[None], torch.ones(1, *SIZE), K[None])
+    factor = augmentation.transform._params[-1].data[f"{kind}_factor"].item()
+    assert abs(factor - 1) > 0.05
     enhance = {"brightness": "Brightness", "contrast": "Contrast", "saturation": "Color"}[kind]
     expected = np.asarray(getattr(ImageEnhance, enhance)(Image.fromarray(array)).enhance(factor))
-    got = apply_colour(torch.from_numpy(array).permute(2, 0, 1).float() / 255, ((kind, factor),))
-    assert np.abs(255 * got.permute(1, 2, 0).numpy() - expected).max() <= 2
+    assert np.abs(255 * new_image[0].permute(1, 2, 0).numpy() - expected).max() <= 2
+
+
+def test_a_batch_on_a_device_is_augmented_there():
+    """A tensor of the device "meta" has no value to read."""
+    batch = (
+        torch.rand(2, 3, *SIZE, device="meta"),
+        torch.rand(2, *SIZE, device="meta"),
+        torch.zeros(2, 3, 3, device="meta"),
+    )
+    assert [part.device.type for part in Augmentation()(*batch)] == ["meta"] * 3

@@ -86,24 +86,27 @@ def test_threads_are_pinned_and_restored(fails):
 
 def bench(path, *words):
     """The report of a tiny run."""
-    words = [*words, "--frames", "2", "--history", "3", "--threads", "1", "--json", str(path)]
+    words = [*words, "--frames", "2", "--history", "2", "--threads", "1", "--json", str(path)]
     before = threads()
     assert main(read(words)) == 0
     assert threads() == before
     return json.loads(path.read_text())
 
 
+RATIOS = ("mean of 1,000 pixels / step", "check and average / step")
+
+
 def test_a_tiny_run_from_end_to_end(tmp_path, capsys):
-    report = bench(tmp_path / "bench.json", "--sizes", "64", "96", "--backends", "auto", "torch", "--streams", "1", "3")
-    assert [result["map"] for result in report["results"]] == ["64 x 64", "96 x 96"]
-    small = report["results"][0]
+    report = bench(tmp_path / "bench.json", "--sizes", "64", "--backends", "auto", "torch")
+    (small,) = report["results"]
+    assert small["map"] == "64 x 64"
     assert set(small["machine"]["versions"]) >= {"ufmstar_torch", "torch", "numba", "numpy", "python"}
     assert set(small["machine"]["hardware"]) >= {"cpu", "cores", "platform", "environment"}
     rows = {row["row"]: row for row in small["rows"]}
     assert len(rows) == 7, "UfM, and three rows of UfM* for each backend"
     plain, corners, posterior, reference = (
         rows[f"UfM*-{name}"]
-        for name in ("DepthOnly", "Anchored-DepthOnly", "DepthOnly (anchors dense, posterior True)",
+        for name in ("DepthOnly", "DepthOnly (anchors corners)", "DepthOnly (anchors dense, posterior True)",
                      "DepthOnly (backend torch)")
     )  # fmt: skip
     for row in rows.values():
@@ -116,11 +119,22 @@ def test_a_tiny_run_from_end_to_end(tmp_path, capsys):
     assert sizes == sorted(sizes), "landmarks and the posterior add to the mixture's memory"
     assert reference["memory"]["multiview"] == plain["memory"]["multiview"], "the same mixture"
     printed = capsys.readouterr()
-    assert "UfM*-Anchored-DepthOnly" in printed.out
-    assert [line["streams"] for line in small["streams"]] == [1, 3]
-    assert all(line["step"]["count"] == 2 and line["step"]["min_ms"] > 0 for line in small["streams"])
-    assert printed.out.count("\n3 streams at once: step ") == 2
-    assert "fastdepth 96 x 96, 5 frames" in printed.err
+    assert "UfM*-DepthOnly (anchors corners)" in printed.out
+    assert "fastdepth 64 x 64, 4 frames" in printed.err
+    assert small["ratios"].keys() == {
+        *RATIOS,
+        *(f"{name} / network" for name in ("step", "step with corners", "default")),
+    }
+    for name, ratio in small["ratios"].items():
+        assert f"\n{name}: {ratio:.3f}\n" in printed.out
+    assert small["ratios"]["step / network"] == plain["ratios_to_depth"]["multiview"]["median"]
+    assert small["ratios"]["default / network"] == posterior["ratios_to_depth"]["multiview"]["median"]
+
+
+def test_each_size_has_its_table(tmp_path, capsys):
+    report = bench(tmp_path / "bench.json", "--sizes", "64", "96")
+    assert [result["map"] for result in report["results"]] == ["64 x 64", "96 x 96"]
+    assert "fastdepth 96 x 96, 4 frames" in capsys.readouterr().err
 
 
 def test_a_network_of_ones_own_on_a_recording(tmp_path):
@@ -131,6 +145,10 @@ def test_a_network_of_ones_own_on_a_recording(tmp_path):
     assert result["map"] == "224 x 224"
     assert result["sequence"]["layout"] == "tum"
     assert result["networks"]["depth_only"]["latency"]["once"]["count"] == 2
+    overlapped = result["overlapped"]
+    assert overlapped["latency"]["count"] == overlapped["ratio_to_network"]["count"] == 1, "nothing overlaps the last"
+    assert len(result["ratios"]) == 6
+    assert overlapped["ratio_to_network"]["median"] in result["ratios"].values()
     assert cli.main(["bench", "--sequence", "nowhere"]) == 2
 
 

@@ -12,7 +12,7 @@ from runs import Brightness, job_of, networks
 from tiny_suite import evaluate, row
 
 import ufmstar_torch
-from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStarConfig
+from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStarConfig, UncertainDepth
 from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.sequences.frame import in_memory
 from ufmstar_torch.eval.tour.sequence import open_tour
@@ -26,7 +26,7 @@ class Passed:
     """The package's classes whose methods are called, and the files whose functions are called, in all threads."""
 
     def __init__(self):
-        self.classes, self.files, self.counts = set(), set(), False
+        self.classes, self.files, self.calls, self.counts = set(), set(), 0, False
 
     def note(self, frame, event, _):
         if event != "call" or not self.counts:
@@ -34,6 +34,7 @@ class Passed:
         code = frame.f_code
         if Path(code.co_filename).is_relative_to(CORE) or Path(code.co_filename).is_relative_to(EVAL):
             self.files.add(code.co_filename)
+            self.calls += not code.co_name.startswith("<")  # a comprehension or generator is no call
         if code.co_argcount and code.co_varnames[0] == "self":
             kind = type(frame.f_locals["self"])
             if kind.__module__.startswith("ufmstar_torch"):
@@ -85,21 +86,33 @@ def run_counted(tour, out, config, landmarks):
 
 
 # (classes, files) of the core, then of eval; half of eval's classes are metrics. The aim is 40 classes in 28 files in
-# all, so that a reader can hold a frame's road in mind. A plain run has 7 classes and 36 files too many, the default
-# with anchors and posterior 38 and 72, a row of UfM* alone in an evaluation 7 and 33.
+# all, so that a reader can hold a frame's road in mind. A plain run has 29 files too many, the default with anchors and
+# posterior 33 classes and 68 files, a row of UfM* alone in an evaluation 23 files.
 
 
 def test_a_frame_of_a_plain_run(tour, tmp_path):
     plain = CONFIG.replace(anchors=None, posterior=None)
-    assert_within(run_counted(tour, tmp_path / "out", plain, "corners"), (19, 37), (28, 27))
+    assert_within(run_counted(tour, tmp_path / "out", plain, "corners"), (16, 31), (24, 26))
 
 
 def test_a_frame_of_a_run(tour, tmp_path):
-    assert_within(run_counted(tour, tmp_path / "out", CONFIG, "dense"), (48, 72), (30, 28))
+    assert_within(run_counted(tour, tmp_path / "out", CONFIG, "dense"), (45, 68), (28, 28))
 
 
 def test_a_frame_of_eval(tour):
     passed, source = Passed(), {"aleatoric": networks(Brightness(1.0, spread=0.02))}
     with passed.watching():
         evaluate(tour, [row("UfM*-Aleatoric")], source, progress=passed.at)
-    assert_within(passed, (19, 36), (28, 25))
+    assert_within(passed, (16, 30), (21, 21))
+
+
+def test_a_call_of_the_default(tour):
+    """(classes, files) and calls of Python functions in one call of ``UncertainDepth`` with anchors and posterior."""
+    passed, model, last = Passed(), UncertainDepth(Brightness(1.0, spread=0.02)), len(tour) - 1
+    with passed.watching():
+        for i, frame in enumerate(tour):
+            passed.counts = i == last
+            model(frame.image, frame.T_world_cam, frame.intrinsics)
+            passed.counts = False
+    assert_within(passed, (47, 67), (0, 0))
+    assert passed.calls <= 800, passed.calls

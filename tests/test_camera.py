@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from random_gaussians import covariances, means
 from scipy.spatial.transform import Rotation
@@ -36,7 +36,6 @@ def test_unproject_is_the_papers_formula():
 
 
 @given(st.integers(0, 10**6))
-@settings(max_examples=20)
 def test_relative_pose(seed):
     T_a, T_b = pose(seed), pose(seed + 1)
     R, t = camera.relative_pose(T_a, T_b)
@@ -56,7 +55,6 @@ def test_relative_pose_keeps_digits_far_from_the_world_origin():
 
 
 @given(st.integers(0, 10**6), st.floats(0, 0.01))
-@settings(max_examples=20)
 def test_nearest_rotation_is_the_polar_factor(seed, amount):
     R = pose(seed)[:3, :3]
     noise = torch.randn(3, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
@@ -69,7 +67,6 @@ def test_nearest_rotation_is_the_polar_factor(seed, amount):
 
 
 @given(st.integers(0, 10**6))
-@settings(max_examples=20)
 def test_projected_covariance(seed):
     K = torch.tensor(scenes.intrinsics(48, 64))
     mean, cov = means(3, seed), covariances(3, seed)

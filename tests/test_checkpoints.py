@@ -15,7 +15,6 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from ufmstar_torch.files import atomic
 from ufmstar_torch.models import CheckpointError, load_state_dict_file, load_weights, save_checkpoint
 
 FORMATS = ["w.pth", "w.pt", "w.safetensors"]
@@ -203,7 +202,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.
     def full_disk(_: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(atomic.os, "fsync", full_disk)
+    monkeypatch.setattr(os, "fsync", full_disk)
     with pytest.raises(OSError, match="No space left"):
         save_checkpoint(tmp_path / name, Small())
     assert [p.name for p in tmp_path.iterdir()] == [name]

@@ -212,6 +212,34 @@ def test_debug_shows_the_traceback(ufmstar, tmp_path):
     assert "Traceback" in err
 
 
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("words", [["--help"], ["eval", "--list"], ["run", "--help"], ["data", "check", "{path}"]])
+def test_a_reader_that_closes_the_output_ends_the_command_quietly(words, unbuffered, path):
+    """As ``ufmstar eval --list | head -1`` does."""
+    command = [sys.executable, "-m", "ufmstar_torch.cli", *(word.format(path=path) for word in words)]
+    closed, output = os.pipe()
+    os.close(closed)
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    ended = subprocess.run(command, stdout=output, stderr=subprocess.PIPE, text=True, env=environment, check=False)
+    os.close(output)
+    assert ended.returncode == cli.CLOSED
+    assert not [text for text in ("failed", "Broken pipe", "Traceback", "Exception") if text in ended.stderr]
+
+
+def test_messages_do_not_depend_on_the_encoding_of_the_terminal(tmp_path, path):
+    """Also an option's error, which tyro frames in other letters; a file's name that it cannot show is escaped."""
+    command = [sys.executable, "-m", "ufmstar_torch.cli"]
+    odd = tmp_path / "grün \udcff"
+    path.rename(odd)
+    for words, expected in ((("run", "x", "--poses", "foo"), "invalid choice 'foo' for argument '--poses'"),
+                            (("data", "check", str(odd)), "gr\\xfcn \\udcff")):  # fmt: skip
+        environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+        ended = subprocess.run([*command, *words], capture_output=True, text=True, env=environment, check=False)
+        assert expected in ended.stdout + ended.stderr
+        assert ended.returncode in (0, 1, 2)
+        assert "Error:" not in ended.stderr
+
+
 # ---- options ----
 
 

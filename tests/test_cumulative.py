@@ -7,18 +7,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
-from ufmstar_torch.eval.bench.cumulative import (
+from cumulative import (
     NETWORK,
     OURS,
     REST,
     CounterLog,
     EnergyReadings,
     cumulative_costs,
+    draw_cumulative,
     read_power,
 )
-from ufmstar_torch.eval.report.figures_cost import draw_cumulative
-from ufmstar_torch.eval.report.text import onboard_table
+from onboard import onboard_table
 
 # Three images, 1 s apart: .2 s of network, then .1, .2 and .3 s of UfM*.
 RUN = SimpleNamespace(started=[10.0, 11.0, 12.0], predicted=[10.2, 11.2, 12.2], finished=[10.3, 11.4, 12.5])

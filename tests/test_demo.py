@@ -16,6 +16,7 @@ from demo_networks import SPEC, members, write_members
 from ufmstar_torch import cli
 from ufmstar_torch.eval.commands import demo, evaluate
 from ufmstar_torch.eval.report.data import load_results
+from ufmstar_torch.eval.report.tables import main_table
 from ufmstar_torch.models import save_trained
 
 FRAMES, SEED = 5, 5
@@ -48,7 +49,7 @@ def test_every_row_is_judged_in_both_kinds_of_rooms(done):
     assert {(r.dataset, r.frames["done"]) for r in results.records} == {("familiar", FRAMES), ("unfamiliar", FRAMES)}
     assert len(results.records) == 2 * len(ROWS)
     assert message.endswith(f"\nopen {out / 'report.html'} in a browser\n")
-    for file in ("report.html", "results.csv", "tables/main-unfamiliar.md", "figures/calibration-unfamiliar.svg"):
+    for file in ("report.html", "results.csv", "tables/main-unfamiliar.tex", "figures/calibration-unfamiliar.svg"):
         assert (out / file).is_file()
     assert list((out / "figures").glob("strip-unfamiliar-*-ensemble_*.png"))
 
@@ -58,12 +59,11 @@ def test_its_table_is_the_readmes(done):
     text = README.read_text(encoding="utf-8")
     table = text[text.index("| 36 frames of an unfamiliar hall") :].partition("\n\n")[0]
     head, _, *lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()]
-    main = (out / "tables" / "main-unfamiliar.md").read_text(encoding="utf-8")
-    shown = [[cell.strip() for cell in line.split("|")[1:-1]] for line in main.splitlines() if line.startswith("| ")]
-    assert [words.split()[0] for words in shown[0][1:]] == head[1:]
-    assert [line[0] for line in shown[2:]] == [line[0] for line in lines]
+    cells = main_table(load_results(out, with_sums=False), "unfamiliar").cells
+    assert [heading.split()[0] for _, heading in cells.columns] == head[1:]
+    assert [label for _, label in cells.index] == [line[0].replace("\\", "") for line in lines]
     assert message.index("of unfamiliar") < message.index("of familiar")
-    assert not (out / "tables" / "main.md").exists()  # no mean over both rooms
+    assert not (out / "tables" / "main.tex").exists()  # no mean over both rooms
 
 
 def test_its_page_shows_a_frame_then_the_table_then_curves(done):

@@ -119,16 +119,12 @@ def test_a_relative_checkpoint_is_no_depth_network_until_it_is_aligned(relative)
 
 @pytest.mark.parametrize("keep_aspect", [False, True])
 def test_colours_are_the_own_processor_s_to_its_rounding(metric, keep_aspect):
-    """The image processor resamples bytes, rounding and clipping after each axis. Observed differences in levels of
-    255: .05 on average, .6 at the quantile .999, 12 at corners where the cubic filter overshoots twice (TUM RGB-D: .28,
-    .97, 9)."""
+    """Both resample bytes by the same function of torch, so only the normalisation rounds differently."""
     image = photos(2, (480, 640))
     ours = DepthAnything.from_pretrained(metric, keep_aspect=keep_aspect).preprocess.apply_image(image)
     theirs = own_processor(metric, image, keep_aspect_ratio=keep_aspect)
     levels = (ours - theirs).abs() * torch.tensor(STD)[:, None, None] * 255
-    assert levels.mean() < 0.1
-    assert levels.flatten()[::7].quantile(0.999) < 1
-    assert levels.max() < 16
+    assert levels.max() < 1e-3
     linear = Preprocess(size=ours.shape[-2:], mean=MEAN, std=STD).apply_image(image)
     assert (linear - theirs).abs().mean() > 1.5 * (ours - theirs).abs().mean()  # the filter matters
 
@@ -137,9 +133,8 @@ def test_an_image_processor_may_be_missing_or_say_something_else(broken):
     file = broken / "preprocessor_config.json"
     says = json.loads(file.read_text())
     file.unlink()
-    assert DepthAnything.from_pretrained(broken).preprocess == Preprocess(
-        size=(518, 518), mean=MEAN, std=STD, cubic=True
-    )
+    with pytest.raises(ValueError, match=r"broken has no preprocessor_config\.json, .*copy it there"):
+        DepthAnything.from_pretrained(broken)
     file.write_text(json.dumps(says | {"image_mean": [0.5, 0.5, 0.5], "resample": 2}))
     assert DepthAnything.from_pretrained(broken).preprocess == Preprocess(
         size=(518, 518), mean=(0.5, 0.5, 0.5), std=STD
@@ -271,7 +266,8 @@ def test_smaller_outputs_are_enlarged_to_the_input(other):
     network.raw.model = Half()
     depth = network(torch.zeros(2, 3, 64, 96)).depth
     inner = depth[:, :, 1:-1]
-    torch.testing.assert_close(inner, ((torch.arange(1, 95) + 0.5) / 2 + 0.5).expand_as(inner))
+    ramp = ((torch.arange(1, 95) + 0.5) / 2 + 0.5).expand_as(inner)
+    torch.testing.assert_close(inner, ramp, rtol=0, atol=0.1)  # the image processor's cubic filter overshoots by .08
 
 
 def test_weights_that_a_model_does_not_use_may_be_missing(broken):

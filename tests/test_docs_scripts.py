@@ -141,3 +141,11 @@ def test_distances_of_clouds(script: Any, tmp_path: Path) -> None:
     assert median == pytest.approx(3, abs=1e-3)
     assert most == pytest.approx(3, abs=1e-3)
     assert back == pytest.approx(3, abs=0.5)
+
+
+def test_the_times_of_streams(script: Any, capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
+    monkeypatch.setattr("sys.argv", ["measure_streams.py", "1", "3", "--frames", "1"])
+    script("measure_streams").main()
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(":")[0] for line in lines] == ["1 streams at once", "3 streams at once"]
+    assert all(float(line.split()[-2]) > 0 for line in lines)

@@ -123,6 +123,8 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: open_sequence("tour:1", "tum"), "takes no layout"),
     (lambda: make_tour(-1), "seed must be"),
     (lambda: make_tour(True), "seed must be"),
+    (lambda: make_tour(2**32), "below 4294967296"),
+    (lambda: tour("tour:1?movers=101"), "movers must be 0 to 100"),
     (lambda: make_tour(1, "attic"), "style must be one of"),
     (lambda: tour_path(make_tour(2), 0), "frames must be"),
     (lambda: tour_path(make_tour(2), 3, -1), "seed must be"),

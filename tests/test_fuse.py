@@ -15,8 +15,7 @@ import oracle
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.steps.correspond import Correspondence
-from ufmstar_torch.steps.fuse import append, fuse
-from ufmstar_torch.steps.views import view_weights
+from ufmstar_torch.steps.fuse import append, fuse, view_weights
 
 pytestmark = pytest.mark.numerics
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from random_gaussians import covariances, means
 
@@ -52,7 +52,6 @@ def test_degenerate_inputs_stay_finite():
 
 
 @given(seeds)
-@settings(max_examples=30)
 def test_wasserstein_is_a_squared_metric_and_agrees_with_oracle_and_pot(seed):
     cov, mean = covariances(3, seed), means(3, seed)
 
@@ -83,7 +82,6 @@ def test_float32_callers_are_served_in_float64():
 
 
 @given(seeds, st.floats(0, 1))
-@settings(max_examples=30)
 def test_geodesic(seed, lam):
     (a, b), (mean_a, mean_b) = covariances(2, seed), means(2, seed)
     mean, cov, squared = gaussian.geodesic(mean_a, a, mean_b, b, torch.tensor(lam, dtype=torch.float64))
@@ -101,7 +99,6 @@ def test_geodesic(seed, lam):
 
 
 @given(seeds)
-@settings(max_examples=30)
 def test_bhattacharyya(seed):
     generator = torch.Generator().manual_seed(seed)
     root = torch.randn(2, 2, 2, generator=generator, dtype=torch.float64)

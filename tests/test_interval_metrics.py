@@ -9,7 +9,8 @@ from evaluations import in_memory, rows_of
 
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.metrics.intervals import IntervalCoverage
-from ufmstar_torch.eval.report.figures_gates import draw_gates, draw_intervals, gates_figure
+from ufmstar_torch.eval.report.figures_calibration import INTERVAL, draw_calibration
+from ufmstar_torch.eval.report.figures_error import draw_gates, gates_figure
 
 
 def maps(n=4000, seed=0):
@@ -82,12 +83,13 @@ def test_the_report_draws_coverage_and_gates_of_rows_with_intervals():
 
     empty = in_memory({(row, ("rooms", "a")): {} for row in rows})
     results = replace(empty, merged={("rooms", rows[0]): plain.curves(), ("rooms", rows[1]): metrics.curves()})
-    (axes,) = draw_intervals(results, "rooms").axes
+    axes = draw_calibration(results, "rooms").axes[-1]
+    assert axes.get_xlabel() == INTERVAL.x
     lines = [line for line in axes.lines if line.get_label() != "exactly right"]
     assert len(lines) == 1
     np.testing.assert_allclose(lines[0].get_ydata(), metrics.curves()["coverage_found"])
     error, within, covered = draw_gates(results, "rooms").axes
     assert [len(axes.lines) for axes in (error, within, covered)] == [2, 2, 3]
     assert {text.get_text() for text in error.texts} == {"0.05", "0.1", "0.2"}
-    assert draw_intervals(empty, "rooms") is None
+    assert draw_calibration(empty, "rooms") is None
     assert gates_figure({}, "") is None

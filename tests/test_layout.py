@@ -155,7 +155,7 @@ def test_kernels_import_back_only_plain_types():
             continue  # calls the kernels; all else is the reference's code
         for module, names in imported(path):
             if module.startswith("ufmstar_torch.") and "kernels" not in module:
-                allowed = {n for n in names if n in plain or module == "ufmstar_torch.steps.segment_input"}
+                allowed = {n for n in names if n in plain}
                 assert set(names) == allowed, f"{path} imports {names} from {module}"
 
 
@@ -192,6 +192,13 @@ def test_generic_names_are_not_importable(tmp_path):
     code = "from importlib.util import find_spec; print([find_spec(x) for x in ('models', 'eval', 'train')])"
     done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path)
     assert done.stdout.strip() == "[None, None, None]"
+
+
+def test_oracles_import_numpy_and_each_other_alone():
+    oracles = sorted((ROOT / "tests").glob("oracle*.py"))
+    allowed = {"numpy", *sys.stdlib_module_names, *(path.stem for path in oracles)}
+    for path in oracles:
+        assert {module.partition(".")[0] for module, _ in imported(path)} <= allowed, path
 
 
 def test_every_module_has_a_docstring():

@@ -1,79 +1,20 @@
-"""``LiveDepth``: processed and dropped images, late and missing poses, errors, saving, signals."""
+"""``LiveDepth``: processed and dropped images, late and missing poses, errors (its state: test_live_state.py)."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-import textwrap
 import threading
 import time
 
 import numpy as np
 import pytest
 import torch
+from live_model import HANGS, PICTURE, K, Network, at, compiled, model, network, require_all_counted, show, stamps
 
-from ufmstar_torch import AnchorConfig, DepthPrediction, LiveDepth, UfMStarConfig, UncertainDepth
+from ufmstar_torch import AnchorConfig, LiveDepth, UfMStarConfig, UncertainDepth
 from ufmstar_torch.frames.clock import StreamClock, Verdict
 from ufmstar_torch.live import BACKWARDS, CLOSED, DOUBTFUL, GAP, LATE, LOST, NEWER
 
-K = (50.0, 50.0, 31.5, 23.5)
-PICTURE = np.zeros((48, 64, 3), np.uint8)
-
-
-class Network(torch.nn.Module):
-    """Predicts 2 m everywhere. A call sets ``entered`` and waits for ``gate``."""
-
-    def __init__(self):
-        super().__init__()
-        self.gate, self.entered = threading.Event(), threading.Event()
-        self.gate.set()
-
-    def forward(self, x):
-        self.entered.set()
-        assert self.gate.wait(20)
-        if x.float().mean() > 0.8:
-            raise OSError("the network failed")
-        return DepthPrediction(torch.full((len(x), 48, 64), 2.0))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled():
-    """Compile all kernels before the first image of a test."""
-    UncertainDepth(Network())(PICTURE, np.eye(4), K)
-
-
-@pytest.fixture
-def network():
-    return Network()
-
-
-@pytest.fixture
-def model(network):
-    return UncertainDepth(network)
-
-
-def at(x):
-    T = np.eye(4)
-    T[0, 3] = x
-    return T
-
-
-def show(live, stamp, picture=PICTURE, x=0.0):
-    """Push a pose and an image with its stamp, and wait until both are processed."""
-    live.push_pose(stamp, at(x))
-    live.push_image(stamp, picture)
-    assert live.wait_idle(20)
-
-
-def stamps(results):
-    return [result.stamp for result in results]
-
-
-def require_all_counted(live):
-    counts = live.statistics
-    assert counts.images == counts.results + sum(counts.dropped.values()) + sum(counts.skipped.values())
-    return counts
+__all__ = ["compiled", "model", "network"]
 
 
 def test_a_result_has_the_pose_at_its_stamp(model):
@@ -83,7 +24,7 @@ def test_a_result_has_the_pose_at_its_stamp(model):
         for stamp, x in ((0.1, 1), (0.0, 5), (0.0, 0)):
             live.push_pose(stamp, at(x))
         live.push_image(0.025, torch.zeros(3, 48, 64, dtype=torch.uint8))
-        assert live.wait_idle(20)
+        assert live.wait_idle(HANGS)
     (result,) = results
     assert live.statistics.poses == 3
     np.testing.assert_allclose(result.T_world_cam, at(0.25), atol=1e-12)
@@ -96,7 +37,7 @@ def test_a_result_has_the_pose_at_its_stamp(model):
 
 def test_a_late_pose_is_waited_for_and_others_go_on_being_pushed(model):
     results = []
-    with LiveDepth(model, results.append, K, max_wait=20) as live:
+    with LiveDepth(model, results.append, K, max_wait=HANGS) as live:
         live.push_pose(0.0, at(0))
         for n in range(1, 40):  # more images than the queue holds; the oldest image's pose arrives first
             live.push_image(n / 100, PICTURE)
@@ -108,7 +49,7 @@ def test_a_late_pose_is_waited_for_and_others_go_on_being_pushed(model):
         assert stamps(results) == [0.01]
         live.push_pose(0.15, at(2))
         live.push_pose(0.4, at(2))  # a gap around the newest image
-        assert live.wait_idle(20)
+        assert live.wait_idle(HANGS)
         assert live.statistics.skipped == {GAP: 1}
     assert stamps(results) == [0.01, 0.15]
     require_all_counted(live)
@@ -121,11 +62,11 @@ def test_the_newest_image_wins_while_the_model_is_busy(model, network):
         for n in range(4):
             live.push_pose(n / 100, at(n / 100))
         live.push_image(0.0, PICTURE)
-        assert network.entered.wait(20)
+        assert network.entered.wait(HANGS)
         for n in (1, 2, 3):
             live.push_image(n / 100, PICTURE)
         network.gate.set()
-        assert live.wait_idle(20)
+        assert live.wait_idle(HANGS)
     assert stamps(results) == [0.0, 0.03]
     assert require_all_counted(live).dropped == {NEWER: 2}
 
@@ -138,7 +79,7 @@ def test_the_image_may_be_overwritten_after_the_push(model, network):
         live.push_image(0, buffer)
         buffer[:] = 255
         network.gate.set()
-        assert live.wait_idle(20)
+        assert live.wait_idle(HANGS)
     assert not results[0].image.any()
 
 
@@ -146,18 +87,18 @@ def test_why_images_are_skipped(model, caplog):
     results = []
     with LiveDepth(model, results.append, K, max_wait=0.02, max_gap=0.1) as live:
         live.push_image(0.5, PICTURE)  # no pose at all
-        assert live.wait_idle(20)
+        assert live.wait_idle(HANGS)
         assert live.statistics.skipped == {LATE: 1}
         for stamp, T in ((1.0, at(0)), (1.05, np.full((4, 4), np.nan)), (1.1, at(0)), (1.5, at(0))):
             live.push_pose(stamp, T)
         for stamp in (0.9, 1.02, 1.07, 1.3):  # before all poses, before and after a lost pose, in a gap
             live.push_image(stamp, PICTURE)
-            assert live.wait_idle(20)
+            assert live.wait_idle(HANGS)
         for stamp in (1.3, 0.2):  # its stamp is not after the previous one
             live.push_image(stamp, PICTURE)
         live.push_image(1.5, PICTURE)
         live.push_image(1.504, PICTURE)  # its next pose never arrives: use the pose within 5 ms
-        assert live.wait_idle(20)
+        assert live.wait_idle(HANGS)
     assert stamps(results) == [1.5, 1.504]
     assert require_all_counted(live).skipped == {LATE: 1, GAP: 2, LOST: 2, BACKWARDS: 2}
     assert "image at 0.500 s skipped: no pose in time (poses: none" in caplog.text
@@ -168,14 +109,14 @@ def test_why_images_are_skipped(model, caplog):
 @pytest.mark.parametrize("what", ["pose", "image"])
 def test_a_single_wrong_stamp_is_dropped_and_counted(model, what, wrong, caplog):
     results = []
-    with LiveDepth(model, results.append, K, max_wait=20) as live:
+    with LiveDepth(model, results.append, K, max_wait=HANGS) as live:
         for n in range(6):
             if n in (0, 3):  # also before the first pose or image
                 live.push_pose(wrong, at(9)) if what == "pose" else live.push_image(wrong, PICTURE)
             live.push_pose(n / 30, at(n / 100))
             live.push_image(n / 30, PICTURE)
             if n > 2:
-                assert live.wait_idle(20)
+                assert live.wait_idle(HANGS)
         counts = require_all_counted(live)
     assert [round(stamp * 30) for stamp in stamps(results) if stamp != wrong][-3:] == [3, 4, 5]
     assert (counts.dropped_poses, counts.skipped.get(DOUBTFUL, 0)) >= ((1, 0) if what == "pose" else (0, 1))
@@ -186,14 +127,14 @@ def test_a_single_wrong_stamp_is_dropped_and_counted(model, what, wrong, caplog)
 @pytest.mark.parametrize("jump", [1e6, 10.0, -10.0, -1e6])
 def test_a_clock_that_jumps_is_named_and_followed_after_three_frames(model, jump, caplog):
     results = []
-    with LiveDepth(model, results.append, K, max_wait=20) as live:
+    with LiveDepth(model, results.append, K, max_wait=HANGS) as live:
         for n in range(5):
             show(live, 2e6 + n / 30, x=n / 100)
         for n in range(8):
             live.push_pose(2e6 + jump + n / 30, at(n / 100))
             live.push_image(2e6 + jump + n / 30, PICTURE)
             if n > 1:
-                assert live.wait_idle(20)
+                assert live.wait_idle(HANGS)
         counts = require_all_counted(live)
     assert stamps(results)[-6:] == [2e6 + jump + n / 30 for n in range(2, 8)]
     assert counts.skipped == {DOUBTFUL: 2}
@@ -205,14 +146,14 @@ def test_a_clock_that_jumps_is_named_and_followed_after_three_frames(model, jump
 def test_poses_that_are_sent_again_replace_the_earlier_ones(model, caplog):
     """As after a loop closure; poses that are older than the buffer do not count as another clock."""
     results = []
-    with LiveDepth(model, results.append, K, max_wait=20) as live:
+    with LiveDepth(model, results.append, K, max_wait=HANGS) as live:
         for n in range(200):
             live.push_pose(n / 20, at(0))
         live.push_image(9.9, PICTURE)
         for n in range(-100, 200):
             live.push_pose(n / 20, at(1))
         live.push_image(9.925, PICTURE)
-        assert live.wait_idle(20)
+        assert live.wait_idle(HANGS)
     assert stamps(results)[-1] == 9.925
     assert results[-1].T_world_cam[0, 3] == 1
     assert "jumped" not in caplog.text
@@ -232,44 +173,13 @@ def test_a_slow_stream_and_a_pause_are_no_jump(monkeypatch):
     assert clock.judge(3872.0, now + 3600.0) == Verdict.USE
 
 
-def test_a_second_process_may_not_write_the_same_state(model, tmp_path):
-    """Temporary files of a killed one are removed at the start, other files stay."""
-    file = tmp_path / "s.pt"
-    left, other = tmp_path / ".s.pt.0123456789ab.tmp", tmp_path / ".other.pt.0123456789ab.tmp"
-    left.write_text("half a state")
-    other.write_text("of another program")
-    code = f"""
-import sys, torch
-from ufmstar_torch import DepthPrediction, LiveDepth, UncertainDepth
-class Network(torch.nn.Module):
-    def forward(self, x): return DepthPrediction(torch.full((1, 8, 8), 2.0))
-with LiveDepth(UncertainDepth(Network()), print, state={str(file)!r}):
-    print("holds it", flush=True)
-    sys.stdin.read()
-"""
-    words = [sys.executable, "-P", "-c", code]
-    first = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    try:
-        assert first.stdout.readline() == "holds it\n"
-        assert (left.exists(), other.exists()) == (False, True)
-        with pytest.raises(ValueError, match=r"state: another process is writing .*s\.pt"):
-            LiveDepth(model, print, K, state=file)
-    finally:
-        first.kill()
-        first.communicate()
-    with LiveDepth(model, print, K, state=file):
-        (tmp_path / "link.pt").symlink_to(file)
-        with pytest.raises(ValueError, match="another process is writing"):
-            LiveDepth(model, print, K, state=tmp_path / "link.pt")
-
-
 def test_a_reset_forgets_views_and_times(model):
     results = []
     with LiveDepth(model, results.append, K, max_wait=0.02) as live:
         show(live, 9)
         live.reset()
         live.push_image(1, PICTURE)  # the old pose is discarded
-        assert live.wait_idle(20)
+        assert live.wait_idle(HANGS)
         show(live, 2)
     assert stamps(results) == [9, 2]
     assert live.statistics.skipped == {LATE: 1}
@@ -301,7 +211,7 @@ def test_a_camera_that_changes_its_size_restarts_the_evidence_of_its_anchors(net
             scale, picture = w / 64, rng.integers(0, 256, (h, w, 3), dtype=np.uint8)
             live.push_pose(n, at(n / 100))
             live.push_image(n, picture, (50 * scale, 50 * scale, (w - 1) / 2, (h - 1) / 2))
-            assert live.wait_idle(20)
+            assert live.wait_idle(HANGS)
     assert len(results) == 6
     assert require_all_counted(live).restarts == 1
 
@@ -319,7 +229,7 @@ def test_an_error_reaches_every_thread_that_pushes(model, what):
     live.push_pose(0, at(0))
     live.push_image(0, PICTURE + (255 if what == "model" else 0))
     with pytest.raises(expected):
-        live.wait_idle(20)
+        live.wait_idle(HANGS)
     for call in (lambda: live.push_image(1, PICTURE), lambda: live.push_pose(1, at(0)), live.reset, live.close):
         with pytest.raises(expected):
             call()
@@ -334,20 +244,20 @@ def test_closing_while_busy_waits_for_the_image_and_drops_the_rest(model, networ
     live.push_pose(0, at(0))
     live.push_pose(1, at(0))
     live.push_image(0, PICTURE)
-    assert network.entered.wait(20)
+    assert network.entered.wait(HANGS)
     live.push_image(1, PICTURE)
     closing = threading.Thread(target=live.close)
     closing.start()
     time.sleep(0.02)
     assert closing.is_alive()
     network.gate.set()
-    closing.join(20)
+    closing.join(HANGS)
     live.push_image(2, PICTURE)  # a camera callback after the end
     live.push_pose(2, at(0))
     live.close()
     assert stamps(results) == [0]
     assert require_all_counted(live).dropped == {CLOSED: 2}
-    assert live.wait_idle(20)
+    assert live.wait_idle(HANGS)
 
 
 def test_on_result_may_close(model):
@@ -357,7 +267,7 @@ def test_on_result_may_close(model):
     live = LiveDepth(model, on_result, K)
     live.push_pose(0, at(0))
     live.push_image(0, PICTURE)
-    live._worker.join(20)
+    live._worker.join(HANGS)
     live.close()
     assert live.statistics.results == 1
 
@@ -375,8 +285,8 @@ def test_many_threads(model):
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(60)
-    assert live.wait_idle(60)
+        thread.join(HANGS)
+    assert live.wait_idle(HANGS)
     live.close()
     assert require_all_counted(live).images == 8 * 30
     assert live.statistics.poses == 8 * 30
@@ -424,71 +334,3 @@ def test_impossible_settings_are_refused(model, tmp_path):
         LiveDepth(model, print, state=tmp_path)
     with pytest.raises(FileNotFoundError, match="state: no such folder"):
         LiveDepth(model, print, state=tmp_path / "nowhere" / "state.pt")
-
-
-def test_the_state_goes_on_where_it_ended(model, tmp_path):
-    with LiveDepth(model, lambda _: None, K, state=tmp_path / "state.pt", save_every=0) as live:
-        for n in range(3):
-            show(live, n, x=n / 100)
-    assert live.statistics.saved == 3
-    again = UncertainDepth(Network())
-    with LiveDepth(again, print, K, state=tmp_path / "state.pt"):
-        assert int(again.image_index) == 3
-    assert live.statistics.saved == 3  # no change, so nothing is written
-    torch.testing.assert_close(
-        again(PICTURE, at(0.03), K).variance, model(PICTURE, at(0.03), K).variance, rtol=0, atol=0
-    )
-    assert sorted(path.name for path in tmp_path.iterdir()) == [".state.pt.lock", "state.pt"]
-    with LiveDepth(model, print, K, state=tmp_path / "other.pt"):
-        pass  # no change, so no file is overwritten
-    assert not (tmp_path / "other.pt").exists()
-
-
-def test_a_state_that_does_not_fit_is_refused_and_stays(model, tmp_path):
-    file, before = tmp_path / "state.pt", {name: value.clone() for name, value in model.stream_state().items()}
-    plain = UncertainDepth(Network(), posterior=False)
-    torch.save(plain.stream_state(), file)
-    (tmp_path / "damaged.pt").write_bytes(file.read_bytes()[:500])
-    for path, words in ((file, "the state must hold"), (tmp_path / "damaged.pt", "damaged")):
-        content = path.read_bytes()
-        with pytest.raises(
-            ValueError, match=rf"state .*{path.name} cannot be continued: (.|\n)*{words}(.|\n)*Delete the"
-        ):
-            LiveDepth(model, print, K, state=path)
-        assert path.read_bytes() == content
-    after = model.stream_state()
-    assert all(torch.equal(after[name], value) for name, value in before.items())
-
-
-def test_a_state_that_cannot_be_written_is_an_error(model, tmp_path):
-    live = LiveDepth(model, lambda _: None, K, state=tmp_path / "state.pt")
-    (tmp_path / "state.pt").mkdir()
-    show(live, 0)
-    with pytest.raises(OSError, match=r"state\.pt"):
-        live.close()
-
-
-@pytest.mark.slow
-def test_sigterm_as_an_exception_saves_the_state(tmp_path):
-    """As in docs/live.md."""
-    script = textwrap.dedent(
-        f"""
-        import signal, sys, time
-        sys.path.insert(0, {str(os.path.dirname(__file__))!r})
-        import test_live as t
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
-        model = t.UncertainDepth(t.Network())
-        ready, state = lambda _: print("ready", flush=True), {str(tmp_path / "state.pt")!r}
-        with t.LiveDepth(model, ready, t.K, state=state) as live:
-            live.push_pose(0, t.at(0)); live.push_image(0, t.PICTURE)
-            time.sleep(60)
-        """
-    )
-    process = subprocess.Popen(
-        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    )
-    assert process.stdout.readline() == "ready\n"
-    process.terminate()
-    assert process.wait(30) != 0
-    process.stdout.close()
-    assert "image_index" in torch.load(tmp_path / "state.pt")

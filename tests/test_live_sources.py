@@ -5,6 +5,8 @@ from __future__ import annotations
 import base64
 import io
 import json
+import math
+import os
 import re
 import subprocess
 import sys
@@ -12,6 +14,7 @@ import threading
 import time
 from dataclasses import replace
 from itertools import count
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,12 +24,15 @@ from layouts import quaternion_line
 from PIL import Image
 from rerun_stand_in import stand_in
 
-from ufmstar_torch import UncertainDepth, cli
+from ufmstar_torch import cli
+from ufmstar_torch.eval.commands import live as live_command
 from ufmstar_torch.eval.run import rerun_log
+from ufmstar_torch.eval.sequences import live as sources
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.live import PoseFile, growing_folder, json_lines, replay
 from ufmstar_torch.eval.tour import export_tour
-from ufmstar_torch.files.lock import hold
+from ufmstar_torch.files.write import hold
+from ufmstar_torch.frames.networks import NetworksInTurn
 
 __all__ = ["stand_in"]
 
@@ -128,35 +134,39 @@ def test_an_image_that_replaces_an_earlier_one_is_new(tmp_path):
     """A camera that starts again writes the same names."""
     file = tmp_path / "0.png"
     file.write_bytes(content(np.full((8, 8, 3), 7, np.uint8)))
-    events = growing_folder(tmp_path, PoseFile(tmp_path / "none"), idle=60)
-    threading.Timer(0.2, lambda: file.write_bytes(content(np.full((8, 8, 3), 9, np.uint8)))).start()
-    assert next(events).image[0, 0, 0] == 9
+    os.utime(file, (1, 1))
+
+    def clock():  # first read after the folder has been listed
+        file.write_bytes(content(np.full((8, 8, 3), 9, np.uint8)))
+        return 0.0
+
+    assert next(growing_folder(tmp_path, PoseFile(tmp_path / "none"), clock=clock)).image[0, 0, 0] == 9
 
 
-def test_a_folder_that_grows(tmp_path):
+def test_a_folder_that_grows(tmp_path, monkeypatch):
+    monkeypatch.setattr(sources, "_UNREADABLE", 1000)  # [s] this machine may be slow
     folder, image = tmp_path / "images", np.full((8, 8, 3), 7, np.uint8)
     folder.mkdir()
     (folder / "1.0.png").write_bytes(content(image))  # existed before
-    begun, found = threading.Event(), []
 
-    def clock():
-        begun.set()  # the folder has been listed
-        return time.monotonic()
+    def first():
+        (folder / "2.0.png").write_bytes(content(image)[:40])  # still being written
+        (folder / "3.0.png").write_bytes(content(image))
+        (folder / "notes.txt").write_text("no image")
+        (folder / "0.png").symlink_to("nowhere.png")
+        (tmp_path / "poses.txt").write_text("2.5 0 0 0 0 0 0 1\n")
 
-    events = growing_folder(folder, PoseFile(tmp_path / "poses.txt"), idle=5, clock=clock)
-    thread = threading.Thread(target=lambda: found.extend(event for _, event in zip(range(4), events, strict=False)))
-    thread.start()
-    assert begun.wait(20)
-    (folder / "2.0.png").write_bytes(content(image)[:40])  # still being written
-    (folder / "3.0.png").write_bytes(content(image))
-    (folder / "notes.txt").write_text("no image")
-    (folder / "0.png").symlink_to("nowhere.png")
-    (tmp_path / "poses.txt").write_text("2.5 0 0 0 0 0 0 1\n")
-    time.sleep(0.1)
-    (folder / "2.0.png").write_bytes(content(image))
-    time.sleep(0.1)
+    steps = [first, lambda: None, lambda: (folder / "2.0.png").write_bytes(content(image))]
+
+    def clock():  # first read after the folder has been listed, then before each look into it
+        if steps:
+            steps.pop(0)()
+        return 0.0
+
+    events = growing_folder(folder, PoseFile(tmp_path / "poses.txt"), clock=clock)
+    found = [next(events) for _ in range(3)]
     (folder / "front.png").write_bytes(content(image))
-    thread.join(20)
+    found.append(next(events))
     assert [event.stamp for event in found[:3]] == [2.5, 2.0, 3.0]
     assert found[0].image is None
     assert abs(found[3].stamp - time.time()) < 60  # the file's metadata
@@ -256,18 +266,24 @@ def test_a_recording_live(ufmstar, tmp_path):
 
 
 def test_a_recording_waits_for_a_network_that_starts_slowly(ufmstar, monkeypatch):
-    """As on a GPU, whose libraries take seconds: longer than this recording."""
-    member, started = UncertainDepth.member, []
+    """As on a GPU, whose libraries take seconds: the recording's clock starts after the first prediction."""
+    member, running, too_early = NetworksInTurn.member, threading.Event(), []
+
+    def perf_counter():
+        running.set()
+        return time.perf_counter()
 
     def slow_at_first(*words):
-        if not started:
-            started.append(time.sleep(2))
+        if not too_early:
+            too_early.append(running.wait(0.3))
         return member(*words)
 
-    monkeypatch.setattr(UncertainDepth, "member", slow_at_first)
-    code, out, err = ufmstar(TOUR, "--speed", "0.25", "--json")
+    monkeypatch.setattr(sources, "time", SimpleNamespace(sleep=time.sleep, perf_counter=perf_counter))
+    monkeypatch.setattr(NetworksInTurn, "member", slow_at_first)
+    code, out, err = ufmstar(TOUR, "--speed", "100", "--json")
     assert code == 0, err + out
-    assert len(out.splitlines()) >= 3  # 2 without the wait: the first image and the last
+    assert too_early == [False]
+    assert running.is_set()
 
 
 def test_lines_on_standard_input_live(ufmstar, tmp_path, monkeypatch):
@@ -312,7 +328,10 @@ def test_intrinsics_hold_for_later_lines_and_images_may_be_missing(tmp_path, cap
     assert "2 images could not be read" in caplog.text
 
 
-def test_a_folder_that_grows_live(ufmstar, tmp_path):
+def test_a_folder_that_grows_live(ufmstar, tmp_path, monkeypatch):
+    """Until --seconds are over: here, after the first result."""
+    out = tmp_path / "out"
+    monkeypatch.setattr(live_command, "monotonic", lambda: math.inf if any(out.glob("*.npz")) else 0.0)
     sequence = open_sequence(TOUR)
     folder = tmp_path / "images"
     folder.mkdir()
@@ -332,11 +351,11 @@ def test_a_folder_that_grows_live(ufmstar, tmp_path):
     writer.start()
     K = sequence.intrinsics
     words = ("--trajectory", tmp_path / "poses.txt", "--intrinsics", K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-    code, out, err = ufmstar(folder, "--follow", "--seconds", "1", *words)
+    code, printed, err = ufmstar(folder, "--follow", "--seconds", "1", "--out", out, *words)
     ended.set()
     writer.join()
-    assert code == 0, err + out
-    assert "UfM*'s share" in out
+    assert code == 0, err + printed
+    assert "UfM*'s share" in printed
 
 
 _VIEWER = """
@@ -371,7 +390,7 @@ def test_a_viewer_shows_the_results_on_this_computer_alone(ufmstar, stand_in, mo
     assert address.startswith("rerun+http://127.0.0.1:")
     (count,) = re.findall(r"(\d) of 5 images", out)
     depths, images = stand_in.logged("world/camera/maps/depth"), stand_in.logged("world/camera/image/rgb")
-    assert len(depths) == len(images) == len(stand_in.logged("plots/latency_ms")) == int(count)
+    assert len(depths) == len(images) == len(stand_in.logged("milliseconds/latency_ms")) == int(count)
     assert images[0].words[0].shape == (64, 96, 3)
     assert depths[0].words[0].dtype == np.uint16
 

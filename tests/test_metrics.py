@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 import warnings
 from collections import Counter
 
@@ -16,9 +18,7 @@ from scipy import stats
 
 from ufmstar_torch.eval.metrics import (
     NLL,
-    RMSE,
-    AbsRel,
-    Delta1,
+    DepthAccuracy,
     ECEDelta,
     ECEQuantile,
     EntropyHistogram,
@@ -33,19 +33,19 @@ from ufmstar_torch.eval.metrics.base import SumMetric
 
 class TestAgainstIndependentImplementations:
     def test_accuracy(self) -> None:
-        d, v, g = maps(40, 50)
+        d, _, g = maps(40, 50)
         dn, gn = d.numpy(), g.numpy()
-        delta1 = figures(Delta1(), d, v, g)
-        assert float(delta1["delta1"]) == np.mean(np.abs(dn - gn) <= 0.25 * gn)
-        assert float(delta1["delta1_ratio"]) == np.mean(np.maximum(dn / gn, gn / dn) < 1.25)
-        assert delta1["delta1"] != delta1["delta1_ratio"]
-        assert float(figures(AbsRel(), d, None, g)["abs_rel"]) == pytest.approx(np.mean(np.abs(dn - gn) / gn))
-        assert float(figures(RMSE(), d, None, g)["rmse"]) == pytest.approx(np.sqrt(np.mean((dn - gn) ** 2)))
+        accuracy = figures(DepthAccuracy(), d, None, g)
+        assert float(accuracy["delta1"]) == np.mean(np.abs(dn - gn) <= 0.25 * gn)
+        assert float(accuracy["delta1_ratio"]) == np.mean(np.maximum(dn / gn, gn / dn) < 1.25)
+        assert accuracy["delta1"] != accuracy["delta1_ratio"]
+        assert float(accuracy["abs_rel"]) == pytest.approx(np.mean(np.abs(dn - gn) / gn))
+        assert float(accuracy["rmse"]) == pytest.approx(np.sqrt(np.mean((dn - gn) ** 2)))
 
     def test_delta1_closed_form(self) -> None:
         g = torch.full((5,), 4.0)
         d = torch.tensor([3.0, 5.0, 2.99, 5.01, 3.125])
-        got = figures(Delta1(), d, None, g)
+        got = figures(DepthAccuracy(), d, None, g)
         assert float(got["delta1"]) == 3 / 5  # 3, 5 and 3.125: the interval is closed and lies around g
         assert float(got["delta1_ratio"]) == 0.0  # ratios 1.333, 1.25, 1.338, 1.2525, 1.28: open interval
 
@@ -271,13 +271,13 @@ def loop(d: np.ndarray, v: np.ndarray, g: np.ndarray, use: np.ndarray) -> dict[s
             sums["EntropyHistogram.pixels"] += 1
         if not (chosen and true):
             continue
-        sums["Delta1.with_truth"] += 1
+        sums["DepthAccuracy.with_truth"] += 1
         if math.isfinite(x):
-            sums["Delta1.pixels"] += 1
-            sums["Delta1.hits"] += abs(x - t) <= 0.25 * t
-            sums["Delta1.hits_ratio"] += x > 0 and max(x / t, t / x) < 1.25
-            sums["AbsRel.total"] += abs(x - t) / t
-            sums["RMSE.total"] += (x - t) ** 2
+            sums["DepthAccuracy.pixels"] += 1
+            sums["DepthAccuracy.hits"] += abs(x - t) <= 0.25 * t
+            sums["DepthAccuracy.hits_ratio"] += x > 0 and max(x / t, t / x) < 1.25
+            sums["DepthAccuracy.relative"] += abs(x - t) / t
+            sums["DepthAccuracy.squared"] += (x - t) ** 2
         if predicted and w > 0:
             sums["NLL.total"] += (x - t) ** 2 / (2 * w) + 0.5 * math.log(2 * math.pi * w)
             sums["NLL.pixels"] += 1
@@ -302,8 +302,8 @@ def test_hostile_maps_add_up_to_what_loops_say(dtype: torch.dtype) -> None:
     for name, total in expected.items():
         assert float(sums[f"metrics.{name}"]) == pytest.approx(total, rel=1e-12), name
     judged, found = int(sums["metrics.ECEQuantile.pixels"]), metrics.compute()
-    for name, kind in (("left_out_share", "Delta1"), ("nll_left_out_share", "NLL")):
-        used = expected[f"{kind}.pixels"] / expected["Delta1.with_truth"]
+    for name, kind in (("left_out_share", "DepthAccuracy"), ("nll_left_out_share", "NLL")):
+        used = expected[f"{kind}.pixels"] / expected["DepthAccuracy.with_truth"]
         assert found[name] == pytest.approx(1 - used, rel=1e-12)
     for name in ("ECEDelta.pixels", "Sparsification.count", "SpearmanCorrelation.joint"):
         assert int(sums[f"metrics.{name}"].sum()) == judged
@@ -376,3 +376,18 @@ class TestRanking:
         sure = v.sqrt() <= 0.2
         got = figures(NLLByError(), d, v, g, sure)["nll_by_error"]
         np.testing.assert_array_equal(got, figures(NLLByError(), d[sure], v[sure], g[sure])["nll_by_error"])
+
+
+LEAN = """
+import sys
+from ufmstar_torch.eval.metrics import ECEDelta
+loaded = sorted(name for name in ("torchvision", "transformers", "torch._dynamo") if name in sys.modules)
+import torchmetrics
+whole = torchmetrics.MeanMetric, torchmetrics.utilities.data, torchmetrics.functional, torchmetrics.__version__
+print(loaded, issubclass(ECEDelta, torchmetrics.Metric), issubclass(torchmetrics.MeanMetric, torchmetrics.Metric))
+"""
+
+
+def test_metrics_load_no_other_metrics_of_torchmetrics_until_these_are_used():
+    process = subprocess.run([sys.executable, "-c", LEAN], capture_output=True, text=True, check=False)
+    assert process.stdout.splitlines() == ["[] True True"], process.stderr

@@ -14,7 +14,6 @@ import scenes
 from ufmstar_torch import ConfidenceConfig, PosteriorConfig, SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.gaussians.camera import resize_intrinsics
 from ufmstar_torch.gaussians.gaussian import barycenter
-from ufmstar_torch.steps.segment_input import SegmentInput
 
 INF, NAN = torch.inf, torch.nan
 DEPTH, POSE, CAMERA = frame(0)
@@ -59,7 +58,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: setattr(UfMStarConfig(), "eta", 0.3), "assign"),
     (lambda: segment({"noise_floor": 0.5}), "noise_floor"),
     (lambda: SPGFConfig.preset("kitti"), "tum, tartanair_indoor, tartanair_outdoor, got 'kitti'"),
-    (lambda: SegmentInput.of(D, K1, SPGFConfig(min_gaussian_length=1e-6)), "config.min_gaussian_length = 1e-06 m"),
+    (lambda: SPGFConfig(min_gaussian_length=1e-6), "SPGFConfig.min_gaussian_length = 1e-06 m"),
     (lambda: resize_intrinsics(K1, (0, 4), (5, 6)), r"old must be \(H, W\), positive whole numbers"),
     (lambda: barycenter(torch.zeros(2, 3), torch.eye(3).expand(2, 3, 3), -torch.ones(2)), "weight must be non-neg"),
 ]

@@ -210,9 +210,21 @@ def test_rarer_options_of_readers():
         ("plugin=a.py", "--reader has no plugin"),
         ("fps=3", "no fps"),
         ("max_truth=-1", "max_truth"),
+        ("max_truth=[]", r"max_truth must be a number, got \[\]"),
+        ("max_pose_gap=true", "max_pose_gap must be a number, got True"),
+        ("scans=1.5", "scans must be a whole number, got 1.5"),
+        ("model_index=a", "model_index must be a whole number, got 'a'"),
+        ("drive=[1]", "drive must be a name or a number"),
+        ("T_color_depth=[[1]]", "T_color_depth must be a file or an array"),
+        ("depth_intrinsics=5", "no such file: 5"),
     ):
         with pytest.raises(ValueError, match=reason):
             OpeningOptions(reader=(wrong,))
+    words = ["check", "walk", "--max-pose-gap", ".3"]
+    with pytest.raises(ValueError, match=r"--max-pose-gap, \.3; it is a rarer option .*: --reader max_pose_gap=VALUE$"):
+        parse(_options_of("data"), words, "ufmstar data")
+    with pytest.raises(ValueError, match=r"^Unrecognized options: --anything$"):
+        parse(_options_of("data"), ["check", "walk", "--anything"], "ufmstar data")
 
 
 def _options_of(command: str) -> type:
@@ -244,6 +256,7 @@ def test_help_is_short_and_has_sentences(command, monkeypatch):
         parse(options, ["--help"], f"ufmstar {command}")
     assert ended.value.code == 0
     assert len(shown.getvalue().splitlines()) <= _TWO_SCREENS
+    assert "options options" not in shown.getvalue().replace("-options", "options")
     for name, text in _texts(options).items():
         assert text, name
         assert text[0].isupper(), f"{name}: {text}"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import pytest
 import torch
 from modules import same
@@ -235,6 +237,52 @@ def test_weights_of_a_large_layer_are_marked_by_its_first_and_last_entries():
         layer.weight[at] = True
         marks.append(weights_mark(layer))
     assert len(set(marks)) == 3
+
+
+class Meeting:
+    """Lets a network wait from the second image on until UfM* has begun the image before, and UfM* until the network
+    has begun."""
+
+    def __init__(self) -> None:
+        self.network, self.ufm = threading.Event(), threading.Event()
+
+    def stage(self, name):
+        self.ufm.set()
+        assert self.network.wait(60)
+
+
+class Waiting(Scaled):
+    def __init__(self, meeting: Meeting) -> None:
+        super().__init__(1.0)
+        self.meeting = meeting
+
+    def forward(self, image):
+        if self.calls:
+            self.meeting.network.set()
+            assert self.meeting.ufm.wait(60)
+        return super().forward(image)
+
+
+def test_stream_runs_a_network_on_the_cpu_beside_ufm_star():
+    meeting = Meeting()
+    model = UncertainDepth(Waiting(meeting), CONFIG, posterior=False)
+    model.ufm.observer = meeting
+    assert len(list(model.stream((image(i), POSES[i], K) for i in range(3)))) == 3
+
+
+def test_an_error_of_the_network_in_a_stream_comes_after_the_result_before_it():
+    class Failing(Scaled):
+        def forward(self, image):
+            if self.calls == 2:
+                raise ArithmeticError("the third image")
+            return super().forward(image)
+
+    model = UncertainDepth(Failing(1.0), CONFIG, posterior=False)
+    results = model.stream((image(i), POSES[i], K) for i in range(4))
+    assert [next(results).member for _ in range(2)] == [0, 0]
+    with pytest.raises(ArithmeticError, match="the third image"):
+        next(results)
+    assert model.image_index == 2
 
 
 def test_stream_and_a_device_for_the_multiview_part_change_no_bit():

@@ -13,7 +13,7 @@ from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.anchors.anchors import check_anchors
 from ufmstar_torch.frames.frame import check_frame
-from ufmstar_torch.kernels.host import moved
+from ufmstar_torch.kernels.select import moved
 from ufmstar_torch.posterior import field
 from ufmstar_torch.posterior.distribution import divided
 from ufmstar_torch.posterior.running import FEATURES, SIZE, Running
@@ -157,11 +157,32 @@ def test_on_device_meta_the_results_have_shapes():
         assert (value.shape, value.dtype) == (same.shape, same.dtype)
 
 
-def updated(depth, anchors, claimed=None, packed=None):
+def updated(depth, anchors, claimed=None, packed=None, config=MODEL):
     """State and posterior after a frame of one stream."""
     packed = torch.zeros(1, SIZE, dtype=torch.float64) if packed is None else packed
     claimed = np.zeros_like(depth) if claimed is None else claimed
-    return update(packed, *checked(depth, *anchors), torch.from_numpy(claimed)[None], MODEL)
+    return update(packed, *checked(depth, *anchors), torch.from_numpy(claimed)[None], config)
+
+
+def test_far_from_evidence_the_slopes_are_the_stream_s_mean():
+    """Ten frames show a network of right shape; then anchors in the left quarter show errors that fall to the right.
+    At the right border, the correction is nearer to the network's shape than to the line through these anchors."""
+    depth, everywhere = (
+        np.full((36, 48), 2.0),
+        np.stack([x.ravel() for x in np.mgrid[1:48:3, 1:36:3]], -1).astype(float),
+    )
+    left, none = everywhere[everywhere[:, 0] < 12], np.zeros(len(everywhere))
+    frames = [(everywhere, none)] * 10 + [(left, 0.5 - left[:, 0] / 48)]
+    outs = []
+    for config in (MODEL, type("Extrapolated", (PosteriorConfig,), {"slope_reach": 1e9})()):
+        packed = None
+        for pixel, y in frames:
+            packed, out = updated(depth, (pixel, 2 * np.exp(y), np.full(len(y), 1e-4)), packed=packed, config=config)
+        outs.append(out)
+    near, far = (np.log([o.depth[0, :, column].mean() / 2 for o in outs]) for column in (6, 47))
+    assert near[0] == pytest.approx(near[1], abs=0.02)
+    assert far[1] < -0.1
+    assert far[0] > far[1] / 2
 
 
 def test_without_anchors_the_slopes_of_the_correction_revert_and_its_scale_remains():
@@ -185,8 +206,8 @@ def test_without_anchors_the_slopes_of_the_correction_revert_and_its_scale_remai
     assert float(logs.std()) == pytest.approx(float(np.log(room).std()), rel=0.1)
 
 
-def relative(out):
-    return (out.variance / out.depth.square())[0]
+def relative(out, name="variance"):
+    return (getattr(out, name) / out.depth.square())[0]
 
 
 def test_anchors_correct_a_wrong_scale_and_the_variance_covers_what_is_left():
@@ -357,7 +378,7 @@ def test_another_surface_is_more_probable_and_less_certain_away_from_evidence():
     assert float(p[20]) == pytest.approx(MODEL.wrong, rel=0.3)
     assert 1.5 * MODEL.wrong < float(p.max()) < 2.5 * MODEL.wrong  # the scale of the depth is nearly certain
     beyond = ((out.variance - out.inlier) / out.depth.square())[0].mean(0)
-    assert float(beyond[50]) > 2 * float(beyond[20]) > 4 * float(beyond[1])
+    assert float(beyond[54]) > 2 * float(beyond[20]) > 4 * float(beyond[1])
     assert bool((out.inlier < out.variance).all())  # another surface adds to the total variance only
 
 
@@ -436,20 +457,27 @@ def test_before_the_first_anchor_it_is_plain_ufm_star_to_the_bit():
     assert a.posterior_outlier is a.quantiles is None
 
 
-def test_before_the_first_anchor_of_a_source_nothing_reads_as_certain():
-    """With only invalid anchors, the depth is the network's. A network that is off by a factor of 8 is within three
-    standard deviations: the prior of its scale has a heavy tail."""
+def test_before_the_first_anchor_of_a_source_the_deviation_is_about_the_depth():
+    """With only invalid anchors, the depth is the network's and two standard deviations reach the camera. The mixture
+    has the heavier tail: a network that is 8 times too near is far more probable in it than in the normal
+    distribution."""
     depth, _, _, *anchors = scene(0)
     frame, invalid = checked(depth, *anchors)
     invalid = dataclasses.replace(invalid, valid=torch.zeros_like(invalid.valid))
     packed, out = update(torch.zeros(1, SIZE, dtype=torch.float64), frame, invalid, torch.zeros(1, 36, 48), MODEL)
     assert not bool(packed.any())
     torch.testing.assert_close(out.depth[0][frame.valid[0]], frame.depth[frame.valid])
-    share = relative(out)[frame.valid[0]]
-    assert float(share.min()) > MODEL.prior_sigma**2
-    assert float(share.max()) < 8
-    assert float(share.min()) > (7 / 3) ** 2
-    assert 0.7 < float((out.inlier / out.depth.square())[frame.valid].median().sqrt()) < 1
+    total, inlier = (relative(out, name)[frame.valid[0]].sqrt() for name in ("variance", "inlier"))
+    assert 0.7 < float(total.min()) < float(total.max()) < 1.2
+    assert 0.7 < float(inlier.median()) < float(total.median())
+    p = out.outlier[frame.valid]
+    tail = ((total.square() - (1 - p) * inlier.square()) / p).sqrt()
+    mixture = (1 - p) * density(7.0, inlier) + p * density(7.0, tail)
+    assert float((mixture / density(7.0, total)).median()) > 1e6
+
+
+def density(x, sigma):
+    return torch.exp(-((x / sigma) ** 2) / 2) / sigma
 
 
 def test_a_frame_without_anchors_keeps_the_correction_learns_nothing_and_grows_less_certain():

@@ -66,6 +66,20 @@ class Metric3D(torch.nn.Module):
         return ramp(x)[:, None], torch.sigmoid(x[:, :1]), {"prediction_normal": x}
 
 
+class Yolo:
+    """``ultralytics.YOLO``, whose ``model`` takes RGB in 0..1 and returns depth at a quarter of the resolution in eval
+    mode, the "depth" of a mapping in training mode (``ultralytics.nn.modules.head.Depth``)."""
+
+    class DepthModel(torch.nn.Module):
+        def forward(self, x: torch.Tensor) -> torch.Tensor | dict[str, torch.Tensor]:
+            assert x.amax() <= 1
+            depth = ramp(x)[:, None, ::4, ::4]
+            return {"depth": depth} if self.training else depth
+
+    def __init__(self) -> None:
+        self.model = self.DepthModel()
+
+
 @dataclass
 class Prediction:
     """As ``depth_anything_3.specs.Prediction``; the metric network returns no confidence and no cameras."""
@@ -102,7 +116,9 @@ def write(folder: Path, name: str) -> dict[str, Any]:
         write_depth_anything(folder, "metric")
     elif name in ("ZoeDepth", "Depth Pro"):
         write_other(folder, {"ZoeDepth": "zoedepth", "Depth Pro": "depth_pro"}[name])
-    stand_ins = {"unidepth": UniDepth(), "moge": MoGe(), "metric3d": Metric3D(), "da3": DepthAnything3()}
+    stand_ins: dict[str, Any] = {
+        "yolo": Yolo(), "unidepth": UniDepth(), "moge": MoGe(), "metric3d": Metric3D(), "da3": DepthAnything3(),
+    }  # fmt: skip
     return {"DIR": folder, **stand_ins}
 
 
@@ -110,10 +126,11 @@ def write(folder: Path, name: str) -> dict[str, Any]:
 def test_the_line_makes_a_metric_network(tmp_path: Path, name: str) -> None:
     network = run(LINES[name], **write(tmp_path / "n", name))
     assert network.states_confidence == (name in ("UniDepth V2", "Metric3D v2"))
-    assert network.takes_intrinsics == (name not in ("Depth Anything V2", "ZoeDepth"))
+    assert network.takes_intrinsics == (name not in ("Depth Anything V2", "ZoeDepth", "YOLO26-Depth"))
     how = network.preprocess if name != "Depth Pro" else package.Preprocess(size=(64, 64))
     x, K_net = how(IMAGE, K)
     with torch.no_grad():
+        network.eval()
         prediction = network(x, K_net) if network.takes_intrinsics else network(x)
     depth = prediction.depth
     assert depth.shape == (1, *x.shape[-2:])

@@ -88,6 +88,9 @@ def test_a_pool_of_two_sequences(ufmstar, tmp_path, weights):
     code, out, err = ufmstar(*words)
     assert code == 0, err
     assert "6 images, " in out
+    assert re.search(
+        r"^[2-4] of them cannot be ranked: less than 10% of their pixels were seen from two places", out, re.M
+    )
     assert (tmp_path / "out" / "contact_sheet.png").stat().st_size > 1000
     with (tmp_path / "out" / "scores.csv").open() as file:
         rows = list(csv.DictReader(file))

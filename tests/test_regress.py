@@ -19,9 +19,8 @@ from ufmstar_torch.gaussians.camera import unproject
 from ufmstar_torch.kernels.cpu import regress as regress_cpu
 from ufmstar_torch.kernels.cpu.regress import fill_and_smooth
 from ufmstar_torch.kernels.cpu.vectors import vectors
-from ufmstar_torch.steps.regress import Regression, distribute, regress, regress_image, shares, smooth
+from ufmstar_torch.steps.regress import Regression, distribute, regress, regress_image, set_unmeasured, shares, smooth
 from ufmstar_torch.steps.sample import sample_pixels
-from ufmstar_torch.steps.unmeasured import after_regression
 
 pytestmark = pytest.mark.numerics
 
@@ -50,12 +49,12 @@ def test_agrees_with_the_oracle(backend, config, seed):
     sparse = backend.kernels.regress_image(*arguments, torch.tensor([[14, 3], [0, 9]]))
     neighbourhood = (2.0, 0.1, 0.5) if config is NEAR else None
     for b in range(2):
-        components = oracle.prepared(as_lists(m, b))
-        expected = [
-            oracle.regress_point(x, components, prior_weight=2.0, prior_mean=0.3, neighbourhood=neighbourhood)
-            for x in points[b].numpy()
-        ]
-        values, features = (np.array(list(part)) for part in zip(*expected, strict=True))
+        components = as_lists(m, b)
+        table, prior = [[g["m"], *g["features"]] for g in components], np.array([0.3, 0, 0])
+        expected = oracle.regress(
+            points[b].numpy(), components, table, prior, prior_weight=2.0, neighbourhood=neighbourhood
+        )
+        values, features = expected[:, 0], expected[:, 1:]
         np.testing.assert_allclose(result.disagreement[b].flatten(), values, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(result.features[b].flatten(0, 1), features, rtol=1e-9, atol=1e-12)
         chosen = [[14, 3], [0, 9]][b]
@@ -194,7 +193,7 @@ def test_filling_and_smoothing_at_once_equal_both(stated, dtype):
     maps = torch.rand(4, 2, 9, 11, generator=generator).to(dtype)
     maps[3, :, :2, ::2], maps[:3, :, 1:4, :3] = torch.nan, torch.nan  # of the mixture, and of the frame
     disagreement, measured, depth, memory = (*maps[:3], maps[3].float())
-    filled, _ = after_regression(Regression(disagreement, measured[..., None]), depth, config)
+    filled, _ = set_unmeasured(Regression(disagreement, measured[..., None]), depth, config)
     for alpha in (0.3, 1.0):
         expected = smooth(memory, filled.disagreement, alpha)
         *found, counts = fill_and_smooth(disagreement, measured, depth, memory, config, alpha)

@@ -11,22 +11,15 @@ import numpy as np
 import pytest
 from evaluations import confident, draw_maps, in_memory, judge, record_of, rows_of
 
-from ufmstar_torch.anchors.tracker import TrackerConfig
-from ufmstar_torch.eval.engine.anchors import TRUTH_COUNT
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting, setting_from
 from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.figures_cost import STAGES, draw_stages
-from ufmstar_torch.eval.report.figures_curves import (
-    draw_calibration,
-    draw_entropy,
-    draw_error,
-    entropies,
-)
+from ufmstar_torch.eval.report.efficiency import STAGES, draw_stages
+from ufmstar_torch.eval.report.figures_calibration import draw_calibration
+from ufmstar_torch.eval.report.figures_error import draw_entropy, draw_error, entropies
 from ufmstar_torch.eval.report.figures_sweep import default_value, draw_sweep, sweep_lines, sweeps
-from ufmstar_torch.eval.report.means import difference, mean_of
-from ufmstar_torch.eval.report.names import NLL
+from ufmstar_torch.eval.report.quantities import NLL, difference, mean_of
 from ufmstar_torch.eval.report.style import (
     line_style,
     new_figure,
@@ -47,7 +40,7 @@ def results() -> Results:
         variances = {row: draw_maps(row, sequence)[1] for row in (ALONE, UFM)}
         references = {row.method.name: confident(v) for row, v in variances.items() if v is not None}
         for row in ROWS:
-            judged, _ = judge(draw_maps(row, sequence), references)
+            judged = judge(draw_maps(row, sequence), references)
             records.append(record_of("own", "rooms", sequence, row, judged))
             merged.setdefault(("rooms", row), judged.curves)
     empty = in_memory({(row, ("rooms", "a")): {} for row in ROWS})
@@ -220,7 +213,6 @@ def test_the_overlap_figure_shows_the_improvement_in_nll_with_its_zero_line() ->
 # ---- sweeps with anchors ----
 
 STAR = STAR_OF_DEPTH.method
-MOST = TrackerConfig().max_points
 ROTATION_DRIFTS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5)
 
 
@@ -250,23 +242,18 @@ def test_anchored_rows_are_a_line_that_goes_through_the_row_without_noise(anchor
     tracked = [line for line in lines if dict(line.rest) == {"anchors": "corners"}]
     assert list(tracked[0].points) == pytest.approx(values)
     assert [r.row for r in tracked[0].points[default_value(name)]] == [row(anchors="corners")]
-    assert tracked[0].words == "anchored"
+    assert tracked[0].words == "anchors corners"
     # The line of plain UfM* has no other row's points.
     (alone,) = (line for line in lines if line.method == STAR and not line.rest)
     assert not any(r.row.setting.anchors for records in alone.points.values() for r in records)
 
 
-def test_numbers_of_anchors_begin_with_none(anchored):
+def test_numbers_of_anchors_are_lines_of_the_rows_that_state_one(anchored):
     lines = {line.words: line for line in sweep_lines(anchored, "depth_only", "anchor_count") if len(line.points) > 1}
-    assert set(lines) == {"anchored", "truth anchors"}
-    assert list(lines["truth anchors"].points) == [0, 5, 20, 100, 300]
-    assert list(lines["anchored"].points) == [0, 5, 20, MOST]
-    # Without a row for 0, plain UfM* is that point. A row without a number has the tracker's default number.
-    assert lines["anchored"].points[0][0].row == Row(STAR)
-    assert lines["anchored"].points[MOST][0].row == row(anchors="corners")
-    assert lines["truth anchors"].points[0][0].row == row(anchors="truth", anchor_count=0)
-    both = results_of([row(anchors="truth"), *(row(anchors="truth", anchor_count=n) for n in (0, 20))])
-    assert list(sweep_lines(both, "depth_only", "anchor_count")[0].points) == [0, 20, TRUTH_COUNT]
+    assert {words: list(line.points) for words, line in lines.items()} == {
+        "anchors truth": [0, 5, 20, 100, 300],
+        "anchors corners": [5, 20],
+    }
 
 
 def test_words_and_switches_are_no_values():

@@ -1,8 +1,7 @@
-"""Pictures of a report: strips, breakdowns, comparisons and rooms show the right numbers."""
+"""Pictures of a report: strips, breakdowns and comparisons show the right numbers."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +9,6 @@ import numpy as np
 import pytest
 import torch
 from evaluations import KITCHEN, SHAPE
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from PIL import Image
 
 from ufmstar_torch.eval.metrics import NLL
@@ -21,20 +18,11 @@ from ufmstar_torch.eval.report.pictures import (
     BREAKDOWN,
     COMPARE,
     NLL_SCALE,
-    ROOM,
     STRIP,
     draw_comparison,
     draw_strip,
     fit_strip_scales,
     pictures_of,
-)
-from ufmstar_torch.eval.report.rooms import (
-    SIGMAS,
-    Snapshot,
-    draw_room,
-    find_rooms,
-    oblique_view,
-    project,
 )
 from ufmstar_torch.eval.run.colours import INVALID_GREY
 
@@ -150,81 +138,10 @@ class TestCompare:
         assert ((colours[..., 0] > 80) & (colours[..., 1] < 20) & (colours[..., 2] < 50)).sum() > 500
 
 
-class TestProjection:
-    @settings(max_examples=25)
-    @given(st.integers(0, 2**32 - 1))
-    def test_the_ellipse_reaches_as_far_as_the_gaussian(self, seed: int) -> None:
-        """In every direction n of the picture the ellipse extends to ``sigmas`` sqrt(n^T P S P^T n), as the marginal
-        does."""
-        rng = np.random.default_rng(seed)
-        R, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-        A = rng.normal(size=(4, 3, 3))
-        covariance = A @ A.transpose(0, 2, 1)
-        axes, angle = project(R, covariance)
-        for direction in np.linspace(0, np.pi, 7):
-            n = np.cos(direction) * R[0] + np.sin(direction) * R[1]
-            expected = SIGMAS * np.sqrt(np.einsum("i,kij,j->k", n, covariance, n))
-            off = direction - np.radians(angle)
-            a, b = axes.T
-            np.testing.assert_allclose(np.hypot(a * np.cos(off), b * np.sin(off)), expected, rtol=1e-9)
-
-
-def snapshot(frame: str, mean: list[list[float]], m: list[float], sigma: float = 0.3) -> Snapshot:
-    covariance = np.eye(3)[None].repeat(len(m), 0) * sigma**2
-    return Snapshot(
-        frame, np.array(mean).reshape(-1, 3), covariance, np.array(m), np.full(len(m), 2), np.eye(4), np.zeros((1, 3))
-    )
-
-
-class TestRooms:
-    def pixels(self, path: Path, snapshots: list[Snapshot], *roots: float) -> int:
-        """Pixels where Gaussians with these sqrt(m) [m] overlap, the last one on top."""
-        scale = draw_room(path, snapshots, "room")
-        colour = np.full(3, 255.0)
-        for root in roots:
-            colour = 0.85 * scale.rgb(np.array(root)).astype(float) + 0.15 * colour
-        with Image.open(path) as picture:
-            drawn = np.asarray(picture.convert("RGB")).astype(int)
-        return int((np.abs(drawn[70:-70] - colour).max(-1) <= 2).sum())  # without title and colour bar
-
-    def test_the_nearest_is_painted_last(self, tmp_path: Path) -> None:
-        away = [0.0, 0.0, 2.0] - 2 * oblique_view(np.eye(4)[None])[0][2]
-        near, far = ([0.0, 0.0, 2.0], 4.0), (away.tolist(), 0.25)
-        for one, other in ((near, far), (far, near)):
-            room = [snapshot("f", [one[0], other[0]], [one[1], other[1]])]
-            assert self.pixels(tmp_path / "r.png", room, 0.5, 2.0) > 300
-            assert self.pixels(tmp_path / "r.png", room, 2.0, 0.5) == 0
-
-    def test_the_ceiling_is_taken_off(self, tmp_path: Path) -> None:
-        one = snapshot("f", [[0, 0.2, 2], [2, -1.0, 2]], [0.25, 4.0])  # up is -y
-        higher = replace(one, path=np.array([[0, -0.9, 0]]))
-        assert self.pixels(tmp_path / "r.png", [one], 0.5) > 300
-        assert self.pixels(tmp_path / "r.png", [one], 2.0) == 0
-        assert self.pixels(tmp_path / "r.png", [higher], 2.0) > 300
-
-    def test_snapshots_are_found_in_order(self, tmp_path: Path) -> None:
-        (tmp_path / "room").mkdir()
-        maps = {"mean_world": np.zeros((0, 3)), "covariance_world": np.zeros((0, 3, 3)), "disagreement": np.zeros(0)}
-        maps["views"] = np.zeros(0)
-        for name in ("UfMstar-Ensemble_frame_10", "UfMstar-Ensemble_frame_9", "UfMstar-MCD@ab_frame_1"):
-            path = np.zeros((int(name.rpartition("_")[2]), 3))
-            np.savez(tmp_path / "room" / f"{name}.npz", **maps, T_world_cam=np.eye(4), path=path)
-        rooms = find_rooms(tmp_path)
-        assert {row: [s.frame for s in result] for row, result in rooms.items()} == {
-            "UfMstar-Ensemble": ["frame_9", "frame_10"],
-            "UfMstar-MCD@ab": ["frame_1"],
-        }
-        with pytest.raises(ValueError, match="at least one Gaussian"):
-            draw_room(tmp_path / "x.png", rooms["UfMstar-Ensemble"], "empty")
-        np.savez(tmp_path / "room" / "UfMstar-MCD_1.npz", mean_world=np.zeros((0, 3)))
-        with pytest.raises(ValueError, match=r"UfMstar-MCD_1\.npz must hold mean_world.*; covariance_world"):
-            find_rooms(tmp_path)
-
-
 class TestWritePictures:
     def test_all_kinds_with_their_words(self, evaluation: Path, tmp_path: Path) -> None:
         sequence = KITCHEN[1]  # not a valid folder name
         pictures = [draw() for _, draw in pictures_of(load_results(evaluation, with_sums=False), tmp_path)]
-        assert [p.file.partition("-")[0] for p in pictures] == [STRIP, BREAKDOWN, COMPARE, ROOM]
+        assert [p.file.partition("-")[0] for p in pictures] == [STRIP, BREAKDOWN, COMPARE]
         assert all((evaluation / "figures" / p.file).is_file() for p in pictures)
         assert all(p.title.startswith(sequence) for p in pictures)

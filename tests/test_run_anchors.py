@@ -259,6 +259,14 @@ def test_pictures_have_a_column_for_what_anchors_add(tour, finished):
     assert [column.label for column in map_columns([panel])] == ["depth", "σ", "√B", "|error|"]
 
 
+def saved_depths(tour, folder):
+    """The tour's depth, one npy a frame, as a program would predict it."""
+    folder.mkdir()
+    for frame in tour:
+        np.save(folder / f"{frame.name}.npy", frame.depth)
+    return str(folder)
+
+
 def test_images_are_needed(tour, monkeypatch, tmp_path, caplog):
     words = [TOUR, "--depth", "self", "--out", str(tmp_path / "out")]
     blind = with_entries(tour, lambda _, e: dataclasses.replace(e, load_image=None))
@@ -266,6 +274,7 @@ def test_images_are_needed(tour, monkeypatch, tmp_path, caplog):
     with pytest.raises(ValueError, match=r"--anchors corners searches images, of which the sequence .* has none"):
         job_from(read([*words, "--anchors", "corners"]), TOUR)
     assert not caplog.messages
+    words[2] = saved_depths(tour, tmp_path / "maps")
     job = job_from(read(words), TOUR)
     assert job.config.posterior is job.config.anchors is None
     assert job.settings["plain"] is True
@@ -275,8 +284,8 @@ def test_images_are_needed(tour, monkeypatch, tmp_path, caplog):
     assert not caplog.messages
 
 
-def test_the_default_is_the_posterior_with_dense_evidence_and_plain_is_ufm_star_alone(tour):
-    words = [TOUR, "--depth", "self", "--out", "out"]
+def test_the_default_is_the_posterior_with_dense_evidence_and_plain_is_ufm_star_alone(tour, tmp_path):
+    words = [TOUR, "--depth", saved_depths(tour, tmp_path / "maps"), "--out", "out"]
     jobs = {option: job_from(read([*words, *option.split()]), TOUR) for option in ("", "--plain", "--anchors corners")}
     assert {option: job.landmarks for option, job in jobs.items() if job.config.posterior} == {
         "": "dense",
@@ -286,3 +295,15 @@ def test_the_default_is_the_posterior_with_dense_evidence_and_plain_is_ufm_star_
     ranked = rank.read([TOUR, "--depth", "self", "--out", "out"])
     assert ranked.config.anchors is ranked.config.posterior is None
     assert rank.read([TOUR, "--depth", "self", "--out", "out", "--anchors", "dense"]).config.anchors is not None
+
+
+@pytest.mark.parametrize("depth", ["self", "ground-truth"])
+def test_the_recordings_own_depth_is_not_corrected_unless_anchors_are_named(depth, caplog):
+    """A correction by depths that are searched in images makes a perfect depth worse."""
+    words = [TOUR, "--depth", depth, "--out", "out"]
+    plain = job_from(read(words), TOUR)
+    assert plain.config == UfMStarConfig(on_bad_frame="skip")
+    assert [text for text in caplog.messages if "the recording's own depth is not corrected" in text]
+    assert plain.settings["plain"] is True
+    for option in (["--anchors", "dense"], ["--set", "posterior.half_life=9"]):
+        assert job_from(read([*words, *option]), TOUR).config.posterior is not None

@@ -15,7 +15,6 @@ from segment_scenes import REFERENCES, camera, clutter, reference, run_oracle
 from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.steps import segment, segment_fusion
-from ufmstar_torch.steps.segment_input import SegmentInput
 
 pytestmark = pytest.mark.numerics
 
@@ -218,16 +217,16 @@ def test_static_bounds_change_nothing(monkeypatch):
     """The loops and tables of an accelerator, run on the CPU."""
     depth, K = (torch.cat(parts) for parts in zip(clutter(8, 14, 22), clutter(9, 14, 22), strict=True))
     config = SPGFConfig(sparse=2, min_pixels=12, min_rows=3, scale_with_image=False)
-    inputs = [SegmentInput.of(depth, K, one) for one in (config, unpruned(config))]
-    expected = [segment.segment(one) for one in inputs]
+    limits = config, unpruned(config)
+    expected = [segment.segment(depth, K, one) for one in limits]
     monkeypatch.setattr(segment_fusion, "reads_are_free", lambda device: False)
     monkeypatch.setattr(segment, "reads_are_free", lambda device: False)
-    for one, (mixture, labels) in zip(inputs, expected, strict=True):
-        static, static_labels = segment.segment(one)
+    for one, (mixture, labels) in zip(limits, expected, strict=True):
+        static, static_labels = segment.segment(depth, K, one)
         assert torch.equal(labels, static_labels)
         for name, value in mixture.padded(static.capacity).tensors().items():
             torch.testing.assert_close(static.tensors()[name], value, rtol=1e-13, atol=1e-15, msg=name)
-        assert static.capacity == (14 * 7 if one.config.prune == "none" else 14 * 22 // 9)
+        assert static.capacity == (14 * 7 if one.prune == "none" else 14 * 22 // 9)
 
 
 @pytest.mark.parametrize("prune", ["both", "either", "none"])
@@ -237,7 +236,7 @@ def test_no_value_is_read_on_other_devices(prune):
     depth = torch.empty(b, height, width, device="meta")
     config = SPGFConfig(sparse=2, min_pixels=7, min_rows=2, prune=prune, scale_with_image=False)
     features = torch.empty(b, 4, height, width, device="meta")
-    mixture, labels = segment.segment(SegmentInput.of(depth, torch.empty(b, 3, 3, device="meta"), config, features))
+    mixture, labels = segment.segment(depth, torch.empty(b, 3, 3, device="meta"), config, features)
     assert labels.shape == depth.shape
     assert mixture.capacity == {"both": 54 // 6, "either": 54 // 7, "none": 18}[prune]
     assert mixture.features.shape == (b, mixture.capacity, 4)

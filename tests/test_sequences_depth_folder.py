@@ -7,6 +7,7 @@ import pytest
 from layouts import truncate, write_depth_png
 
 from ufmstar_torch.eval.sequences import DepthFolder, FrameError
+from ufmstar_torch.eval.sequences.images import read_depth
 
 NAMES = ("000000_left", "000001_left", "000002_left")
 DEPTHS = [np.full((3, 4), value) for value in (1.0, 2.0, 3.0)]
@@ -30,6 +31,18 @@ def test_png_scale_is_given_or_in_the_file(tmp_path):
     assert values(DepthFolder(tmp_path / "b").for_frames(NAMES)) == [1, 2, 3]
     with pytest.raises(ValueError, match=r"^scale is in metres per unit"):
         DepthFolder(tmp_path / "b", scale=4000)
+
+
+def test_a_scale_that_the_file_contradicts_is_refused(tmp_path):
+    write_pngs(tmp_path, NAMES, units=4000, scale_text="0.00025")
+    assert values(DepthFolder(tmp_path, scale=1 / 4000).for_frames(NAMES)) == [1, 2, 3], "the same unit"
+    contradiction = (
+        r"000000_left\.png: its text depth_scale states 0\.00025 metres per unit, which contradicts .* 0\.001"
+    )
+    with pytest.raises(ValueError, match=rf"^scale: .*{contradiction}"):
+        DepthFolder(tmp_path, scale=1e-3)
+    with pytest.raises(FrameError, match=contradiction):
+        read_depth(tmp_path / f"{NAMES[0]}.png", scale=1e-3)
 
 
 @pytest.mark.parametrize(

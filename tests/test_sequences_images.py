@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import subprocess
+import sys
 import tracemalloc
 import zipfile
 import zlib
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -293,3 +296,12 @@ def test_only_a_bare_exception_of_the_png_decoder_leaves_the_file_to_pillow(tmp_
     fails(kind("no memory"))
     with pytest.raises(kind, match="no memory"):
         read_color(tmp_path / "a.png")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are text")
+def test_a_name_that_is_not_utf_8(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 256, (4, 5, 3), np.uint8)
+    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/1\xff.png"))
+    with path.open("wb") as file:
+        Image.fromarray(pixels).save(file, "PNG")
+    np.testing.assert_array_equal(read_color(path), pixels)

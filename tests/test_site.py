@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import importlib
-import os
 import re
-import shutil
-import subprocess
-import sys
 import tomllib
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -77,28 +73,6 @@ def test_docstrings_keep_their_brackets(pages: Any) -> None:
         "depth [B, H, W] [m], see :func:`f` and ``a[0]*b``: UfM*"
     )
     assert text == r"depth \[B, H, W\] \[m\], see `f` and ``a[0]*b``: UfM\*"
-
-
-@pytest.mark.slow
-def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
-    pytest.importorskip("mkdocs", reason="needs the extra docs")
-    pytest.importorskip("material", reason="needs the extra docs")
-    flat = tmp_path / "flat" / "ufmstar_torch"
-    shutil.copytree(ROOT / "ufmstar_torch", flat)
-    for name in ("models", "eval", "train"):
-        shutil.copytree(ROOT / name, flat / name)
-    config = (ROOT / "mkdocs.yml").read_text().replace("docs_dir: docs", f"docs_dir: {DOCS}")
-    config = config.replace("[docs/site_", f"[{DOCS}/site_").replace("[build/flat]", f"[{flat.parent}]")
-    (tmp_path / "mkdocs.yml").write_text(config)
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
-    command += ["--config-file", str(tmp_path / "mkdocs.yml")]
-    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=environment)
-    assert done.returncode == 0, done.stderr
-    core = (tmp_path / "site" / "reference" / "core.html").read_text()
-    assert 'id="ufmstar_torch.ufmstar.UfMStar"' in core
-    assert "[B, H, W]" in core
-    assert (tmp_path / "site" / "search" / "search_index.json").stat().st_size > 100_000
 
 
 # ---- workflows and what GitHub reads ----

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
 import zipfile
 import zlib
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +16,19 @@ import torch
 from torch import nn
 
 from ufmstar_torch import UfMStarConfig
+from ufmstar_torch.anchors.sources import landmark_source
+from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.frame import FrameError, parse_size
 from ufmstar_torch.eval.sequences.images import image_size, read_color, read_depth
+from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
+from ufmstar_torch.eval.sequences.poses import read_trajectory
+from ufmstar_torch.eval.suite.work_items import read_names
 from ufmstar_torch.files.limits import MOST_BYTES, MOST_PIXELS
 from ufmstar_torch.models import CheckpointError, NetworkSpec, OnnxNetwork, Preprocess, from_hugging_face, load_trained
 from ufmstar_torch.models.checkpoints import load_state_dict_file
+from ufmstar_torch.models.outputs import ProgramSpec
+from ufmstar_torch.posterior.recalibrate import Recalibration
 
 LIMIT = r"more than the limit of [\d,]+"
 
@@ -160,8 +169,9 @@ def test_a_tensor_inside_an_onnx_graph(tmp_path, kind):
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
-        ({"fusion_hidden_size": 40_000}, "config.json states a model of [0-9,]+ bytes, its weights have [0-9,]+"),
+        ({"fusion_hidden_size": 40_000}, r"config\.json states a model of [0-9,]+ bytes, its weights have [0-9,]+"),
         ({"backbone_config": {"num_hidden_layers": 10**9}}, "states 1000000000 layers, at most 1000 can be"),
+        ({"fusion_hidden_size": -3}, r"cannot be loaded as a depth model"),
     ],
 )
 def test_a_configuration_of_transformers(tmp_path, changes, match):
@@ -174,3 +184,40 @@ def test_a_configuration_of_transformers(tmp_path, changes, match):
     (folder / "config.json").write_text(json.dumps(config))
     with pytest.raises(CheckpointError, match=match):
         from_hugging_face(folder)
+
+
+READS = {
+    "trajectory": read_trajectory,
+    "landmarks": landmark_source,
+    "recalibration": Recalibration.from_json,
+    "suite": suite_named,
+    "settings of a network": ProgramSpec.from_json,
+    "list of sequences": read_names,
+}
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="this system has no /dev/zero")
+@pytest.mark.parametrize("read", READS.values(), ids=READS)
+def test_a_file_without_an_end(read, tmp_path):
+    """A device, and a pipe that nobody writes to."""
+    suffix = "toml" if read is suite_named else "txt"
+    endless, pipe = tmp_path / f"endless.{suffix}", tmp_path / f"pipe.{suffix}"
+    endless.symlink_to("/dev/zero")
+    os.mkfifo(pipe)
+    for path in (endless, pipe):
+        with pytest.raises(ValueError, match="must be a file, got a device or a pipe"):
+            read(str(path))
+
+
+def test_the_mark_of_editors_on_windows_is_no_content(tmp_path):
+    mark = b"\xef\xbb\xbf"
+    (tmp_path / "poses.txt").write_bytes(mark + b"0 1 2 3 0 0 0 1\r\n1 1 2 4 0 0 0 1\r\n")
+    trajectory = read_trajectory(tmp_path / "poses.txt")
+    assert trajectory.timestamps.tolist() == [0, 1]
+    assert trajectory.T_world_cam[0, :3, 3].tolist() == [1, 2, 3]
+    (tmp_path / "K.txt").write_bytes(mark + b"60 61 32 24\r\n")
+    np.testing.assert_array_equal(read_intrinsics(tmp_path / "K.txt"), [[60, 0, 32], [0, 61, 24], [0, 0, 1]])
+    (tmp_path / "suite.toml").write_bytes(
+        mark + files("ufmstar_torch.eval.methods").joinpath("suites/demo.toml").read_bytes()
+    )
+    assert suite_named(str(tmp_path / "suite.toml")).rows == suite_named("demo").rows

@@ -16,7 +16,7 @@ import scenes
 from ufmstar_torch import AnchorConfig, SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.frames.frame import check_values
-from ufmstar_torch.kernels.cpu import threads as threads_cpu
+from ufmstar_torch.kernels.cpu import calls
 
 pytestmark = pytest.mark.numerics
 
@@ -152,9 +152,9 @@ def frames(count: int, config: UfMStarConfig, dtype: torch.dtype, streams: int =
 
 def tensors(out) -> dict[str, torch.Tensor]:
     """Return the tensors of a frame's output by name."""
-    result = {f"statistics.{name}": value for name, value in vars(out.statistics).items()}
+    result = {f"statistics.{name}": value for name, value in out.statistics.counts.items()}
     result |= {f"current_cam.{name}": value for name, value in out.current_cam.tensors().items()}
-    return {name: value for name, value in (result | vars(out)).items() if isinstance(value, torch.Tensor)}
+    return {name: value for name, value in (result | vars(out) | out.maps).items() if isinstance(value, torch.Tensor)}
 
 
 def assert_same(one, other, rows=slice(None)) -> None:
@@ -204,7 +204,7 @@ def test_agrees_with_the_reference(compiled_backend, name, dtype, tolerance):
 @ON_CPU
 @pytest.mark.parametrize("name", CONFIGS)
 def test_a_stream_gives_the_same_bits_alone_and_on_any_number_of_threads(backend, name, monkeypatch):
-    monkeypatch.setattr(threads_cpu, "_SHARE", 4 * 64)  # pixels; up to three parts of a stream
+    monkeypatch.setattr(calls, "_SHARE", 4 * 64)  # pixels; up to three parts of a stream
     config = CONFIGS[name].replace(on_bad_frame="skip", backend=backend.name)
     counts = (1, 2, 3) if backend.name == "numba" else (1,)  # torch's sums are not deterministic
     # The reference processes an image row by row, so the images have few rows.

@@ -39,8 +39,8 @@ def test_an_evaluation_ends_with_its_table_and_report(ufmstar, rooms, tmp_path):
     out = tmp_path / "out"
     code, text, err = ufmstar(*words_for(rooms, out, "--frames", "0:2", "--examples", "1"))
     assert code == 0, err
-    assert all(name in text for name in ("DepthOnly", "UfM-DepthOnly-100K", "UfM\\*-DepthOnly"))
-    assert (out / "tables" / "main.md").is_file()
+    assert all(name in text for name in ("DepthOnly", "UfM-DepthOnly-100K", "UfM*-DepthOnly"))
+    assert (out / "tables" / "main.tex").is_file()
     assert err.count("rooms/") == 3
     about = json.loads((out / "eval.json").read_text())
     assert about["settings"] == {"frames": [0, 2, None]}

@@ -90,7 +90,7 @@ def test_a_row_equals_a_loop_by_hand(base, network_files, networks, sequence):
         by_hand = judged(sequence, through(estimator, members, sequence))
         assert agrees(result[one.slug].figures, by_hand)
     ufm, components = hands[2], int(hands[0].mixture.components)
-    assert result[rows[2].slug].state["bytes_end"] == 40 * len(ufm.cloud.count) == 40_000
+    assert result[rows[2].slug].state["bytes_end"] == 40 * len(ufm.clouds[0].count) == 40_000
     assert result[rows[0].slug].state["count_end"] == components
     assert result[rows[0].slug].state["bytes_end"] == 84 * components
     assert result[rows[0].slug].state["smoothing_bytes"] == 4 * 32 * 64

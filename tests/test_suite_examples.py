@@ -1,4 +1,4 @@
-"""The maps and mixtures of pictures belong to the named frame."""
+"""The maps of pictures belong to the named frame."""
 
 from __future__ import annotations
 
@@ -67,26 +67,6 @@ def test_the_image_is_what_the_network_saw(folder, networks, sequence):
     assert np.abs(shown - seen).mean() < 4, "grey levels"
 
 
-def test_rooms_in_the_world(folder, networks, sequence):
-    names = sorted(file.name for file in (folder / "room").iterdir())
-    assert names == sorted(f"UfMstar-Aleatoric_{sequence.names[i]}.npz" for i in (1, 2, 5))
-    ufm = UfMStar()
-    for frame in sequence:
-        p = unbatched(networks["aleatoric"], frame)
-        ufm(p.depth[None], torch.from_numpy(frame.T_world_cam), p.intrinsics, p.aleatoric[None])
-    stored = read(folder / "room" / f"UfMstar-Aleatoric_{sequence.names[5]}.npz")
-    mixture, T = ufm.mixture, ufm.T_world_first[0]
-    used = mixture.valid[0]
-    mean = mixture.mean[0][used].double() @ T[:3, :3].T + T[:3, 3]
-    covariance = T[:3, :3] @ mixture.covariance[0][used].double() @ T[:3, :3].T
-    np.testing.assert_allclose(stored["mean_world"], mean, atol=1e-12)
-    np.testing.assert_allclose(stored["covariance_world"], covariance, atol=1e-12)
-    np.testing.assert_array_equal(stored["weight"], mixture.weight[0][used])
-    np.testing.assert_array_equal(stored["disagreement"], mixture.disagreement[0][used])
-    np.testing.assert_array_equal(stored["T_world_cam"], sequence[5].T_world_cam)
-    np.testing.assert_array_equal(stored["path"], [frame.T_world_cam[:3, 3] for frame in sequence])
-
-
 def test_a_broken_frame_hands_its_place_to_the_next(networks, tmp_path):
     path = write_generic(tmp_path, frames=6)[0]
     sequence = open_sequence(path)
@@ -96,8 +76,6 @@ def test_a_broken_frame_hands_its_place_to_the_next(networks, tmp_path):
     assert {file.name.partition(".")[0] for file in (tmp_path / "out" / "examples").glob("*[0-9].npz")} == {
         sequence.names[i] for i in (0, 3, 4)
     }
-    rooms = {file.name for file in (tmp_path / "out" / "room").iterdir()}
-    assert rooms == {f"UfMstar-Aleatoric_{sequence.names[i]}.npz" for i in (1, 3, 4)}
 
 
 def test_maps_of_another_camera_bring_their_own(networks, sequence, tmp_path):

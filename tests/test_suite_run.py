@@ -15,10 +15,10 @@ from tiny_suite import NAMES, TRUTH, Stub, evaluate, go, job_on, rows_of, stored
 from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.engine.evaluate import SequenceError, evaluate_sequence
 from ufmstar_torch.eval.engine.predictions import CacheError, content_digest
+from ufmstar_torch.eval.engine.record import Record
 from ufmstar_torch.eval.report.data import load_results
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.suite.evaluate import with_references
-from ufmstar_torch.eval.suite.record import Record
 
 
 @pytest.fixture(scope="module")
@@ -180,11 +180,11 @@ def test_another_sequence_of_the_name_is_refused(tmp_path):
 def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, whole, monkeypatch):
     job, saved, write = job_on(rooms, tmp_path / "out"), [], Record.save
 
-    def save(self, path, sums):
+    def save(self, path):
         if len(saved) == 6:
             raise KeyboardInterrupt
         saved.append(path)
-        write(self, path, sums)
+        write(self, path)
 
     monkeypatch.setattr(Record, "save", save)
     with pytest.raises(KeyboardInterrupt):

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from layouts import write_seven_scenes
 from tiny_suite import NAMES, go, job_on, write_rooms
 
+from ufmstar_torch.eval.engine.record import pack, unpack
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
-from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
 from ufmstar_torch.eval.run.folder import FolderError, hold
 from ufmstar_torch.eval.suite.folder import evaluation_folder
 from ufmstar_torch.eval.suite.work_items import WorkItem, find_work, read_names
@@ -118,7 +118,7 @@ def test_overwriting_removes_our_files_alone(tmp_path):
     for file in users:
         file.parent.mkdir(exist_ok=True)
         file.write_text("mine")
-    made = [out / "tables" / "main.md", out / "results.csv", out / "cache" / "kept"]
+    made = [out / "tables" / "main.tex", out / "results.csv", out / "cache" / "kept"]
     for file in made:
         file.write_text("made")
     enter(out, ABOUT, overwrite=True)

@@ -15,7 +15,7 @@ from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.methods.setting import configured, default_of
 from ufmstar_torch.eval.methods.suite import names, suite_named
 from ufmstar_torch.eval.report.data import listed_rows
-from ufmstar_torch.eval.report.names import row_labels
+from ufmstar_torch.eval.report.quantities import row_labels
 
 # The rows of the paper's tables, copied.
 TABLE_1 = """

@@ -11,25 +11,22 @@ import pytest
 import torch
 from scipy.stats import spearmanr
 from training_data import PLAIN
-from trainings import SPEC, tiny_job
+from trainings import SPEC, tiny_job, trained
 
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.tour.sequence import open_tour
 from ufmstar_torch.models import GaussianDepth
-from ufmstar_torch.models.trained import load_for_training
 from ufmstar_torch.train import (
     DataConfig,
     DepthDataModule,
-    EpochBatches,
     Job,
     Recipe,
     SequenceFrames,
 )
-from ufmstar_torch.train import data as training_data_module
 from ufmstar_torch.train.distil import Teacher, distillation_sums
-from ufmstar_torch.train.member import WEIGHTS, make_data, new_network, train_member
-from ufmstar_torch.train.samples import clips
+from ufmstar_torch.train.member import make_data, new_network, train_member
+from ufmstar_torch.train.samples import SampleDataset, clips, joined
 
 CLIP, SIZE, FRAMES = 4, (48, 64), 16
 # [m] The depth of a full green channel.
@@ -73,11 +70,7 @@ def room():
 
 def batch_of(source):
     """All clips of a source as one batch."""
-    data = DepthDataModule(DataConfig(augmentation=None), PLAIN, CLIP, clip_frames=CLIP)
-    data.train_set = training_data_module.SampleDataset(source, PLAIN)
-    chosen = [frame for clip in clips(source, CLIP) for frame in clip]
-    samples = [data.train_set[i] for i in chosen]
-    return {name: torch.stack([sample[name] for sample in samples]) for name in samples[0]}
+    return joined(list(SampleDataset(source, PLAIN, clips(source, CLIP))))
 
 
 def correlation(network, batch):
@@ -97,11 +90,10 @@ def test_a_fastdepth_comes_to_state_it_too(tmp_path):
     settings = tiny_job(tmp_path, tmp_path / "out", recipe).settings
     job = Job(recipe, data, settings)
     opened = make_data(job, 0, 1)
-    samples = [opened.train_set[frame] for clip in opened.clips for frame in clip]
-    batch = {name: torch.stack([sample[name] for sample in samples]) for name in samples[0]}
+    batch = joined(list(opened.train_set))
     before = correlation(new_network(job, 0), batch)
-    assert train_member(job, 0) is None
-    after = correlation(load_for_training(job.folder(0) / WEIGHTS)[0], batch)
+    train_member(job, 0)
+    after = correlation(trained(job), batch)
     print(f"Spearman {before:.2f} before, {after:.2f} after")
     # Measured over three seeds: -.04 to .04 before, .37 to .39 after.
     assert after > before + 0.1
@@ -157,11 +149,13 @@ def test_the_loss_is_the_sum_by_hand_and_its_minimum_lies_at_the_variance():
 def test_clips_are_whole_and_every_frame_is_in_one_batch(room):
     found = clips(SequenceFrames([coded(), coded()], "0:14"), CLIP)
     assert [list(clip) for clip in found] == [list(range(n, n + 4)) for n in (0, 4, 8, 14, 18, 22)]
-    parts = [EpochBatches(6, 1, seed=2, rank=rank, world=2, clips=found) for rank in (0, 1)]
-    steps = list(zip(*parts, strict=True))
-    assert len(steps) == 3
-    frames = [[key.frame for key in batch] for step in steps for batch in step]
-    assert sorted(frames) == [list(clip) for clip in found]
+    data = DepthDataModule(DataConfig(augmentation=None), PLAIN, 2 * CLIP, clip_frames=CLIP)
+    data.train_set = SampleDataset(room, PLAIN, clips(room, CLIP))
+    batches = [batch["T_world_cam"] for batch in data.train_dataloader()]
+    assert [len(batch) for batch in batches] == [2 * CLIP, 2 * CLIP]
+    seen = [pose for batch in batches for pose in batch.unflatten(0, (2, CLIP))]
+    poses = torch.stack([torch.from_numpy(room.load(i).T_world_cam) for i in range(FRAMES)]).unflatten(0, (-1, CLIP))
+    assert sorted(int((poses == clip).all((1, 2, 3)).nonzero()) for clip in seen) == [0, 1, 2, 3]
     truth = truth_at(room.sequences[0][3], room.sequences[0].intrinsics, SIZE)
     np.testing.assert_array_equal(room.load(3).depth, truth)
     np.testing.assert_array_equal(room.load(3).T_world_cam, room.sequences[0][3].T_world_cam)

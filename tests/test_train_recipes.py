@@ -13,9 +13,8 @@ from torch import nn
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.train import PRESETS, DataConfig, FitSettings, Job, Recipe, preset
 from ufmstar_torch.train.member import new_network
-from ufmstar_torch.train.module import move_average, share_of_rate
+from ufmstar_torch.train.module import TrainingModule, averaging, learning_rates
 from ufmstar_torch.train.presets import TRAINING
-from ufmstar_torch.train.progress import Sums, Validation
 
 
 def test_every_method_of_the_paper_is_a_preset_of_both_architectures():
@@ -57,64 +56,84 @@ def test_ensembles_of_different_seeds_share_no_member(tmp_path):
         Recipe(members=1001)
 
 
-def test_the_learning_rate_rises_and_falls_as_a_cosine():
-    recipe = Recipe(warmup_steps=4)
-    rates = [share_of_rate(step, 24, recipe) for step in range(24)]
-    assert rates[:4] == pytest.approx([0.2, 0.4, 0.6, 0.8])
-    assert rates[4:] == pytest.approx([(1 + math.cos(math.pi * n / 20)) / 2 for n in range(20)])
-    assert share_of_rate(30, 24, recipe) == 0
-    assert share_of_rate(1000, 24, replace(recipe, schedule="constant")) == 1
+def rates(recipe, total):
+    """The learning rates of all steps, relative to the recipe's."""
+    optimizer = torch.optim.SGD([torch.zeros(1)], recipe.learning_rate)
+    schedule, found = learning_rates(optimizer, recipe, total), []
+    for _ in range(total):
+        found.append(optimizer.param_groups[0]["lr"] / recipe.learning_rate)
+        optimizer.step()
+        schedule.step()
+    return found
+
+
+@pytest.mark.parametrize("warm", [4, 0])
+def test_the_learning_rate_rises_and_falls_as_a_cosine(warm):
+    recipe = Recipe(warmup_steps=warm)
+    found = rates(recipe, warm + 20)
+    assert found[:warm] == pytest.approx([0.2, 0.4, 0.6, 0.8][:warm])
+    assert found[warm:] == pytest.approx([(1 + math.cos(math.pi * n / 20)) / 2 for n in range(20)])
+    assert rates(replace(recipe, schedule="constant"), 30)[warm:] == pytest.approx([1.0] * (30 - warm))
 
 
 def test_the_running_mean_is_the_one_by_hand():
-    averaged, network = nn.BatchNorm1d(2), nn.BatchNorm1d(2)
-    expected = torch.ones(2)
+    """The first step's weights, and then a mean that remembers more and more."""
+    module = nn.BatchNorm1d(2)
+    callback = averaging(0.15)
+    mean = torch.optim.swa_utils.AveragedModel(module, use_buffers=True, **callback._kwargs)
+    expected = 0.0
     for n in range(5):
         with torch.no_grad():
-            network.weight.fill_(n)
-            network.num_batches_tracked.fill_(n)
-        move_average(averaged, network, 0.75)
-        expected = 0.75 * expected + 0.25 * n
-    torch.testing.assert_close(averaged.weight.detach(), expected)
-    assert averaged.num_batches_tracked == 4
+            module.weight.fill_(n)
+            module.running_mean.fill_(-n)
+            module.num_batches_tracked.fill_(n)
+        mean.update_parameters(module)
+        factor = min(0.15, (n + 1) / (n + 11))
+        expected = factor * expected + (1 - factor) * n
+    torch.testing.assert_close(mean.module.weight.detach(), torch.full((2,), expected))
+    torch.testing.assert_close(mean.module.running_mean, torch.full((2,), -expected))
+    assert mean.module.num_batches_tracked == 4
 
 
-def test_the_yardstick_is_the_likelihood_of_one_variance():
+class Fixed(nn.Module):
+    """A network that returns predictions one after the other."""
+
+    def __init__(self, *predictions):
+        super().__init__()
+        self.predictions = iter(predictions)
+
+    def forward(self, image):
+        return next(self.predictions)
+
+
+def test_the_figures_of_a_validation_are_those_by_hand(monkeypatch):
     generator = torch.Generator().manual_seed(0)
     depth = 1 + torch.rand(2, 5, 7, generator=generator, dtype=torch.float64)
     predicted = depth + torch.randn(2, 5, 7, generator=generator, dtype=torch.float64) / 3
     valid = torch.rand(2, 5, 7, generator=generator) < 0.6
-    variance = torch.full_like(depth, 0.3)
-    validation, alone = Validation(), Validation()
-    for n in range(2):
-        maps = (value[n : n + 1] for value in (predicted, 0.25 * variance, 0.75 * variance))
-        validation.update(DepthPrediction(*maps), depth[n : n + 1], valid[n : n + 1])
-    error, truth = (predicted - depth)[valid].numpy(), depth[valid].numpy()
-    figures = validation.figures(Sums(torch.tensor([0.3 * 11, 11], dtype=torch.float64)))
+    variance, truth = torch.full_like(depth, 0.3), torch.where(valid, depth, 0)
+    monkeypatch.setattr(TrainingModule, "log", lambda *_, **__: None)
+
+    def figures(*predictions):
+        module = TrainingModule(Fixed(*predictions), Recipe(), 1)
+        for n in range(len(predictions)):
+            module.validation_step({"image": None, "depth": truth[n : n + 1]}, n)
+        module.on_validation_epoch_end()
+        return module.figures
+
+    maps = [[value[n : n + 1] for value in (predicted, 0.25 * variance, 0.75 * variance)] for n in range(2)]
+    found = figures(*(DepthPrediction(*m) for m in maps))
+    error, goal = (predicted - depth)[valid].numpy(), depth[valid].numpy()
     normal = torch.distributions.Normal(predicted[valid], 0.3**0.5)
-    assert figures["val_nll"] == pytest.approx(-float(normal.log_prob(depth[valid]).mean()), rel=1e-12)
-    # A constant variance has no gain.
-    assert figures["val_nll_constant"] == pytest.approx(figures["val_nll"], rel=1e-12)
-    assert figures["val_rmse"] == pytest.approx(np.sqrt((error**2).mean()))
-    assert figures["val_rel"] == pytest.approx((abs(error) / truth).mean())
-    ratio = np.maximum((truth + error) / truth, truth / (truth + error))
-    assert figures["val_delta1"] == pytest.approx(((ratio < 1.25) & (ratio > 0)).mean())
+    assert found["val_nll"] == pytest.approx(-float(normal.log_prob(depth[valid]).mean()), rel=1e-12)
+    assert found["val_rmse"] == pytest.approx(np.sqrt((error**2).mean()))
+    assert found["val_rel"] == pytest.approx((abs(error) / goal).mean())
+    ratio = np.maximum((goal + error) / goal, goal / (goal + error))
+    assert found["val_delta1"] == pytest.approx(((ratio < 1.25) & (ratio > 0)).mean())
     # The mean squared error is the best constant variance.
-    constants = [
-        validation.figures(Sums(torch.tensor([v, 1.0], dtype=torch.float64)))["val_nll_constant"]
-        for v in np.geomspace(1e-3, 10, 200)
-    ]
-    best = validation.figures(Sums(torch.tensor([(error**2).mean(), 1.0], dtype=torch.float64)))["val_nll_constant"]
-    assert figures["val_nll_constant_best"] == pytest.approx(best)
-    assert best <= min(constants)
-    alone.update(DepthPrediction(predicted), depth, valid)
-    assert "val_nll" not in alone.figures(Sums())
-
-
-def test_the_sums_of_training_steps_need_no_value_before_the_epoch_ends():
-    """A tensor of the device "meta" has no value to wait for."""
-    step = torch.zeros(2, dtype=torch.float64, device="meta")
-    assert Sums().plus(step).plus(step).values.device.type == "meta"
-    sums = Sums().plus(torch.tensor([3.0, 2.0])).plus(torch.tensor([1.0, 6.0]))
-    assert (sums.mean(), sums.pixels) == (0.5, 8.0)
-    assert math.isnan(Sums().mean())
+    constants = [0.5 * (np.log(2 * np.pi * v) + (error**2).mean() / v) for v in np.geomspace(1e-3, 10, 2000)]
+    assert found["val_nll_constant"] == pytest.approx(min(constants), abs=1e-4)
+    assert found["val_nll_constant"] <= min(constants)
+    assert "val_nll" not in figures(*(DepthPrediction(m[0]) for m in maps))
+    truth.zero_()
+    assert figures(*(DepthPrediction(*m) for m in maps)) == {}

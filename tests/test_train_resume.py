@@ -10,14 +10,15 @@ from dataclasses import replace
 import pytest
 import torch
 from forked import CONTEXT
-from trainings import RECIPE, logged, tiny_job, with_network
+from trainings import RECIPE, logged, tiny_job, trained, with_network
 
 from ufmstar_torch.eval.run.folder import FolderError
+from ufmstar_torch.models import load_trained
 from ufmstar_torch.models.checkpoints import read_safetensors
-from ufmstar_torch.train import ResumeError
-from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO
+from ufmstar_torch.train import ResumeError, TrainingModule
 from ufmstar_torch.train.fit import fit
-from ufmstar_torch.train.member import WEIGHTS
+from ufmstar_torch.train.folder import WEIGHTS
+from ufmstar_torch.train.member import CHECKPOINT, AtomicCheckpointIO, train_member
 
 # Sums depend on the number of threads, and the compared processes have one.
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -26,82 +27,88 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 DROPOUT = with_network(method="mc_dropout", dropout=0.2)
 
 
-@pytest.fixture(scope="module")
-def uninterrupted(frames, tmp_path_factory):
-    """The folder of an undisturbed training."""
-    out = tmp_path_factory.mktemp("reference") / "out"
-    assert fit(tiny_job(frames, out, DROPOUT))["stopped"] is None
-    return out
+def stop_in(monkeypatch, epoch):
+    """Ctrl-C at the second step of an epoch."""
+    original = TrainingModule.training_step
 
+    def interrupted(module, batch, batch_idx):
+        if (module.current_epoch, batch_idx) == (epoch, 1):
+            raise KeyboardInterrupt
+        return original(module, batch, batch_idx)
 
-def tensors(path):
-    return read_safetensors(path)[0]
+    monkeypatch.setattr(TrainingModule, "training_step", interrupted)
 
 
 def stored(out, member=0):
-    return torch.load(out / f"member_{member}" / NAME, weights_only=True)
-
-
-def assert_same_result(out, reference, member=0):
-    """Weights bit for bit, the optimizer's state too, and the losses of the last epoch."""
-    mine, theirs = (tensors(folder / f"member_{member}" / WEIGHTS) for folder in (out, reference))
-    assert mine.keys() == theirs.keys()
-    assert [key for key in mine if not torch.equal(mine[key], theirs[key])] == []
-    states = [stored(folder, member)["optimizer_states"][0]["state"] for folder in (out, reference)]
-    for key, state in states[1].items():
-        for name, value in state.items():
-            assert torch.equal(value, states[0][key][name]), (key, name)
-    for name in ("train_loss", "val_rmse"):
-        assert logged(out, name)[-1] == logged(reference, name)[-1]
-
-
-def stop_after(steps):
-    """Request a stop after ``steps`` steps of the first member (the callback runs once before the first step)."""
-    count = iter(range(10_000))
-    return lambda: next(count) >= steps
+    return torch.load(out / f"member_{member}" / CHECKPOINT, weights_only=True)
 
 
 # ---- stopped ----
 
 
 @pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_stopped_again_and_again_it_goes_on_bit_for_bit(frames, uninterrupted, tmp_path, workers, monkeypatch):
-    """Stops two steps into the second and third of three epochs of three steps; weights exist after each session."""
+def test_interrupted_in_every_epoch_it_goes_on_from_the_last_whole_one_bit_for_bit(
+    frames, tmp_path, workers, monkeypatch
+):
     monkeypatch.setattr(torch.multiprocessing, "get_context", lambda _: CONTEXT)  # test_train_data.py spawns
-    job = tiny_job(frames, tmp_path / "out", DROPOUT)
+    whole, job = (tiny_job(frames, tmp_path / name, DROPOUT) for name in ("whole", "out"))
+    assert fit(whole)["stopped"] is None
     job = replace(job, data=replace(job.data, workers=workers))
-    for reached, checkpointed in ((5, 3), (8, 6), (9, 9)):
-        summary = fit(job, resume=True, asked=stop_after(5))
-        assert (summary["members"][0]["steps"], stored(tmp_path / "out")["global_step"]) == (reached, checkpointed)
+    for epoch in (1, 2):
+        with monkeypatch.context() as patch:
+            stop_in(patch, epoch)
+            with pytest.raises(KeyboardInterrupt):
+                fit(job, resume=True)
+        summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+        assert (summary["stopped"], summary["members"][0]["steps"]) == ("interrupted", 3 * epoch)
         assert (tmp_path / "out" / WEIGHTS).is_file()
-    assert summary["stopped"] is None
-    assert_same_result(tmp_path / "out", uninterrupted)
+    assert fit(job, resume=True)["stopped"] is None
+    mine, theirs = (trained(one).state_dict() for one in (job, whole))
+    assert [key for key in theirs if not torch.equal(mine[key], theirs[key])] == []
+    states = [stored(folder)["optimizer_states"][0]["state"] for folder in (tmp_path / "out", tmp_path / "whole")]
+    for key, state in states[1].items():
+        for name, value in state.items():
+            assert torch.equal(value, states[0][key][name]), (key, name)
+    for name in ("train_loss_step", "val_rmse", "lr-Adam"):
+        assert logged(tmp_path / "out", name)[-1] == logged(tmp_path / "whole", name)[-1]
 
 
 def test_a_time_budget_is_shared_by_the_members_and_resuming_goes_on(frames, tmp_path):
-    recipe = replace(RECIPE, members=2, epochs=1)
+    """The budget ends a member inside an epoch, with a validation and its weights."""
+    recipe = replace(RECIPE, members=2, epochs=2)
     summary = fit(tiny_job(frames, tmp_path / "out", recipe, max_minutes=1e-9))
     assert summary["stopped"] == "time budget spent"
     assert [m["steps"] for m in summary["members"]] == [1, 1]
+    assert len(load_trained(tmp_path / "out" / WEIGHTS)) == 2
+    seconds = [m["seconds"] for m in summary["members"]]
+    # Each session has its own budget.
+    summary = fit(tiny_job(frames, tmp_path / "out", recipe, max_minutes=1e-9), resume=True)
+    assert [m["steps"] for m in summary["members"]] == [2, 2]
     summary = fit(tiny_job(frames, tmp_path / "out", recipe), resume=True)
     assert summary["stopped"] is None
-    assert [(m["steps"], m["finished"]) for m in summary["members"]] == [(3, True), (3, True)]
+    assert [(m["steps"], m["finished"]) for m in summary["members"]] == [(6, True), (6, True)]
+    assert all(m["seconds"] >= before for m, before in zip(summary["members"], seconds, strict=True))
 
 
-def test_a_finished_member_is_not_trained_again(frames, tmp_path):
+def test_a_finished_member_is_not_trained_again(frames, tmp_path, monkeypatch):
     recipe = replace(RECIPE, members=2, epochs=1)
     out = tmp_path / "out"
-    # The callback runs before each member and after each step: stop before the second member.
-    count = iter(range(100))
-    summary = fit(tiny_job(frames, out, recipe), asked=lambda: next(count) >= 4)
-    assert [m["finished"] for m in summary["members"]] == [True]
-    assert summary["stopped"] == "stopped"
+
+    def stopped(job, member, **_):
+        if member == 1:
+            raise KeyboardInterrupt
+        train_member(job, member)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("ufmstar_torch.train.fit.train_member", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            fit(tiny_job(frames, out, recipe))
     first = out / "member_0"
     before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in first.iterdir() if path.is_file()}
     summary = fit(tiny_job(frames, out, recipe), resume=True)
     assert [m["finished"] for m in summary["members"]] == [True, True]
     assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in before} == before
-    both = tensors(out / WEIGHTS)
+    both = read_safetensors(out / WEIGHTS)[0]
     key = "backbone.encoder.0.conv.weight"
     assert not torch.equal(both[f"member.0.{key}"], both[f"member.1.{key}"])
     # Resuming a finished training trains nothing; further members are added.
@@ -110,30 +117,33 @@ def test_a_finished_member_is_not_trained_again(frames, tmp_path):
     assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in before} == before
 
 
-def test_sigterm_reaches_who_asks_for_the_stop(frames, tmp_path):
-    """Lightning's handler would end the program with exit code 0, without weights and result."""
-    received = []
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_signals_end_the_command_and_leave_the_last_epoch(ufmstar, frames, tmp_path, number, monkeypatch):
+    """Lightning would end the program with exit code 0 after SIGTERM, without weights."""
+    original = TrainingModule.training_step
 
-    def asked():
-        if list((tmp_path / "out" / "member_0").glob("version_0/*.csv")) and not received:
-            os.kill(os.getpid(), signal.SIGTERM)
-        return bool(received)
+    def signalled(module, batch, batch_idx):
+        if (module.current_epoch, batch_idx) == (1, 0):
+            os.kill(os.getpid(), number)
+        return original(module, batch, batch_idx)
 
-    before = signal.signal(signal.SIGTERM, lambda number, _: received.append(number))
-    try:
-        summary = fit(tiny_job(frames, tmp_path / "out"), asked=asked)
-    finally:
-        signal.signal(signal.SIGTERM, before)
-    assert received == [signal.SIGTERM]
-    assert summary["stopped"] == "stopped"
-    assert summary["members"][0]["steps"] in (1, 2)
+    monkeypatch.setattr(TrainingModule, "training_step", signalled)
+    words = ["train", "--preset", "fastdepth-aleatoric", "--data", "sequences", "--root", frames]
+    words += [f"--set={name}" for name in ("data.part=0:12", "network.size=[32,32]", "network.widths=0.05")]
+    words += ["--batch-size", "4", "--epochs", "3", "--accelerator", "cpu", "--no-progress", "--no-tensorboard"]
+    before = signal.getsignal(number)
+    code, _, err = ufmstar(*words, "--out", tmp_path / "out")
+    assert signal.getsignal(number) == before
+    assert (code, err) == (130, "ufmstar train: interrupted; --resume goes on with the last whole epoch\n")
+    assert stored(tmp_path / "out")["global_step"] == 3
+    assert len(load_trained(tmp_path / "out" / WEIGHTS)) == 1
 
 
 # ---- what must not be lost ----
 
 
 def test_a_write_that_fails_leaves_the_checkpoint_before_it(tmp_path):
-    path = tmp_path / NAME
+    path = tmp_path / CHECKPOINT
     io = AtomicCheckpointIO()
     io.save_checkpoint({"x": torch.ones(3)}, path)
 
@@ -144,13 +154,13 @@ def test_a_write_that_fails_leaves_the_checkpoint_before_it(tmp_path):
     with pytest.raises(OSError, match="disk full"):
         io.save_checkpoint({"x": torch.ones(10_000), "y": Unwritable()}, path)
     assert torch.equal(torch.load(path, weights_only=True)["x"], torch.ones(3))
-    assert [p.name for p in tmp_path.iterdir()] == [NAME]
+    assert [p.name for p in tmp_path.iterdir()] == [CHECKPOINT]
 
 
 def test_a_damaged_checkpoint_is_named(frames, tmp_path):
-    job = tiny_job(frames, tmp_path / "out", replace(RECIPE, epochs=2))
-    fit(job, asked=stop_after(4))
-    file = tmp_path / "out" / "member_0" / NAME
+    job = tiny_job(frames, tmp_path / "out", replace(RECIPE, epochs=1))
+    fit(job)
+    file = tmp_path / "out" / "member_0" / CHECKPOINT
     whole = file.read_bytes()
     for broken in (whole[: len(whole) // 2], b"", b"hello"):
         file.write_bytes(broken)

@@ -44,7 +44,7 @@ def expected(oracle, i, s2, pose=None):
 
 def agree(ufm, oracle, tolerance=1e-9):
     """Compare the points, in order, with the oracle's, which are in the current camera frame."""
-    cloud, T = ufm.cloud, np.linalg.inv(oracle.pose) @ ufm.T_world_first[0].numpy()
+    cloud, T = ufm.clouds[0], np.linalg.inv(oracle.pose) @ ufm.T_world_first[0].numpy()
     mean = cloud.mean.numpy() @ T[:3, :3].T + T[:3, 3]
     cov = T[:3, :3] @ cloud.covariance.numpy() @ T[:3, :3].T
     assert cloud.count.tolist() == [point["count"] for point in oracle.points]
@@ -64,11 +64,11 @@ def test_agrees_with_the_loops(cap, parts):
         out = ufm(*frame(i), *[torch.tensor(drawn / max(parts, 1))[None]] * parts)
         want = expected(oracle, i, drawn if parts else np.zeros((H, W)))
         np.testing.assert_allclose(out.variance[0].numpy(), want, rtol=0, atol=1e-9)
-        assert len(ufm.cloud.count) == len(oracle.points)
-        seen = max(seen, len(ufm.cloud.count))
+        assert len(ufm.clouds[0].count) == len(oracle.points)
+        seen = max(seen, len(ufm.clouds[0].count))
     agree(ufm, oracle)
     assert (seen <= (cap or 0)) == (cap is not None)
-    assert int(ufm.cloud.count.max()) > 2, "points must have been seen again"
+    assert int(ufm.clouds[0].count.max()) > 2, "points must have been seen again"
 
 
 def test_single_precision_stays_close_to_double():
@@ -100,7 +100,7 @@ def test_a_still_camera_gives_the_mean_variance_plus_the_spread_of_the_depths():
     d, s2 = 2 + 0.1 * rng.random(9), 0.01 * rng.random(9)
     ufm, out = still(d, s2, 9)
     assert torch.allclose(out.variance, torch.full((1, 4, 6), s2.mean() + d.var(), dtype=torch.float64), atol=1e-12)
-    assert ufm.cloud.count.tolist() == [9] * 24
+    assert ufm.clouds[0].count.tolist() == [9] * 24
 
 
 def moved(x, y=0.0, z=0.0):
@@ -121,8 +121,8 @@ def test_halves_are_rounded_to_even():
     ufm = UfM(dtype=torch.float64)
     ufm(plane(1.0), torch.eye(4, dtype=torch.float64), K1)
     ufm(plane(1.0), moved(0.5), K1)
-    assert ufm.cloud.count.tolist() == [2, 2, 2, 2, 1, 1]
-    x = ufm.cloud.mean[4:, 0]
+    assert ufm.clouds[0].count.tolist() == [2, 2, 2, 2, 1, 1]
+    x = ufm.clouds[0].mean[4:, 0]
     assert x.tolist() == [1.5, 3.5], "no point lands on columns 1 and 3"
 
 
@@ -130,18 +130,29 @@ def test_points_out_of_view_are_pruned_first_and_the_oldest_of_them():
     ufm = UfM(9, dtype=torch.float64)
     for x in (0.0, 100.0, 200.0):  # three disjoint views of four points each
         ufm(plane(1.0), moved(x), K1)
-    assert ufm.cloud.mean[:, 0].tolist() == [3, 100, 101, 102, 103, 200, 201, 202, 203]
+    assert ufm.clouds[0].mean[:, 0].tolist() == [3, 100, 101, 102, 103, 200, 201, 202, 203]
     ufm(plane(1.0), moved(0.0), K1)  # the oldest is in view again, the others are not
-    assert ufm.cloud.mean[:, 0].tolist() == [3, 103, 200, 201, 202, 203, 0, 1, 2]
+    assert ufm.clouds[0].mean[:, 0].tolist() == [3, 103, 200, 201, 202, 203, 0, 1, 2]
 
 
 def test_memory_per_point_is_as_documented():
     for dtype, size in ((torch.float32, 40), (torch.float64, 76)):
         ufm = UfM(dtype=dtype)
         ufm(*frame(0))
-        cloud = ufm.cloud
+        cloud = ufm.clouds[0]
         assert cloud.bytes_per_point == size
         assert cloud.moments.nbytes + cloud.count.nbytes == size * len(cloud.count)
+
+
+def test_streams_do_not_affect_each_other():
+    together, alone = UfM(None), [UfM(None) for _ in range(2)]
+    for i in range(4):
+        each = [frame(j, dtype=torch.float32) for j in (i, 7 + 2 * i)]
+        out = together(*(torch.cat(values) for values in zip(*each, strict=True)))
+        for s, ufm in enumerate(alone):
+            assert torch.equal(out.variance[s].nan_to_num(-1), ufm(*each[s]).variance[0].nan_to_num(-1))
+            assert torch.equal(together.clouds[s].moments, ufm.clouds[0].moments)
+    assert len(together.clouds[0].count) != len(together.clouds[1].count)
 
 
 # ---- bad input ----
@@ -149,12 +160,12 @@ def test_memory_per_point_is_as_documented():
 
 def test_invalid_pixels_are_left_out_and_points_there_left_alone():
     ufm, _ = still([2.0, 3.0], [0.01, 0.01], 2)
-    before = ufm.cloud
+    before = ufm.clouds[0]
     valid = torch.ones(1, 4, 6, dtype=torch.bool)
     valid[0, 1, 2] = False
     eye, K4 = torch.eye(4, dtype=torch.float64), torch.tensor(scenes.intrinsics(4, 6))
     out = ufm(torch.full((1, 4, 6), 4.0).double(), eye, K4, torch.full((1, 4, 6), 0.01).double(), valid=valid)
-    after = ufm.cloud
+    after = ufm.clouds[0]
     assert out.variance.isnan().equal(~valid)
     assert torch.equal(after.moments[8], before.moments[8])
     assert after.count.tolist() == [2 if n == 8 else 3 for n in range(24)]
@@ -172,7 +183,15 @@ BAD = {
     "depth's shape": ({"depth": torch.ones(H, W)}, ValueError, "depth must be"),
     "aleatoric's shape": ({"aleatoric": torch.ones(1, 2, 2)}, ValueError, "aleatoric must have"),
     "valid's type": ({"valid": torch.ones(1, H, W)}, TypeError, "valid must be a torch.bool"),
-    "streams": ({"depth": torch.ones(2, H, W)}, ValueError, "of one stream"),
+    "streams": (
+        {
+            "depth": torch.ones(2, H, W),
+            "pose": torch.eye(4).repeat(2, 1, 1),
+            "intrinsics": torch.eye(3).repeat(2, 1, 1),
+        },
+        ValueError,
+        "of 1 streams as before",
+    ),
 }
 
 
@@ -181,11 +200,11 @@ def test_bad_input_is_named_and_leaves_the_state(name):
     change, error, message = BAD[name]
     ufm = UfM(dtype=torch.float64)
     ufm(*frame(0))
-    before = ufm.cloud
+    before = ufm.clouds[0]
     good = dict(zip(("depth", "pose", "intrinsics"), frame(1), strict=True))
     with pytest.raises(error, match=message):
         ufm(**{**good, **change})
-    assert ufm.cloud is before
+    assert ufm.clouds[0] is before
 
 
 def test_reset_forgets_all_frames():
@@ -219,7 +238,7 @@ def test_the_cap_holds_and_covariances_stay_positive(cap, seed):
     ufm = UfM(cap, dtype=torch.float64)
     for i in rng.integers(0, FRAMES, 4):
         out = ufm(*frame(i, rng.random((H, W)) * 0.1))
-        cloud = ufm.cloud
+        cloud = ufm.clouds[0]
         assert len(cloud.count) <= cap
         assert (out.variance[out.valid] >= 0).all()
         assert torch.linalg.eigvalsh(cloud.covariance).min() > -1e-12

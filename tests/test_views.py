@@ -15,7 +15,7 @@ from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.frames.image_check import ImageCheck, reduced, shows_something
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.models import Preprocess, wrap_network
-from ufmstar_torch.steps.views import COMPLETE, LEAST, after_view, view_weights
+from ufmstar_torch.steps.fuse import COMPLETE, LEAST, after_view, view_weights
 
 pytestmark = pytest.mark.numerics
 CONFIG = UfMStarConfig()

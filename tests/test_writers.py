@@ -16,7 +16,7 @@ import torch
 from PIL import Image
 from runs import read_summary
 
-from ufmstar_torch.eval.run.files import to_json, write_atomic, write_json_atomic
+from ufmstar_torch.eval.engine.files import to_json, write_atomic, write_json_atomic
 from ufmstar_torch.eval.run.writers import encode_length_png, frame_file, read_frame, write_frame
 from ufmstar_torch.eval.sequences.images import read_depth
 

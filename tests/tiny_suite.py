@@ -14,9 +14,9 @@ import torch
 from layouts import write_generic
 
 from ufmstar_torch.eval.engine.evaluate import Judge, evaluate_sequence
-from ufmstar_torch.eval.engine.judge import RowFigures
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.progress import Progress
+from ufmstar_torch.eval.engine.record import Record
 from ufmstar_torch.eval.engine.stream import Stopped
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
@@ -199,7 +199,8 @@ def _drawn(sequence, row):
     metrics = SequenceMetrics(with_variance=False)  # small sums: a forked process must not use torch's threads
     metrics.update(target + 0.1, None, target)
     counts = {"selected": len(sequence), "done": len(sequence), "skipped": 0, "reasons": {}}
-    return RowFigures(row, counts, metrics.compute(), metrics.curves(), {}, {}, {"metrics": metrics.state_dict()})
+    how = {"figures": metrics.compute(), "curves": metrics.curves(), "sums": {"metrics": metrics.state_dict()}}
+    return Record(row.method.name, row.setting.to_dict(), counts, **how)
 
 
 def go(job, evaluate=None, **how):

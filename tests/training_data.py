@@ -7,14 +7,7 @@ from layouts_more import write_h5
 
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError
 from ufmstar_torch.models import Preprocess
-from ufmstar_torch.train import (
-    Augmentation,
-    AugmentationConfig,
-    DataConfig,
-    EpochBatches,
-    SampleDataset,
-)
-from ufmstar_torch.train.data import sample_loader
+from ufmstar_torch.train import DataConfig
 
 SMALL = (48, 64)  # NYU's aspect ratio
 PLAIN = Preprocess()
@@ -52,12 +45,3 @@ class Numbered:
             raise FrameError(self.name(index), "torn")
         image, depth = np.full((6, 8, 3), index, np.uint8), np.full((6, 8), index + 1, np.float32)
         return Frame(index, self.name(index), image, depth, np.eye(4), np.eye(3) + 2)
-
-
-def numbers(batch) -> list[int]:
-    return [round(x.item()) - 1 for x in batch["depth"][:, 3, 4]]
-
-
-def loader(length=23, **options):
-    dataset = SampleDataset(Numbered(length), PLAIN, Augmentation(AugmentationConfig(scale=(1.0, 1.0))))
-    return sample_loader(dataset, EpochBatches(length, 4, seed=9, **options))

@@ -10,6 +10,7 @@ from layouts import write_depth_png, write_image
 
 from ufmstar_torch.models import NetworkSpec
 from ufmstar_torch.train import AugmentationConfig, DataConfig, FitSettings, Job, Recipe
+from ufmstar_torch.train.member import read_checkpoint, trained_network
 
 SIZE = (32, 32)
 SPEC = NetworkSpec(widths=0.05, positive="softplus", size=SIZE, preprocess="resize")
@@ -59,6 +60,11 @@ def tiny_job(frames, out, recipe=RECIPE, augment=True, **settings):
     )
     quiet = {"tensorboard": False, "progress": False, "accelerator": "cpu", "log_every": 1}
     return Job(recipe, data, FitSettings(out=out, **{**quiet, **settings}))
+
+
+def trained(job, member=0):
+    """A member of a finished training."""
+    return trained_network(job, member, read_checkpoint(job, member))
 
 
 def logged(out, name, member=0):

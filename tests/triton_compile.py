@@ -26,7 +26,6 @@ from ufmstar_torch.frames.frame import check_frame
 from ufmstar_torch.gaussians.state import UfMStarState
 from ufmstar_torch.kernels.select import select_kernels
 from ufmstar_torch.steps.correspond import Correspondence
-from ufmstar_torch.steps.segment_input import SegmentInput
 
 TARGET = GPUTarget("cuda", 90, 32)
 TYPES = {
@@ -66,7 +65,7 @@ K = torch.tensor(scenes.intrinsics(*SIZE)).expand(2, 3, 3)
 
 def cases() -> dict[str, Callable[[], object]]:
     """Calls that launch every kernel once, on small inputs."""
-    from ufmstar_torch.kernels.triton import append, check, correspond, fuse, regress, segment
+    from ufmstar_torch.kernels.triton import check, correspond, fuse, regress, segment
     from ufmstar_torch.kernels.triton import step as step_device
 
     m = mixture(2, 40, 3, features=1)
@@ -89,19 +88,11 @@ def cases() -> dict[str, Callable[[], object]]:
         frame = check_frame(
             depth, torch.eye(4), K[:streams], None, None, None, depth[:, None], feature_count=1, rotation_tolerance=0.01
         )
-        late = step_device.DeviceStep(kernels)
-        state, _ = late(UfMStarState.initial(streams, chosen, torch.float32, "cpu"), frame, chosen)
-        waiting = late._waiting
-        assert waiting is not None
-        assert waiting.rest is not None
-        rest = waiting.rest
-        append.append(
-            state.mixture, rest.current, rest.to_first, rest.view, rest.left, state.frames, near_plane=0.05,
-            paper=False, again=True, last=False,
-        )  # fmt: skip
+        state = UfMStarState.initial(streams, chosen, torch.float32, "cpu")
+        step_device.DeviceStep(kernels)(state, frame, chosen)
 
     values = depth, torch.eye(4).double().expand(2, 4, 4), K, depth, depth, depth[:, None], depth > 0
-    segment_input = SegmentInput.of(depth, K, config.segment, depth[:, None])
+    limits = config.segment.scaled_to(*SIZE)
     return {
         "regress": lambda: regress.regress_image(m, depth, K, depth > 0, config),
         "regress_subset": lambda: regress.regress_image(
@@ -112,11 +103,11 @@ def cases() -> dict[str, Callable[[], object]]:
         "fuse": lambda: fuse.fuse(m, current, pairs, view, config.replace(overlap_weighted=True)),
         "check": lambda: check.check_values(*values, rotation_tolerance=0.01, max_depth=20.0),
         "floor": lambda: fuse.floor_covariance(m.covariance, m.weight),
-        "segment": lambda: segment.segment(segment_input),
+        "segment": lambda: segment.segment(depth, K, limits, depth[:, None]),
         "device": device,
         "device_one": lambda: device(1),
         "device_relative": lambda: device(unmeasured="relative"),
-        "fit": lambda: segment.fit(SegmentInput.of(depth, K, config.segment), floor=segment.Floor(0.05, 1e-6)),
+        "fit": lambda: segment.fit(depth, K, limits, floor=segment.Floor(0.05, 1e-6)),
     }
 
 

@@ -7,17 +7,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ufmstar_torch.runtime.lazy import lazy_names
+from ufmstar_torch.runtime.optional import lazy_names
 
 if TYPE_CHECKING:
     from ufmstar_torch.train.augment import Augmentation as Augmentation
     from ufmstar_torch.train.augment import AugmentationConfig as AugmentationConfig
-    from ufmstar_torch.train.batches import EpochBatches as EpochBatches
-    from ufmstar_torch.train.checkpoints import ResumeError as ResumeError
     from ufmstar_torch.train.data import DepthDataModule as DepthDataModule
     from ufmstar_torch.train.data_config import DataConfig as DataConfig
     from ufmstar_torch.train.losses import loss_of as loss_of
     from ufmstar_torch.train.losses import loss_sums as loss_sums
+    from ufmstar_torch.train.member import ResumeError as ResumeError
     from ufmstar_torch.train.module import NonFiniteLossError as NonFiniteLossError
     from ufmstar_torch.train.module import TrainingModule as TrainingModule
     from ufmstar_torch.train.nyu import convert_labelled as convert_labelled

@@ -1,17 +1,16 @@
-"""Random augmentation of training frames: image, depth and intrinsics together, from a seed.
+"""Random augmentation of a batch on its device by kornia: image, depth and intrinsics together.
 
-FastDepth's augmentation of NYU Depth V2 (scale 1 to 1.5 with the depth divided by it, rotation by up to 5 degrees,
-flip, colour jitter .4; its code discards the rotated image, this one applies it). The result is the view of another
-pinhole camera at the same position: rolled about its optical axis, mirrored, zoomed, and shifted in its image plane. So
-its intrinsics are exact, and depths stay depths along the optical axis.
+FastDepth's augmentation of NYU Depth V2: scale 1 to 1.5 with the depth divided by it, rotation by up to 5 degrees (its
+code discards the rotated image, this one applies it), flip, colours by up to .4. kornia draws the parameters on the CPU
+from torch's generator, whose seed decides the samples, and copies them to the device without waiting for it.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,19 +19,18 @@ from ufmstar_torch.runtime.checked import Checked, choice, number
 
 @dataclass(frozen=True)
 class AugmentationConfig(Checked):
-    """Ranges of the augmentation of a frame, each sampled uniformly.
+    """Ranges of the augmentation, each sampled uniformly for every image.
 
     Attributes:
         scale: range of the zoom factor s, at least 1, so that the image has no borders.
         rotation: largest rotation about the image's centre, in both directions. Corners from outside the image are
             black and have no depth.
         flip: probability of a mirrored image.
-        crop: part of the zoomed image: "centre", or anywhere, "random".
         zoom: meaning of a zoom. "depth": the camera is unchanged and everything is s times nearer, so depth is divided
             by s (FastDepth): for a network without intrinsics as input, which learns the relation of size and depth for
             one camera. "focal": the focal length is s times longer and depth is unchanged (exact optics, but another
             camera).
-        brightness, contrast, saturation: range x of the factor, 1 - x to 1 + x; applied in random order.
+        brightness, contrast, saturation: range x of the factor, 1 - x to 1 + x; applied in this order.
 
     Raises:
         ValueError: an invalid value; the message names the field.
@@ -41,7 +39,6 @@ class AugmentationConfig(Checked):
     scale: tuple[float, float] = (1.0, 1.5)
     rotation: float = number(5.0, "angle", "degrees", 0, 180)
     flip: float = number(0.5, "p", "1", 0, 1)
-    crop: str = choice("centre", "random")
     zoom: str = choice("depth", "focal")
     brightness: float = number(0.4, "x", "1", 0, 1)
     contrast: float = number(0.4, "x", "1", 0, 1)
@@ -53,106 +50,53 @@ class AugmentationConfig(Checked):
             raise ValueError(f"AugmentationConfig.scale must be (low, high), 1 <= low <= high, got {self.scale}")
 
 
-@dataclass(frozen=True)
-class Change:
-    """One sample of the augmentation."""
-
-    scale: float = 1.0  # zoom factor s
-    angle: float = 0.0  # [rad] roll of the camera
-    flip: bool = False  # mirrored or not
-    shift: tuple[float, float] = (0.0, 0.0)  # [px] (right, down) of the zoomed content
-    colour: tuple[tuple[str, float], ...] = ()  # (kind, factor) in the order of application; kinds as in the config
-
-
 class Augmentation:
-    """A random change of a frame with the ranges of ``config``, which depends only on the seed."""
+    """A random change of every image of a batch, with the ranges of ``config``.
+
+    Attributes:
+        transform: kornia's ``AugmentationSequential``; its ``transform_matrix`` [B, 3, 3] maps the pixels of the last
+            batch, p' = M p.
+    """
 
     def __init__(self, config: AugmentationConfig | None = None) -> None:
-        self.config = config or AugmentationConfig()
+        from kornia.augmentation import AugmentationSequential, ColorJitter, RandomAffine, RandomHorizontalFlip
+        from kornia.constants import DataKey, Resample
 
-    def __call__(
-        self, image: Tensor, depth: Tensor, intrinsics: Tensor, seed: tuple[int, ...]
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """An augmented copy, of the same size, of image [3, H, W] floating-point in [0, 1], depth [H, W] [m], 0 = none,
-        and intrinsics [3, 3] float64 [px]; depth is 0 outside the original image. ``seed``: whole numbers >= 0, for
-        example (seed, epoch, index)."""
-        height, width = depth.shape
-        change = draw(self.config, seed, height, width)
-        new_image, new_depth, K = apply_geometry(image, depth, intrinsics, change, self.config.zoom)
-        return apply_colour(new_image, change.colour), new_depth, K
+        self.config = c = config or AugmentationConfig()
+        # align_corners: coordinates of pixel centres, as everywhere in this package.
+        geometry = RandomAffine(c.rotation, scale=c.scale, align_corners=True, p=1.0)
+        # A drawn order of the colours would be read back by the CPU.
+        colours = ColorJitter(c.brightness, c.contrast, c.saturation, order=(0, 1, 2), p=1.0)
+        nearest: dict[Any, dict[str, Any]] = {DataKey.MASK: {"resample": Resample.NEAREST, "align_corners": True}}
+        steps = (geometry, RandomHorizontalFlip(p=c.flip), colours)
+        self.transform: Any = AugmentationSequential(*steps, data_keys=["input", "mask"], extra_args=nearest)
 
-
-def draw(config: AugmentationConfig, seed: tuple[int, ...], height: int, width: int) -> Change:
-    """Sample the change of a frame of height x width [px]."""
-    rng = np.random.default_rng(seed)
-    scale = rng.uniform(*config.scale)
-    angle = math.radians(rng.uniform(-config.rotation, config.rotation))
-    flip = bool(rng.random() < config.flip)
-    room = (scale - 1) / 2 * np.array([width, height]) if config.crop == "random" else np.zeros(2)
-    shift = rng.uniform(-1, 1, 2) * room
-    factors = [(name, float(1 + getattr(config, name) * rng.uniform(-1, 1))) for name in _COLOUR]
-    colour = tuple(factors[i] for i in rng.permutation(len(factors)) if getattr(config, factors[i][0]) > 0)
-    return Change(float(scale), angle, flip, (float(shift[0]), float(shift[1])), colour)
+    def __call__(self, image: Tensor, depth: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """An augmented copy, of the same size, of image [B, 3, H, W] floating-point in [0, 1], depth [B, H, W] [m], 0 =
+        none, copied from the nearest pixel, and intrinsics [B, 3, 3] [px]; depth is 0 outside the original image."""
+        new_image, new_depth = self.transform(image, depth[:, None])
+        M = self.transform.transform_matrix.to(intrinsics.dtype)
+        K = camera_of(M @ intrinsics)
+        if self.config.zoom == "depth":
+            zoom = (M[:, 0, 0] * M[:, 1, 1] - M[:, 0, 1] * M[:, 1, 0]).abs().sqrt()[:, None, None]
+            new_depth = new_depth / zoom[..., None].to(depth)
+            K = torch.cat([torch.cat([K[:, :2, :2] / zoom, K[:, :2, 2:]], -1), K[:, 2:]], 1)
+        return new_image, new_depth[:, 0], K
 
 
-def camera_change(intrinsics: Tensor, change: Change, height: int, width: int, zoom: str) -> tuple[Tensor, Tensor]:
-    """The map of the pixels, p' = A p + b, and the corresponding intrinsics K'.
+def camera_of(projection: Tensor) -> Tensor:
+    """The intrinsics K' of a camera [B, 3, 3] whose image was changed by an affine map M of its pixels.
 
-    With K = (L, c), L its upper left 2x2 part, c the principal point, a point at x = (X/Z, Y/Z) projects to
-    p = L x + c. The new camera is rolled by R and mirrored by F, so A = s F L R L^-1. The image's centre m moves by the
-    shift t only, hence c' = A (c - m) + m + t. L' = F L F, times s for zoom "focal"; for zoom "depth" the points are
-    nearer instead: (F R (X, Y), Z / s) projects by K' to p'. Returns [2, 3] (A, b) and [3, 3] K', float64, for
-    ``intrinsics`` [3, 3] float64 of an image of height x width [px].
+    The changed image shows the same points from the same position: M K = K' G, where G turns or mirrors the camera
+    about its optical axis, and K' is upper triangular with positive focal lengths. An RQ decomposition yields both;
+    depths along the optical axis stay. K' has skew where pixels that are not square are rotated.
+
+    Args:
+        projection: M K [B, 3, 3].
     """
-    L, c = intrinsics[:2, :2], intrinsics[:2, 2]
-    m = intrinsics.new_tensor([(width - 1) / 2, (height - 1) / 2])
-    cos, sin = math.cos(change.angle), math.sin(change.angle)
-    R = intrinsics.new_tensor([[cos, -sin], [sin, cos]])
-    F = intrinsics.new_tensor([[-1.0 if change.flip else 1.0, 0.0], [0.0, 1.0]])
-    A = change.scale * F @ L @ R @ torch.linalg.inv(L)
-    centre = m + intrinsics.new_tensor(change.shift)
-    K = torch.eye(3, dtype=intrinsics.dtype)
-    K[:2, :2] = F @ L @ F * (change.scale if zoom == "focal" else 1.0)
-    K[:2, 2] = A @ (c - m) + centre
-    return torch.cat([A, (centre - A @ m)[:, None]], dim=1), K
-
-
-def apply_geometry(
-    image: Tensor, depth: Tensor, intrinsics: Tensor, change: Change, zoom: str = "depth"
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Warp a frame to the changed camera: colour bilinearly, depth from the nearest pixel.
-
-    Shapes as in :meth:`Augmentation.__call__`.
-    """
-    from kornia.geometry.transform import warp_affine  # lazy: takes a second
-
-    height, width = depth.shape
-    M, K = camera_change(intrinsics, change, height, width, zoom)
-
-    def warp(x: Tensor, mode: str) -> Tensor:  # align_corners: coordinates of pixel centres, as here
-        return warp_affine(x[None], M[None].to(x.dtype), (height, width), mode=mode, align_corners=True)[0]
-
-    new_depth = warp(depth[None], "nearest")[0]
-    return warp(image, "bilinear"), new_depth / change.scale if zoom == "depth" else new_depth, K
-
-
-def apply_colour(image: Tensor, colour: tuple[tuple[str, float], ...]) -> Tensor:
-    """Brightness, contrast and saturation of an image [3, H, W], as defined by torchvision and Pillow.
-
-    kornia's functions with long names follow that definition; its ``adjust_brightness`` adds instead of multiplying.
-    (torchvision.transforms.v2 cannot replace ``apply_geometry``: its affine transform has no mirror, and no rotation
-    for pixels that are not square.)
-    """
-    from kornia import enhance
-
-    adjust = {
-        "brightness": enhance.adjust_brightness_accumulative,
-        "contrast": enhance.adjust_contrast_with_mean_subtraction,
-        "saturation": enhance.adjust_saturation_with_gray_subtraction,
-    }
-    for name, factor in colour:
-        image = adjust[name](image, factor)
-    return image
-
-
-_COLOUR = ("brightness", "contrast", "saturation")
+    (a, b), (c, d) = (projection[:, row, :2].unbind(-1) for row in (0, 1))
+    height = (c * c + d * d).sqrt()
+    zero, one = torch.zeros_like(height), torch.ones_like(height)
+    first = [(a * d - b * c).abs() / height, (a * c + b * d) / height, projection[:, 0, 2]]
+    rows = (first, [zero, height, projection[:, 1, 2]], [zero, zero, one])
+    return torch.stack([torch.stack(row, -1) for row in rows], 1)

@@ -6,22 +6,22 @@ import sys
 from collections.abc import Sequence
 from dataclasses import Field, dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from ufmstar_torch.eval.commands.errors import UsageError
-from ufmstar_torch.eval.commands.options import Count, File, Flag, Number, Repeated, Text, Texts, assigned, parse
-from ufmstar_torch.models.spec import NetworkSpec
-from ufmstar_torch.train.augment import AugmentationConfig
-from ufmstar_torch.train.data_config import DataConfig
-from ufmstar_torch.train.presets import Recipe, preset, table
-from ufmstar_torch.train.settings import FitSettings, Job
+from ufmstar_torch.eval.commands.options import Count, File, Flag, Number, Repeated, Text, Texts, arg, assigned, parse
 
-_SECTIONS: dict[str, tuple[Any, tuple[str, ...]]] = {
-    "network": (NetworkSpec, ("members", "module")),
-    "augment": (AugmentationConfig, ()),
-    "data": (DataConfig, ("kind", "paths", "augmentation")),
-    "session": (FitSettings, ("out", "trainable", "progress", "tensorboard")),
-    "": (Recipe, ("network", "members")),
+if TYPE_CHECKING:
+    from ufmstar_torch.train.presets import Recipe
+    from ufmstar_torch.train.settings import Job
+
+# Section of --set -> the fields that options set instead.
+_WITHOUT: dict[str, tuple[str, ...]] = {
+    "network": ("members", "module"),
+    "augment": (),
+    "data": ("kind", "paths", "augmentation"),
+    "session": ("out", "trainable", "progress", "tensorboard"),
+    "": ("network", "members"),
 }
 
 
@@ -71,7 +71,7 @@ class SessionOptions:
         devices: Use this many processes or GPUs.
         nodes: Use this many computers.
         trainable: Train only parameters whose names begin with one of these.
-        max_minutes: Stop in good order after this time; --resume continues.
+        max_minutes: Stop after this time, with a validation and the weights; --resume continues.
         no_progress: Show no progress bar.
         no_tensorboard: Write no logs for TensorBoard.
     """
@@ -126,24 +126,25 @@ class TrainOptions:
     batch_size: Count = None
     learning_rate: Number = None
     set: Repeated = ()
-    backbone_options: BackboneOptions = field(default_factory=BackboneOptions)
+    custom: Annotated[BackboneOptions, arg(name="own-backbone")] = field(default_factory=BackboneOptions)
     source: DataOptions = field(default_factory=DataOptions)
     session: SessionOptions = field(default_factory=SessionOptions)
 
     def __post_init__(self) -> None:
-        _ = self.changes  # checks the names
+        if self.set:
+            _ = self.changes  # checks the names
 
     @cached_property
     def changes(self) -> dict[str, dict[str, Any]]:
         """The values that options change, by section. Raises ValueError: no such section or value."""
         named = {name: getattr(self, name) for name in ("epochs", "max_steps", "batch_size", "learning_rate")}
-        changes: dict[str, dict[str, Any]] = {section: {} for section in _SECTIONS}
+        changes: dict[str, dict[str, Any]] = {section: {} for section in _WITHOUT}
         changes[""] = {name: value for name, value in named.items() if value is not None}
         for name, value in assigned(self.set).items():
             section, _, inner = name.rpartition(".")
             by_name = _fields_of(section)
             if inner not in by_name:
-                sections = [f"{prefix}." for prefix in _SECTIONS if prefix]
+                sections = [f"{prefix}." for prefix in _WITHOUT if prefix]
                 expected = ", ".join([*by_name, *(() if section and by_name else sections)])
                 within = f"{section}." if section and by_name else ""
                 raise ValueError(f"--set has no {name}; expected {within}{expected}")
@@ -154,6 +155,8 @@ class TrainOptions:
 
     def recipe(self) -> Recipe:
         """The preset with the values that the options change. Raises ValueError: no preset, or an impossible value."""
+        from ufmstar_torch.train.presets import preset
+
         if self.preset is None:
             raise ValueError("--preset or --backbone is missing; ufmstar train --help")
         recipe = preset(self.preset)
@@ -164,7 +167,11 @@ class TrainOptions:
     def job(self) -> Job:
         """The training that the options mean. Raises ValueError: an option is missing, options contradict each other,
         or a value is impossible."""
-        d, s, chosen = self.source, self.session, self.backbone_options
+        from ufmstar_torch.train.augment import AugmentationConfig
+        from ufmstar_torch.train.data_config import DataConfig
+        from ufmstar_torch.train.settings import FitSettings, Job
+
+        d, s, chosen = self.source, self.session, self.custom
         if self.preset is not None and chosen.backbone is not None:
             raise ValueError("--preset and --backbone contradict each other")
         recipe = None if chosen.backbone is not None else self.recipe()
@@ -206,8 +213,16 @@ class _Command(TrainOptions):
 
 def _fields_of(section: str) -> dict[str, Field[Any]]:
     """The fields that ``--set`` changes in a section, by name; {} without such a section."""
-    kind, without = _SECTIONS.get(section, (None, ()))
-    return {} if kind is None else {f.name: f for f in fields(kind) if f.name not in without}
+    from ufmstar_torch.models.spec import NetworkSpec
+    from ufmstar_torch.train.augment import AugmentationConfig
+    from ufmstar_torch.train.data_config import DataConfig
+    from ufmstar_torch.train.presets import Recipe
+    from ufmstar_torch.train.settings import FitSettings
+
+    kinds: dict[str, Any] = {"network": NetworkSpec, "augment": AugmentationConfig, "data": DataConfig}
+    kinds |= {"session": FitSettings, "": Recipe}
+    without = _WITHOUT.get(section, ())
+    return {f.name: f for f in fields(kinds[section]) if f.name not in without} if section in kinds else {}
 
 
 def read(words: Sequence[str]) -> _Command:
@@ -219,6 +234,8 @@ def read(words: Sequence[str]) -> _Command:
 def main(options: _Command) -> int:
     """Train, and print the results; the exit code."""
     if options.list:
+        from ufmstar_torch.train.presets import table
+
         print(table())
         return 0
     try:
@@ -227,7 +244,6 @@ def main(options: _Command) -> int:
         raise UsageError(error) from error
     from lightning.pytorch.utilities import rank_zero_only
 
-    from ufmstar_torch.eval.commands.terminal import stop_signals
     from ufmstar_torch.eval.sequences.frame import FrameError
     from ufmstar_torch.train.fit import fit, report
     from ufmstar_torch.train.start import missing_start
@@ -236,13 +252,15 @@ def main(options: _Command) -> int:
     remark = missing_start(job.recipe.network, job.settings.init)
     if remark and process.rank == 0:
         print(f"ufmstar train: {remark}", file=sys.stderr)
-    command = ["ufmstar", "train", *options.words]
-    with stop_signals(lambda text: print(text, file=sys.stderr), "step") as stop:
-        try:
-            summary = fit(job, resume=options.resume, overwrite=options.overwrite, asked=stop, command=command)
-        except FrameError as error:
-            raise ValueError(f"{error} (--set data.on_bad_file=skip leaves such files out)") from error
-    if "members" not in summary:
+    try:
+        command = ["ufmstar", "train", *options.words]
+        summary = fit(job, resume=options.resume, overwrite=options.overwrite, command=command)
+    except KeyboardInterrupt:
+        print("ufmstar train: interrupted; --resume goes on with the last whole epoch", file=sys.stderr)
+        return 130
+    except FrameError as error:
+        raise ValueError(f"{error} (--set data.on_bad_file=skip leaves such files out)") from error
+    if not summary:
         return 0  # a further process of a distributed training: the first one reports
     print(report(summary))
     print(f"{job.settings.out}: trained.safetensors, summary.json, member_*/, tensorboard/")

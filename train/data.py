@@ -8,7 +8,9 @@ from typing import Any
 
 import torch
 from lightning.pytorch import LightningDataModule
+from torch import Tensor
 from torch.utils.data import DataLoader
+from torch.utils.data.distributed import DistributedSampler
 
 from ufmstar_torch.eval.check.check import check_sequence
 from ufmstar_torch.eval.sequences.nyu import PARTS
@@ -16,9 +18,8 @@ from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.train.augment import Augmentation
-from ufmstar_torch.train.batches import EpochBatches
 from ufmstar_torch.train.data_config import DataConfig, Part
-from ufmstar_torch.train.samples import Sample, SampleDataset, clips
+from ufmstar_torch.train.samples import Sample, SampleDataset, clips, joined
 from ufmstar_torch.train.sequence_data import SequenceFrames, open_rgbd
 from ufmstar_torch.train.tour_data import tour_frames
 
@@ -26,23 +27,18 @@ CHECKED = 3  # most sequences whose depth, poses and images are checked: a mista
 
 
 class DepthDataModule(LightningDataModule):
-    """Train and validation loaders of samples at a network's size.
-
-    The trainer must not replace the sampler: ``Trainer(use_distributed_sampler=False)``.
+    """Train and validation loaders of samples at a network's size; augments and normalises them on their device.
 
     Args:
         config: source of the frames.
         preprocess: of the network.
         batch_size: frames per step and process.
-        seed: of the order and the augmentation.
+        seed: of the order.
         clip_frames: length of the clips of successive frames in training. From two on, only colours are augmented,
             because a zoom that divides depth, or a mirror, would not match the camera's path.
 
     Raises:
         ValueError: ``batch_size`` is no multiple of ``clip_frames``.
-
-    Attributes:
-        clips: of the training part, after ``setup``; None with ``clip_frames = 1``.
     """
 
     def __init__(
@@ -53,9 +49,12 @@ class DepthDataModule(LightningDataModule):
             raise ValueError(f"batch_size {batch_size} of a process must be a multiple of {clip_frames} frames")
         self.config, self.preprocess = config, preprocess
         self.batch_size, self.seed, self.clip_frames = batch_size, seed, clip_frames
-        self.clips: list[range] | None = None
         self.train_set: SampleDataset | None = None
         self.validation_set: SampleDataset | None = None
+        augment = config.augmentation
+        if augment is not None and clip_frames > 1:
+            augment = replace(augment, scale=(1.0, 1.0), rotation=0.0, flip=0.0)
+        self.augmentation = None if augment is None else Augmentation(augment)
 
     def prepare_data(self) -> None:
         """Render tours that are not in the cache; Lightning calls this in one process per computer."""
@@ -67,58 +66,58 @@ class DepthDataModule(LightningDataModule):
         tours; ValueError: a path does not contain the configured kind of data, or the two parts overlap."""
         if self.train_set is not None:
             return
-        c = self.config
-        train, validation = sources(c)
-        config = c.augmentation
-        if self.clip_frames > 1:
-            self.clips = clips(train, self.clip_frames)
-            config = None if config is None else replace(config, scale=(1.0, 1.0), rotation=0.0, flip=0.0)
-        augmentation = None if config is None else Augmentation(config)
-        self.train_set = SampleDataset(train, self.preprocess, augmentation, seed=self.seed, on_bad_file=c.on_bad_file)
-        self.validation_set = SampleDataset(validation, self.preprocess, on_bad_file=c.on_bad_file, evaluate=True)
+        train, validation = sources(self.config)
+        parts = clips(train, self.clip_frames) if self.clip_frames > 1 else None
+        self.train_set = SampleDataset(train, self.preprocess, parts, self.config.on_bad_file)
+        self.validation_set = SampleDataset(validation, self.preprocess, on_bad_file=self.config.on_bad_file)
 
     def train_dataloader(self) -> DataLoader[Sample]:
-        """Training frames in random order; this process's share of every batch."""
-        return self._loader(self.train_set, shuffle=True)
-
-    def val_dataloader(self) -> DataLoader[Sample]:
-        """Validation frames in order; this process's share."""
-        return self._loader(self.validation_set, shuffle=False)
-
-    def bad_files(self) -> tuple[str, ...]:
-        """The broken files skipped so far in both parts."""
-        return tuple(name for part in (self.train_set, self.validation_set) if part for name in part.bad_files())
-
-    def _loader(self, dataset: SampleDataset | None, shuffle: bool) -> DataLoader[Sample]:
-        if dataset is None:
-            raise RuntimeError("call setup() before asking for a loader")
-        rank, world = (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
-        c = self.config
-        order: dict[str, Any] = {"seed": self.seed, "rank": rank, "world": world, "shuffle": shuffle}
-        if shuffle and self.clips is not None:
-            batches = EpochBatches(len(self.clips), self.batch_size // self.clip_frames, clips=self.clips, **order)
-        else:
-            batches = EpochBatches(len(dataset), self.batch_size, **order)
-        if shuffle and self.trainer is not None:
+        """Training clips in random order, another in every epoch; this process's share of every batch."""
+        rank, world, epoch = 0, 1, 0
+        if self.trainer is not None:
+            rank, world = self.trainer.global_rank, self.trainer.world_size
             # Workers prefetch before Lightning sets the epoch, which is not 0 in a resumed training.
             progress: Any = self.trainer.fit_loop.epoch_progress.current
-            batches.set_epoch(progress.processed)
-        return sample_loader(dataset, batches, c.workers)
+            epoch = progress.processed
+        # The order of an epoch is drawn with the sum of seed and epoch: no two trainings share one.
+        seed = (self.seed << 20) % 2**63
+        order: Any = DistributedSampler(self._opened(self.train_set), world, rank, seed=seed, drop_last=True)
+        order.set_epoch(epoch)
+        return self._loader(self.train_set, self.batch_size // self.clip_frames, sampler=order, drop_last=True)
 
+    def val_dataloader(self) -> DataLoader[Sample]:
+        """Validation frames in order."""
+        return self._loader(self.validation_set, self.batch_size)
 
-def sample_loader(dataset: SampleDataset, batches: EpochBatches, workers: int = 0) -> DataLoader[Sample]:
-    """A loader of samples in the order of ``batches``, with ``workers`` processes (0: this one). They are started with
-    "spawn", because forked processes inherit the state of OpenMP's threads and hang if the parent has used them."""
-    return DataLoader(
-        dataset,
-        batch_sampler=batches,
-        num_workers=workers,
-        pin_memory=torch.cuda.is_available(),
-        multiprocessing_context="spawn" if workers else None,
-        persistent_workers=workers > 0,
-        # Without a generator, every iteration would draw from the global one.
-        generator=torch.Generator(),
-    )
+    def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> dict[str, Tensor]:
+        """A batch on its device, augmented in training, and its colours normalised for the network."""
+        image, depth, K, pose = (batch[name] for name in Sample.__annotations__)
+        if self.augmentation is not None and self.trainer is not None and self.trainer.training:
+            image, depth, K = self.augmentation(image, depth, K)
+            if self.clip_frames == 1:  # the camera was turned or mirrored
+                pose = torch.full_like(pose, torch.nan)
+        return {"image": self.preprocess.normalized(image), "depth": depth, "intrinsics": K, "T_world_cam": pose}
+
+    def _opened(self, dataset: SampleDataset | None) -> SampleDataset:
+        if dataset is None:
+            raise RuntimeError("call setup() before asking for a loader")
+        return dataset
+
+    def _loader(self, dataset: SampleDataset | None, batch_size: int, **how: Any) -> DataLoader[Sample]:
+        workers = self.config.workers
+        return DataLoader(
+            self._opened(dataset),
+            batch_size,
+            collate_fn=joined,
+            num_workers=workers,
+            pin_memory=torch.cuda.is_available(),
+            # Forked processes inherit the state of OpenMP's threads and hang if the parent has used them.
+            multiprocessing_context="spawn" if workers else None,
+            persistent_workers=workers > 0,
+            # Without a generator, every iteration would draw from the global one.
+            generator=torch.Generator(),
+            **how,
+        )
 
 
 def sources(config: DataConfig) -> tuple[SequenceFrames, SequenceFrames]:

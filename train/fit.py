@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
@@ -13,45 +12,44 @@ from typing import Any
 import lightning.pytorch as pl
 import torch
 
-from ufmstar_torch.eval.run.files import write_json_atomic
+from ufmstar_torch.eval.engine.files import write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.machine import hardware, versions
-from ufmstar_torch.models.trained import load_for_training, save_trained
-from ufmstar_torch.train.checkpoints import ResumeError
-from ufmstar_torch.train.folder import SUMMARY, open_folder
-from ufmstar_torch.train.member import RESULT, WEIGHTS, make_trainer, quiet_lightning, train_member
+from ufmstar_torch.models.trained import save_trained
+from ufmstar_torch.train.folder import SUMMARY, WEIGHTS, open_folder
+from ufmstar_torch.train.member import (
+    make_trainer,
+    quiet_lightning,
+    read_checkpoint,
+    result_of,
+    train_member,
+    trained_network,
+)
+from ufmstar_torch.train.module import FIGURES
 from ufmstar_torch.train.presets import text_table
-from ufmstar_torch.train.progress import FIGURES
 from ufmstar_torch.train.settings import Job
 
 
-def fit(
-    job: Job,
-    *,
-    resume: bool = False,
-    overwrite: bool = False,
-    asked: Callable[[], bool] | None = None,
-    command: Sequence[str] = (),
-) -> dict[str, Any]:
+def fit(job: Job, *, resume: bool = False, overwrite: bool = False, command: Sequence[str] = ()) -> dict[str, Any]:
     """Train all members that are not finished, and write OUT/trained.safetensors and OUT/summary.json.
 
     Args:
         job: recipe, data and settings.
         resume, overwrite: treatment of an earlier training in the folder; see ``folder.open_folder``.
-        asked: returns True to stop, after the current step.
         command: the command line, for the summary.
 
     Returns:
         The summary; its "stopped" is the reason if not all members are finished. In a distributed training, all
-        processes except the first return only "stopped".
+        processes except the first return an empty one.
 
     Raises:
         FolderError: the folder cannot be used with these options.
-        NonFiniteLossError: a training has diverged. Finished members are written first.
+        NonFiniteLossError: a training has diverged.
         ResumeError: a checkpoint cannot be read.
+        KeyboardInterrupt: Ctrl-C or SIGTERM. After this and after other errors, the weights of the checkpoints are
+            written first.
     """
     began = time.monotonic()
-    end = began + 60 * job.settings.max_minutes if job.settings.max_minutes else None
     # The trainer determines the rank of this process, for every launcher.
     with quiet_lightning():
         trainer = make_trainer(job, 0)
@@ -61,11 +59,14 @@ def fit(
         stopped: str | None = "failed"
         try:
             _meet(trainer, job.settings.out)
-            stopped = train_members(job, end=end, asked=asked)
+            stopped = train_members(job, began)
+        except KeyboardInterrupt:
+            stopped = "interrupted"
+            raise
         finally:
             if first:
                 summary = _conclude(job, stopped, time.monotonic() - began, command)
-    return summary if first else {"stopped": stopped}
+    return summary if first else {}
 
 
 def _meet(trainer: pl.Trainer, out: Path) -> None:
@@ -80,42 +81,30 @@ def _meet(trainer: pl.Trainer, out: Path) -> None:
         raise FolderError(f"--out {out} does not exist: all machines must see the folder of the first process")
 
 
-def read_result(job: Job, member: int) -> dict[str, Any]:
-    """The content of a member's result.json; empty if there is none."""
-    file = job.folder(member) / RESULT
-    if not file.is_file():
-        return {}
-    try:
-        result = json.loads(file.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ResumeError(f"{file} is not the result of a member: {error}; --overwrite starts again") from error
-    if not isinstance(result, dict):
-        raise ResumeError(
-            f"{file} is not the result of a member, but {type(result).__name__}; --overwrite starts again"
-        )
-    return result
-
-
-def train_members(job: Job, *, end: float | None = None, asked: Callable[[], bool] | None = None) -> str | None:
-    """Train the unfinished members until ``end``, in ``time.monotonic()``'s seconds, or until ``asked`` returns True.
-    The remaining time is divided evenly among them. Returns the reason of a stop, or None if all are finished."""
-    members = [member for member in range(job.recipe.members) if not read_result(job, member).get("finished")]
-    first: str | None = None
+def train_members(job: Job, began: float) -> str | None:
+    """Train the unfinished members. The time that remains of ``max_minutes`` since ``began``, in
+    ``time.monotonic()``'s seconds, is divided evenly among them. Returns the reason of a stop, or None if all are
+    finished."""
+    members = [member for member in range(job.recipe.members) if not _result(job, member).get("finished")]
+    most = 60 * job.settings.max_minutes
     for index, member in enumerate(members):
-        if asked is not None and asked():
-            return first or "stopped"
-        now, remaining = time.monotonic(), len(members) - index
-        deadline = None if end is None else now + max(0.0, end - now) / remaining
-        reason = train_member(job, member, deadline=deadline, asked=asked)
-        first = first or reason
-    return first
+        remaining = (began + most - time.monotonic()) / (len(members) - index)
+        # Timer takes whole microseconds, at least one.
+        train_member(job, member, seconds=max(1e-6, remaining) if most else None)
+    finished = all(_result(job, member).get("finished") for member in members)
+    return None if finished else "time budget spent"
+
+
+def _result(job: Job, member: int) -> dict[str, Any]:
+    stored = read_checkpoint(job, member)
+    return {} if stored is None else result_of(job, member, stored)
 
 
 def _conclude(job: Job, stopped: str | None, seconds: float, command: Sequence[str]) -> dict[str, Any]:
     """Write all members that have weights to one file, and the summary."""
     r, out = job.recipe, job.settings.out
-    members = [m for m in range(r.members) if (job.folder(m) / WEIGHTS).is_file()]
-    results = [read_result(job, m) for m in members]
+    stored = {m: content for m in range(r.members) if (content := read_checkpoint(job, m)) is not None}
+    results = [result_of(job, m, content) for m, content in stored.items()]
     gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
     summary = {
         "program": "ufmstar train",
@@ -130,8 +119,8 @@ def _conclude(job: Job, stopped: str | None, seconds: float, command: Sequence[s
         "versions": versions(),
         "hardware": {**hardware(), "threads": torch.get_num_threads(), "gpus": gpus},
     }
-    if members:
-        networks = [load_for_training(job.folder(m) / WEIGHTS, job.backbone)[0] for m in members]
+    if stored:
+        networks = [trained_network(job, m, content) for m, content in stored.items()]
         info = {"recipe": r.to_dict(), "mean": summary["mean"], "command": list(command)}
         save_trained(out / WEIGHTS, networks, r.network, half=r.half, info=info)
     write_json_atomic(out / SUMMARY, summary)

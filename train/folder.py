@@ -3,7 +3,7 @@
 ```
 OUT/training.json         settings at the start
 OUT/lock                  locked during a training
-OUT/member_0/...          of each member: checkpoint, weights, version_N/metrics.csv of every session
+OUT/member_0/...          of each member: last.ckpt, and version_N/metrics.csv of every session
 OUT/tensorboard/          logs
 OUT/trained.safetensors   all members
 OUT/summary.json          figures, command, versions, hardware, seconds
@@ -18,11 +18,10 @@ from dataclasses import asdict
 from typing import Any
 
 from ufmstar_torch.eval.run.folder import FolderKind, output_folder
-from ufmstar_torch.train.checkpoints import NAME as CHECKPOINT
-from ufmstar_torch.train.member import RESULT, WEIGHTS
+from ufmstar_torch.train.member import CHECKPOINT
 from ufmstar_torch.train.settings import Job
 
-SUMMARY = "summary.json"
+SUMMARY, WEIGHTS = "summary.json", "trained.safetensors"
 _SETTINGS = "version_*/hparams.yaml"  # of Lightning's loggers
 # Fields of the data's configuration that change only the speed.
 _SPEED = ("workers", "render_workers", "cache")
@@ -54,10 +53,10 @@ TRAINING = FolderKind(
     program="ufmstar train",
     noun="training",
     manifest="training.json",
-    format=1,
+    format=2,
     lock="lock",
     files=(
-        *(f"member_[0-9]*/{name}" for name in (CHECKPOINT, WEIGHTS, RESULT, "version_*/metrics.csv", _SETTINGS)),
+        *(f"member_[0-9]*/{name}" for name in (CHECKPOINT, "version_*/metrics.csv", _SETTINGS)),
         *(f"tensorboard/member_*/{name}" for name in ("events.out.tfevents.*", "hparams.yaml")),
         WEIGHTS,
         SUMMARY,

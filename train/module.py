@@ -1,55 +1,51 @@
-"""The Lightning module: loss, optimizer, schedule, running mean of the weights, and logged figures."""
+"""The Lightning module: loss, optimizer, schedule, and logged figures."""
 
 from __future__ import annotations
 
-import copy
-import math
 from collections.abc import Mapping
-from itertools import islice
 from typing import Any
 
 import lightning.pytorch as pl
+import numpy as np
 import torch
-import torch.distributed as dist
+from lightning.pytorch.callbacks import WeightAveraging
 from torch import Tensor, nn
 from torch.nn.utils import get_total_norm
-from torch.optim import Adam, Optimizer
-from torch.optim.lr_scheduler import LambdaLR
+from torch.optim import Adam
+from torch.optim.lr_scheduler import CosineAnnealingLR, LinearLR, LRScheduler, SequentialLR
 
+from ufmstar_torch.eval.metrics import NLL, DepthAccuracy
 from ufmstar_torch.frames.prediction import stated_range
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble
 from ufmstar_torch.models.distribution import DepthDistribution, GaussianDepth
-from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.train.distil import Teacher, distillation_sums
-from ufmstar_torch.train.losses import loss_sums
+from ufmstar_torch.train.losses import gaussian_nll, loss_sums
 from ufmstar_torch.train.presets import Recipe
-from ufmstar_torch.train.progress import Sums, Validation
 
 Batch = Mapping[str, Any]
-FIGURES_KEY = "ufmstar_figures"  # of the last validation, in checkpoints
+# Of the last validation: the likelihood; that of the same depth with one variance for all pixels, the mean squared
+# error, which is the best constant; and the accuracy of the depth.
+FIGURES = ("val_nll", "val_nll_constant", "val_delta1", "val_rmse", "val_rel")
+OF_MEMBER = "ufmstar"  # key of a checkpoint: the figures, and the length of the training
+# [m^2] Smallest predicted variance: (1 mm)^2, as for the heads.
+VARIANCE_FLOOR = 1e-6
 
 
 class NonFiniteLossError(RuntimeError):
-    """The loss is NaN or infinite; the message names the batch and its samples."""
+    """The loss or a weight is NaN or infinite; the message names the epoch and the step."""
 
 
 class TrainingModule(pl.LightningModule):
     """Trains one network.
 
-    The random numbers of a step (dropout) depend only on (seed, process, step), so that a resumed training gives the
-    same weights as an uninterrupted one.
+    The random numbers of an epoch (augmentation, dropout) depend only on (seed, process, epoch), so that a training
+    that is resumed after an epoch gives the same weights as an uninterrupted one.
 
     Args:
         network: an ``UncertaintyNetwork``, ``MonteCarloDropout`` or ``BatchEnsemble``, with ``.distribution(image)``.
         recipe: of its training.
-        total_steps: length of the schedule.
+        total_steps: length of the schedule, after which the training stops.
         seed: of the training.
-
-    Attributes:
-        averaged: running mean of the network's weights (``recipe.average``), or None.
-        residuals: sums of squared errors at the training steps of this epoch, for the constant-variance baseline.
-        losses: sums of the loss at the training steps of this epoch.
-        figures: of the last validation, by name.
     """
 
     def __init__(self, network: nn.Module, recipe: Recipe, total_steps: int, seed: int = 0) -> None:
@@ -59,20 +55,11 @@ class TrainingModule(pl.LightningModule):
         self.recipe = recipe
         self.total_steps = total_steps
         self.seed = seed
-        self.averaged: Any = copy.deepcopy(network).requires_grad_(False) if recipe.average else None
-        self.residuals = Sums()
-        self.losses = Sums()
-        self.validation = Validation()
+        self.accuracy = DepthAccuracy()
+        self.likelihood = NLL()
         self.figures: dict[str, float] = {}
-        self._batch_idx = 0
         # Not a submodule: it has no state between steps.
         self._teacher = Teacher(recipe.clip_frames, stated_range([network])) if recipe.clip_frames > 1 else None
-
-    @property
-    def result(self) -> DepthNetwork:
-        """The network to validate and save: the running mean if there is one."""
-        network: DepthNetwork = self.network if self.averaged is None else self.averaged
-        return network
 
     # ---- training ----
 
@@ -84,60 +71,36 @@ class TrainingModule(pl.LightningModule):
                 part.eval()
 
     def on_train_epoch_start(self) -> None:
-        """Reset the sums."""
-        self.residuals, self.losses = Sums(), Sums()
-
-    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        """Seed torch's generator from seed, process and step."""
-        self._batch_idx = batch_idx
-        torch.manual_seed(step_seed(self.seed, self.global_rank, self.global_step))
+        """Seed torch's generators from seed, process and epoch."""
+        words = np.random.SeedSequence((self.seed, self.global_rank, self.current_epoch)).generate_state(1, np.uint64)
+        torch.manual_seed(int(words[0]) >> 1)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """The loss of this process's share of the batch.
 
-        Returns the process's sum over the whole batch's number of pixels, times the number of processes: its gradient,
-        averaged over processes by DistributedDataParallel, is that of the mean over all pixels. Raises
-        NonFiniteLossError: it is NaN or infinite.
+        Returns the process's sum over the mean number of pixels of all processes: its gradient, averaged over processes
+        by DistributedDataParallel, is that of the mean over all pixels. Raises NonFiniteLossError: the loss of a logged
+        step is NaN or infinite.
         """
-        distribution = self._distribution(batch["image"])
-        target, valid = _tiled(batch["depth"], distribution), _tiled(batch["valid"], distribution)
-        total, count = self._loss_sums(batch, distribution, target, valid)
-        error = torch.where(valid, distribution.depth.detach().float() - target, 0.0).double()
-        sums = torch.stack([total.detach().double(), count.double(), error.square().sum(), valid.sum().double()])
-        all_sums, world = self._over_processes(sums)
-        if not math.isfinite(all_sums[0]):
-            raise NonFiniteLossError(self._blame("loss", batch_idx, float(total.detach())))
-        self.residuals = self.residuals.plus(all_sums[2:])
-        self.losses = self.losses.plus(all_sums[:2])
-        mean = all_sums[0] / all_sums[1].clamp(min=1)
-        self.log("train_loss", mean.float(), prog_bar=True, batch_size=len(target))
-        self.log("learning_rate", self.trainer.optimizers[0].param_groups[0]["lr"], batch_size=1)
-        return total * (world / all_sums[1].clamp(min=1)).to(total)
+        total, count = self._loss_sums(batch, self._distribution(batch["image"]))
+        pixels: Any = self.trainer.strategy.reduce(count.to(total.dtype), reduce_op="mean")
+        loss: Tensor = total / pixels.clamp(min=1)
+        where: dict[str, Any] = {"on_step": True, "on_epoch": True, "prog_bar": True, "sync_dist": True}
+        self.log("train_loss", loss.detach(), batch_size=len(batch["image"]), **where)
+        trainer: Any = self.trainer
+        if batch_idx % trainer.log_every_n_steps == 0:  # the log reads the value, too
+            self._require_finite(loss)
+        return loss
 
-    def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
-        """Raise NonFiniteLossError if the gradient of a finite loss is not finite, before it changes the weights."""
-        if self.trainer.precision == "16-mixed":
-            return  # the gradient scaler skips such steps and reduces the scale
-        gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
-        if gradients and not math.isfinite(get_total_norm(gradients)):
-            raise NonFiniteLossError(self._blame("gradient", self._batch_idx))
-
-    def optimizer_step(self, *arguments: Any, **named: Any) -> None:
-        """A step, and then an update of the running mean, so that a checkpoint after the step contains both.
-
-        Lightning's ``WeightAveraging`` is not used: its mean begins with the weights after the first step, it averages
-        batch norm's counters, and it swaps the weights in checkpoints.
-        """
-        super().optimizer_step(*arguments, **named)
-        if self.averaged is not None:
-            # A shorter memory in the first steps, so that the mean forgets the initial weights soon.
-            decay = min(self.recipe.average, self.global_step / (self.global_step + 10))
-            move_average(self.averaged, self.network, decay)
+    def on_train_batch_end(self, *_: Any) -> None:
+        """Stop at the last step, which may lie inside an epoch, after a validation."""
+        if self.global_step >= self.total_steps:
+            self.trainer.should_stop = True
 
     def on_train_epoch_end(self) -> None:
-        """Log the epoch's mean loss over pixels."""
-        if self.losses.pixels:
-            self.log("train_loss_epoch", self.losses.mean(), sync_dist=True)
+        """Raise NonFiniteLossError if the epoch's loss or a weight is not finite, before a checkpoint is written."""
+        self._require_finite(self.trainer.callback_metrics["train_loss_epoch"])
+        self._require_finite(get_total_norm(self.network.parameters()))
 
     def configure_optimizers(self) -> Any:
         """Adam, and the schedule per step."""
@@ -150,34 +113,31 @@ class TrainingModule(pl.LightningModule):
             {"params": [p for p in trained if id(p) in factors], "weight_decay": 0.0},
         ]
         optimizer = Adam([g for g in groups if g["params"]], r.learning_rate, betas=(r.beta1, r.beta2))
-        schedule = LambdaLR(optimizer, lambda step: share_of_rate(step, self.total_steps, r))
+        schedule = learning_rates(optimizer, r, self.total_steps)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     # ---- validation ----
 
-    def on_validation_epoch_start(self) -> None:
-        """Reset the sums."""
-        self.validation = Validation(self.device)
-
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Add a batch to the sums."""
-        self.validation.update(self.result(batch["image"]), batch["depth"], batch["valid"])
+        """Add a batch to the metrics."""
+        prediction, depth = self.network(batch["image"]), batch["depth"]
+        self.accuracy.update(prediction.depth, None, depth, depth > 0)
+        if prediction.variance is not None:
+            variance = prediction.variance.clamp(min=VARIANCE_FLOOR)
+            self.likelihood.update(prediction.depth, variance, depth, depth > 0)
 
     def on_validation_epoch_end(self) -> None:
-        """Log the validation's figures, over all processes."""
-        self.figures = self.validation.figures(self.residuals)
-        for name, value in self.figures.items():
-            self.log(name, value, prog_bar=name in ("val_nll", "val_delta1"), sync_dist=True)
-
-    # ---- state ----
+        """Log the validation's figures, over all processes; none without a pixel."""
+        figures = validation_figures(self.accuracy.compute(), self.likelihood.compute()["nll"])
+        self.accuracy.reset()
+        self.likelihood.reset()
+        self.figures = {name: float(value) for name, value in figures.items()}
+        for name, value in figures.items():
+            self.log(name, value.float(), prog_bar=name in ("val_nll", "val_delta1"), sync_dist=True)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the figures to Lightning's checkpoint."""
-        checkpoint[FIGURES_KEY] = self.figures
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Restore the figures."""
-        self.figures = checkpoint[FIGURES_KEY]
+        """Add the figures and the length of the training to Lightning's checkpoint."""
+        checkpoint[OF_MEMBER] = {"figures": self.figures, "total_steps": self.total_steps}
 
     def _distribution(self, image: Tensor) -> DepthDistribution:
         image = image.contiguous(memory_format=torch.channels_last)
@@ -185,71 +145,53 @@ class TrainingModule(pl.LightningModule):
             return self.network.distribution(image, repeat=False)
         return self.network.distribution(image)
 
-    def _loss_sums(
-        self, batch: Batch, distribution: DepthDistribution, target: Tensor, valid: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def _loss_sums(self, batch: Batch, distribution: DepthDistribution) -> tuple[Tensor, Tensor]:
         """The sum of the loss over this process's pixels, and their number."""
+        # The predictions of a BatchEnsemble's members are concatenated.
+        target = batch["depth"].repeat(len(distribution.depth) // len(batch["depth"]), 1, 1)
         if self._teacher is None or not isinstance(distribution, GaussianDepth):
-            return loss_sums(distribution, target, valid)
+            return loss_sums(distribution, target, target > 0)
         variance, measured = self._teacher(distribution.depth, batch["T_world_cam"], batch["intrinsics"])
-        return distillation_sums(distribution, target, valid, variance, measured)
+        return distillation_sums(distribution, target, target > 0, variance, measured)
 
-    def _over_processes(self, values: Tensor) -> tuple[Tensor, int]:
-        """The sum over all processes, and their number."""
-        if not (dist.is_available() and dist.is_initialized()):
-            return values, 1
-        total = values.clone()
-        dist.all_reduce(total)
-        return total, dist.get_world_size()
-
-    def _samples(self, batch_idx: int) -> list[str]:
-        """Names of the frames in this process's batch, whose order depends on the epoch."""
-        loader: Any = self.trainer.train_dataloader
-        batches = copy.copy(loader.batch_sampler)
-        batches.set_epoch(self.current_epoch)
-        return [loader.dataset.source.name(key.frame) for key in next(islice(batches, batch_idx, None))]
-
-    def _blame(self, what: str, batch_idx: int, loss: float | None = None) -> str:
-        moment = f"epoch {self.current_epoch}, batch {batch_idx} (step {self.global_step})"
-        samples = f"samples {', '.join(self._samples(batch_idx))}"
-        if self.trainer.world_size > 1:
-            samples = f"process {self.global_rank}{f' with loss {loss}' if loss is not None else ''}, {samples}"
-        return (
-            f"the {what} is not finite in {moment}, {samples}; a smaller learning rate or --set clip=1 may help; "
-            "the previous checkpoint remains"
-        )
+    def _require_finite(self, value: Tensor) -> None:
+        if not bool(value.isfinite()):
+            raise NonFiniteLossError(
+                f"the loss or a weight is not finite in epoch {self.current_epoch}, by step {self.global_step}; "
+                "a smaller learning rate or --set clip=1 may help; the previous checkpoint remains"
+            )
 
 
-def step_seed(seed: int, rank: int, step: int) -> int:
-    """A hash of (seed, process, step) in 63 bits."""
-    # SplitMix64's mixing, so that successive seeds are uncorrelated.
-    z = (seed * 0x9E3779B97F4A7C15 + rank * 0xBF58476D1CE4E5B9 + step * 0x94D049BB133111EB + 1) % 2**64
-    z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9 % 2**64
-    z = (z ^ (z >> 27)) * 0x94D049BB133111EB % 2**64
-    return (z ^ (z >> 31)) >> 1
-
-
-def share_of_rate(step: int, total: int, recipe: Recipe) -> float:
-    """The learning rate of a step (from 0) as a share of ``recipe.learning_rate``."""
-    warm = min(1.0, (step + 1) / (recipe.warmup_steps + 1))
+def learning_rates(optimizer: Adam, recipe: Recipe, total: int) -> LRScheduler:
+    """The learning rate of every step: a linear rise over the warm-up, then constant, or a cosine down to 0."""
+    warm = recipe.warmup_steps
+    rise = LinearLR(optimizer, 1 / (warm + 1), total_iters=warm)
     if recipe.schedule == "constant":
-        return warm
-    past = max(0, step - recipe.warmup_steps) / max(1, total - recipe.warmup_steps)
-    return warm * 0.5 * (1 + math.cos(math.pi * min(1.0, past)))
+        return rise
+    return SequentialLR(optimizer, [rise, CosineAnnealingLR(optimizer, max(1, total - warm))], [warm])
 
 
-@torch.no_grad()
-def move_average(averaged: nn.Module, network: nn.Module, decay: float) -> None:
-    """averaged <- decay averaged + (1 - decay) network, in place, also for batch norm's statistics; copies counters."""
-    state = network.state_dict()
-    for name, mean in averaged.state_dict().items():
-        if mean.is_floating_point():
-            mean.lerp_(state[name], 1 - decay)
-        else:
-            mean.copy_(state[name])
+def averaging(decay: float) -> WeightAveraging:
+    """Lightning's running mean of the weights and batch norm's statistics, from the first step's on.
+
+    The decay per step is smaller in the first steps, so that the mean forgets the initial weights soon."""
+
+    def mean_of(mean: Tensor, value: Tensor, updates: Any) -> Tensor:
+        if not mean.is_floating_point():
+            return value  # counters
+        factor = ((updates + 1) / (updates + 11)).clamp(max=decay)
+        return torch.lerp(mean, value, (1 - factor).to(mean))
+
+    return WeightAveraging(avg_fn=mean_of)
 
 
-def _tiled(target: Tensor, distribution: DepthDistribution) -> Tensor:
-    """The target repeated for every member of a BatchEnsemble, whose predictions are concatenated."""
-    times = len(distribution.depth) // len(target)
-    return target if times == 1 else target.repeat(times, 1, 1)
+def validation_figures(accuracy: Mapping[str, Tensor], likelihood: Tensor) -> dict[str, Tensor]:
+    """By name in metrics.csv, from the metrics' values: ``val_nll`` only if it is a number, which needs a variance, no
+    figures without a pixel."""
+    if not accuracy["pixels"]:
+        return {}
+    rmse = accuracy["rmse"]
+    constant = gaussian_nll(torch.zeros_like(rmse), rmse.square().clamp(min=VARIANCE_FLOOR).log(), rmse)
+    nll = {} if likelihood.isnan() else {"val_nll": likelihood}
+    of_depth = {"val_delta1": accuracy["delta1_ratio"], "val_rmse": rmse, "val_rel": accuracy["abs_rel"]}
+    return {**nll, "val_nll_constant": constant, **of_depth}

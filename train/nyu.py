@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ufmstar_torch.files.atomic import write_atomic
+from ufmstar_torch.files.write import write_atomic
 
 if TYPE_CHECKING:
     import h5py

@@ -55,7 +55,7 @@ def train_module(
         ValueError: an argument is invalid; others as ``fit`` and ``from_hugging_face``.
     """
     from ufmstar_torch.train.fit import fit
-    from ufmstar_torch.train.member import WEIGHTS
+    from ufmstar_torch.train.folder import WEIGHTS
 
     job = own_job(backbone, head, data, FitSettings(out=Path(out), **(settings or {})), **options)
     fit(job, resume=resume, overwrite=overwrite)
@@ -144,10 +144,10 @@ def _aligned(network: HuggingFaceDepth, data: DataConfig) -> Alignment:
     chosen = np.linspace(0, len(frames) - 1, min(_ALIGNED_FRAMES, len(frames))).round().astype(int).tolist()
     samples = [frames[index] for index in chosen]
     with torch.no_grad():
-        predicted = torch.cat([network.raw(sample["image"][None]) for sample in samples])
-    depth, valid = (torch.stack([sample[key] for sample in samples]) for key in ("depth", "valid"))
+        predicted = torch.cat([network.raw(network.preprocess.normalized(sample["image"])) for sample in samples])
+    depth = torch.cat([sample["depth"] for sample in samples])
     fit = {"inverse": fit_inverse_depth, "affine": fit_affine_depth}[network.kind]
-    return fit(predicted, depth, valid, shift=None, pooled=True).alignment
+    return fit(predicted, depth, depth > 0, shift=None, pooled=True).alignment
 
 
 def _new_parts(spec: NetworkSpec) -> tuple[str, ...]:

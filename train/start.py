@@ -121,7 +121,11 @@ def _from_onnx(spec: NetworkSpec, path: Path) -> Backbone:
     source = FastDepth.from_onnx(path, dropout=spec.dropout, size=spec.size)
     if not isinstance(backbone, FastDepth) or source.widths != backbone.widths:
         raise ValueError(f"init: {path} has the channels {source.widths}; --set network.widths=pruned or full may fit")
-    fill(backbone, source.state_dict(), f"{path} (--set network.norm={'true' if spec.norm else 'false'})")
+    norm = "encoder.0.norm.weight" in source.state_dict()
+    if norm != spec.norm:
+        kind = "has batch norms" if norm else "has folded batch norms"
+        raise ValueError(f"init: {path} {kind}: --set network.norm={str(norm).lower()} fits")
+    fill(backbone, source.state_dict(), str(path))
     return backbone
 
 

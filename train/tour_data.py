@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, make_sequence
 from ufmstar_torch.eval.tour.style import style_of
-from ufmstar_torch.files.arrays import read_npy
-from ufmstar_torch.files.atomic import write_atomic
+from ufmstar_torch.files.read import read_npy
+from ufmstar_torch.files.write import write_atomic
 from ufmstar_torch.train.data_config import DataConfig
 from ufmstar_torch.train.sequence_data import SequenceFrames
 

@@ -12,13 +12,13 @@ from torch import nn
 
 from ufmstar_torch.anchors.sources import DENSE
 from ufmstar_torch.eval.engine.evaluate import Judge, evaluate_sequence
-from ufmstar_torch.eval.engine.judge import METRICS
 from ufmstar_torch.eval.engine.networks import NetworkSource
+from ufmstar_torch.eval.engine.record import METRICS
 from ufmstar_torch.eval.methods.method import UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.eval.report.figures_curves import write_curves
+from ufmstar_torch.eval.report.figures_calibration import write_curves
 from ufmstar_torch.eval.sequences import FrameSequence, open_sequence
 from ufmstar_torch.frames.networks import NetworksInTurn
 from ufmstar_torch.models.any_network import wrap_network

@@ -12,11 +12,13 @@ import sys
 import traceback
 from collections.abc import Sequence
 from importlib import import_module
+from io import TextIOWrapper
 from typing import Any
 
 from ufmstar_torch.runtime.optional import naming_extra
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
+CLOSED = 141  # of a program that SIGPIPE ends
 # By name: module and purpose.
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("eval.commands.demo", "the method on rendered rooms, without data or weights"),
@@ -51,12 +53,25 @@ _MOST_THREADS = 64
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command and return its exit code: 0 done, 1 failed, 2 wrong usage, 130 interrupted.
+    """Run a command and return its exit code: 0 done, 1 failed, 2 wrong usage, 130 interrupted, 141 nobody reads on.
 
     Args:
         arguments: without the program's name; None = ``sys.argv[1:]``.
     """
-    words = list(sys.argv[1:] if arguments is None else arguments)
+    if isinstance(sys.stdout, TextIOWrapper):  # a terminal may not have the letters of a file's name
+        sys.stdout.reconfigure(errors="backslashreplace")
+    try:
+        try:
+            return _main(list(sys.argv[1:] if arguments is None else arguments))
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:  # the reader of the output has closed it, as `head` does
+        _silence()
+        return CLOSED
+
+
+def _main(words: Sequence[str]) -> int:
+    """Run the command of the words and return its exit code. Raises BrokenPipeError: nobody reads the output."""
     if words[:1] in ([], ["-h"], ["--help"]):
         commands = "\n".join(f"  {name:13}{purpose}" for name, (_, purpose) in COMMANDS.items())
         print(_HELP.format(commands=commands), end="")
@@ -88,6 +103,8 @@ def _run(name: str, words: Sequence[str]) -> int:
         try:
             options = command.read(words)
             _set_up(options)
+        except BrokenPipeError:
+            raise
         except (OSError, ValueError) as error:
             raise UsageError(error) from error
         return int(command.main(options))
@@ -97,10 +114,19 @@ def _run(name: str, words: Sequence[str]) -> int:
         return _end(f"ufmstar {name}: {_one_line(error)}", USAGE)
     except KeyboardInterrupt:
         return _end(f"ufmstar {name}: interrupted", INTERRUPTED)
+    except BrokenPipeError:
+        raise
     except _FAILURES as error:
         if debug:
             traceback.print_exc()
         return _end(f"ufmstar {name}: failed: {_one_line(naming_extra(error, 'this command'))}", FAILED)
+
+
+def _silence() -> None:
+    """Send what is still to print nowhere, so that Python does not fail at it when it ends."""
+    with open(os.devnull, "w") as nowhere:
+        for descriptor in (1, 2):
+            os.dup2(nowhere.fileno(), descriptor)
 
 
 def _set_up(options: Any) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -12,6 +14,8 @@ from ufmstar_torch.posterior.config import PosteriorConfig as PosteriorConfig
 from ufmstar_torch.runtime.checked import Checked, choice, number, section
 
 _SLOT = 84  # [bytes] of a component's state without features
+# Implementations of SPGF iterate over the depth bins; more than this indicate a mistake in the units.
+_MOST_BINS = 10_000
 
 # [m] Largest depth of a network that states none; SPGF's own.
 UNSTATED_RANGE = 20.0
@@ -89,6 +93,11 @@ class SPGFConfig(Checked):
                 "SPGFConfig.noise_thresh and .line_thresh are upper clamps and must not lie below "
                 f".noise_floor = {self.noise_floor}, got {self.noise_thresh} and {self.line_thresh}"
             )
+        if self.depth_limit > _MOST_BINS * self.min_gaussian_length:
+            raise ValueError(
+                f"SPGFConfig.min_gaussian_length = {self.min_gaussian_length} m would cut SPGFConfig.max_depth = "
+                f"{self.depth_limit} m into more than {_MOST_BINS} bins; are both in metres?"
+            )
 
     @classmethod
     def preset(cls, name: str) -> SPGFConfig:
@@ -124,21 +133,16 @@ class SPGFConfig(Checked):
         of the two factors, since f is the smaller focal length: a camera with square pixels keeps its thresholds in
         metres when its image is resized.
         """
-        if not self.scale_with_image:
-            return self
-        across, down = width / self.reference_width, height / self.reference_height
-        resized = max(across, down) if self.slope_focal == "camera" else 1.0
-        return replace(
-            self,
-            adaptive_thresh_scale=self.adaptive_thresh_scale * resized,
-            occlusion_gap=max(1, round(self.occlusion_gap * across)),
-            n_check=max(1, round(self.n_check * across)),
-            sparse=round(self.sparse * across),
-            min_pixels=max(1, round(self.min_pixels * across * down)),
-            min_rows=max(1, round(self.min_rows * down)),
-            reference_height=height,
-            reference_width=width,
-        )
+        return _scaled(self, height, width) if self.scale_with_image else self
+
+    @property
+    def depth_bins(self) -> int:
+        """Number of depth bins that reaches ``depth_limit`` for every camera, since no bin is shorter than L0."""
+        return math.ceil(self.depth_limit / self.min_gaussian_length) + 2
+
+    def segments_per_row(self, width: int) -> int:
+        """Most segments in a row of ``width`` pixels, each of which has more than ``sparse`` of them; at least 1."""
+        return max(1, width // (self.sparse + 1))
 
     @property
     def fixed_slope(self) -> bool:
@@ -154,6 +158,23 @@ class SPGFConfig(Checked):
         """
         scale = focal / self.reference_focal if self.fixed_slope else 1.0
         return self.adaptive_thresh_scale * scale / focal
+
+
+@functools.lru_cache(maxsize=16)  # constructing a config repeats its checks in every frame
+def _scaled(config: SPGFConfig, height: int, width: int) -> SPGFConfig:
+    across, down = width / config.reference_width, height / config.reference_height
+    resized = max(across, down) if config.slope_focal == "camera" else 1.0
+    return replace(
+        config,
+        adaptive_thresh_scale=config.adaptive_thresh_scale * resized,
+        occlusion_gap=max(1, round(config.occlusion_gap * across)),
+        n_check=max(1, round(config.n_check * across)),
+        sparse=round(config.sparse * across),
+        min_pixels=max(1, round(config.min_pixels * across * down)),
+        min_rows=max(1, round(config.min_rows * down)),
+        reference_height=height,
+        reference_width=width,
+    )
 
 
 @dataclass(frozen=True)
@@ -259,7 +280,7 @@ class UfMStarConfig(Checked):
 
     # Fusion (section "Multiview Fusion")
     overlap_weighted: bool = False
-    # Two views from one position are one view (``views``).
+    # Two views from one position are one view (``steps.fuse``).
     view_baseline: float | None = number(0.07, "b_0", "1", 0.0, open_low=True, optional=True)
     # m averages the paper's squared 2-Wasserstein distance, or the squared depth difference where both Gaussians are
     # seen (``disagree``).
@@ -329,7 +350,7 @@ class UfMStarConfig(Checked):
         - ``segment.slope_focal``: SPGF's thresholds have the camera's own focal length here, by default the
           reference's, which made no difference on tours.
         - ``view_baseline``: every comparison counts here, and the first view counts as agreement; by default a
-          comparison counts as far as the view changed (``views``).
+          comparison counts as far as the view changed (``steps.fuse``).
         - ``regression``: over the Gaussians within .1 m here, or .5 m where there are none; by default over all, the
           sum that this approximates to save time, which was calibrated better.
         - ``unmeasured``: a surface that no two views compared reads as 0 here, as a share of its depth by default.

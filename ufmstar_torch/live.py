@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import sys
-from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -13,15 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from threading import Condition, Thread, current_thread
 from time import perf_counter
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.files.atomic import remove_temporaries, write_atomic
-from ufmstar_torch.files.lock import hold
-from ufmstar_torch.files.tensors import read_tensors
+from ufmstar_torch.files.read import read_tensors
+from ufmstar_torch.files.write import hold, remove_temporaries, write_atomic
 from ufmstar_torch.frames.arguments import (
     CameraLike,
     ImageLike,
@@ -31,16 +29,13 @@ from ufmstar_torch.frames.arguments import (
     as_pose,
     require_number,
 )
-from ufmstar_torch.frames.clock import JUMP, StreamClock, Verdict
+from ufmstar_torch.frames.clock import PoseBuffer, StreamClock, Verdict
 from ufmstar_torch.frames.frame import FRAME_FAULTS, NOT_FINITE
 from ufmstar_torch.frames.output import UncertaintyOutput
 from ufmstar_torch.frames.warnings import LOGGER
-from ufmstar_torch.gaussians.trajectory import SAME_TIME, Trajectory, interpolate_pose
+from ufmstar_torch.gaussians.trajectory import SAME_TIME
 from ufmstar_torch.kernels.cpu.check import pose_fault
 from ufmstar_torch.uncertain_depth import UncertainDepth
-
-if TYPE_CHECKING:
-    from filelock import BaseFileLock
 
 # Reasons for which an image is dropped (NEWER, CLOSED) or skipped (the others).
 NEWER, CLOSED = "a newer image was ready", "closed"
@@ -48,8 +43,6 @@ BACKWARDS, LATE, GAP = "its stamp is not after the image before", "no pose in ti
 LOST = "a pose around it is not finite"
 DOUBTFUL = "its stamp is far from those before it"
 _WAITING = 16  # most images that wait for their poses: half a second at 30 frames/s
-_DOUBTFUL = 64  # most poses with doubtful stamps that wait for others
-_POSES = 4096  # most poses in the buffer: 4 s of an inertial filter at 1 kHz
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +85,51 @@ class _Waiting:
     image: ImageLike
     intrinsics: Tensor
     received: float
+
+
+class StateFile:
+    """The file of a model's stream state, which one process at a time writes. The model continues from it if it exists.
+
+    Raises:
+        FileNotFoundError, IsADirectoryError: the folder does not exist, or ``file`` is one.
+        ValueError: another process writes the file, or the model cannot continue from it, and is unchanged.
+    """
+
+    def __init__(self, file: Path, model: UncertainDepth) -> None:
+        if not file.parent.is_dir():
+            raise FileNotFoundError(f"state: no such folder: {file.parent}")
+        if file.is_dir():
+            raise IsADirectoryError(f"state must be a file, got the folder {file}")
+        self._file, target = file, Path(os.path.realpath(file))
+        lock = hold(target.with_name(f".{target.name}.lock"))
+        if lock is None:
+            raise ValueError(f"state: another process is writing {file}: each needs a file of its own")
+        self._lock = lock
+        try:  # temporary files of a killed process go
+            remove_temporaries(path for path in target.parent.iterdir() if path.name.startswith(f".{target.name}."))
+            if file.exists():
+                self._load(model)
+        except BaseException:
+            lock.release()
+            raise
+
+    def _load(self, model: UncertainDepth) -> None:
+        try:
+            with self._file.open("rb") as opened:
+                state = read_tensors(opened, "it")
+            model.load_stream_state(state)
+        except (RuntimeError, TypeError, ValueError, OSError) as error:
+            text = f"state {self._file} cannot be continued: {error}. Delete the file, or name another one, to begin"
+            raise ValueError(f"{text} anew") from error
+
+    def save(self, model: UncertainDepth) -> None:
+        """Write the model's state atomically."""
+        values = model.stream_state()
+        write_atomic(self._file, lambda file: torch.save(values, file))
+
+    def release(self) -> None:
+        """Let other processes write the file."""
+        self._lock.release()
 
 
 class LiveDepth:
@@ -144,44 +182,18 @@ class LiveDepth:
             raise TypeError(f"model must be an UncertainDepth, got {type(model).__name__}: UncertainDepth(network)")
         if not callable(on_result):
             raise TypeError(f"on_result must be callable, got {type(on_result).__name__}")
-        self._state = None if state is None else as_path("state", state)
-        if self._state is not None and not self._state.parent.is_dir():
-            raise FileNotFoundError(f"state: no such folder: {self._state.parent}")
-        if self._state is not None and self._state.is_dir():
-            raise IsADirectoryError(f"state must be a file, got the folder {self._state}")
         self._intrinsics = None if intrinsics is None else as_intrinsics(intrinsics)
-        self._lock = None if self._state is None else self._locked(self._state)
-        if self._state is not None and self._lock is not None and self._state.exists():
-            try:
-                load_state(model, self._state)
-            except BaseException:
-                self._lock.release()
-                raise
+        self._state = None if state is None else StateFile(as_path("state", state), model)
         self.model, self._on_result = model, on_result
         self._max_wait, self._max_gap, self._save_every = max_wait, max_gap, save_every
         self._changed = Condition()  # guards everything below
         self._waiting: list[_Waiting] = []  # images, the oldest first
-        self._times: list[float] = []  # of the poses, increasing
-        self._poses: list[np.ndarray] = []
-        self._last_image = -math.inf
-        self._image_clock, self._pose_clock = StreamClock(), StreamClock()
-        self._doubtful: list[tuple[float, np.ndarray]] = []  # poses whose stamps nothing has confirmed
+        self._poses, self._image_clock, self._last_image = PoseBuffer(), StreamClock(), -math.inf
         self._busy = self._ending = self._ended = self._resetting = False
         self._counts, self._dropped, self._skipped = Counter[str](), Counter[str](), Counter[str]()
         self._error: BaseException | None = None
         self._worker = Thread(target=self._run, name="ufmstar live", daemon=True)
         self._worker.start()
-
-    @staticmethod
-    def _locked(state: Path) -> BaseFileLock:
-        """Lock the file of the state, and remove temporary files of a killed process. Raises ValueError: another
-        process writes it."""
-        file = Path(os.path.realpath(state))
-        lock = hold(file.with_name(f".{file.name}.lock"))
-        if lock is None:
-            raise ValueError(f"state: another process is writing {state}: each needs a file of its own")
-        remove_temporaries(path for path in file.parent.iterdir() if path.name.startswith(f".{file.name}."))
-        return lock
 
     def push_image(self, stamp: float, rgb: ImageLike, intrinsics: CameraLike | None = None) -> None:
         """Submit an image.
@@ -238,40 +250,9 @@ class LiveDepth:
         stamp, pose = _seconds(stamp), _pose(T, self.model.ufm.config.rotation_tolerance)
         with self._changed:
             self._counts["poses"] += 1
-            if not self._replaced(stamp, pose):
-                self._insert(stamp, pose)
+            self._counts["dropped_poses"] += self._poses.add(stamp, pose, perf_counter(), self._image_clock.newest)
             if self._waiting:  # a worker without an image has no use for a pose
                 self._changed.notify_all()
-
-    def _replaced(self, stamp: float, pose: np.ndarray) -> bool:
-        """Replace the pose in the buffer that has the same stamp; False if there is none."""
-        index = bisect_left(self._times, stamp)
-        if index == len(self._times) or self._times[index] != stamp:
-            return False
-        self._poses[index] = pose
-        return True
-
-    def _insert(self, stamp: float, pose: np.ndarray) -> None:
-        """Insert a pose with a new stamp; after a jump of the clock, instead of all others."""
-        before = self._pose_clock.latest
-        verdict = self._pose_clock.judge(stamp, perf_counter(), self._image_clock.newest)
-        if verdict == Verdict.WAIT:
-            self._doubtful.append((stamp, pose))
-            self._counts["dropped_poses"] += max(len(self._doubtful) - _DOUBTFUL, 0)
-            del self._doubtful[:-_DOUBTFUL]
-            return
-        new = [(stamp, pose)]
-        if verdict == Verdict.JUMPED:
-            LOGGER.warning("the poses' clock jumped from %.3f s to %.3f s", before, stamp)
-            new = [one for one in self._doubtful if abs(one[0] - stamp) <= JUMP] + new
-            self._times, self._poses = [], []
-        self._counts["dropped_poses"] += len(self._doubtful) - (len(new) - 1)
-        self._doubtful = []
-        for time, T in new:
-            index = bisect_left(self._times, time)
-            self._times.insert(index, time)
-            self._poses.insert(index, T)
-        del self._times[:-_POSES], self._poses[:-_POSES]
 
     @property
     def statistics(self) -> LiveStatistics:
@@ -288,8 +269,8 @@ class LiveDepth:
         self._raise()
         with self._changed:
             self._drop_waiting(len(self._waiting), NEWER)
-            self._times, self._poses, self._last_image, self._resetting = [], [], -math.inf, True
-            self._image_clock, self._pose_clock, self._doubtful = StreamClock(), StreamClock(), []
+            self._poses, self._image_clock, self._last_image = PoseBuffer(), StreamClock(), -math.inf
+            self._resetting = True
 
     def wait_idle(self, timeout: float | None = None) -> bool:
         """Wait at most ``timeout`` [s] until no image waits or is processed (not in ``on_result``). Returns False after
@@ -330,8 +311,8 @@ class LiveDepth:
         with ExitStack() as stack:
             stack.push(self._keep_error)
             self._work()
-        if self._lock is not None:
-            self._lock.release()
+        if self._state is not None:
+            self._state.release()
         with self._changed:
             self._busy, self._ended = False, True
             self._changed.notify_all()
@@ -367,28 +348,18 @@ class LiveDepth:
 
     def _choose(self, now: float) -> tuple[_Waiting, np.ndarray] | None:
         """The newest image that needs no further wait, and its pose; drops older images."""
-        latest = self._times[-1] if self._times else -math.inf
         for n in reversed(range(len(self._waiting))):
             frame = self._waiting[n]
-            late = latest < frame.stamp - SAME_TIME
+            late = self._poses.latest < frame.stamp - SAME_TIME
             if late and now - frame.received < self._max_wait:
                 continue
             del self._waiting[n]
-            T = self._pose_at(frame.stamp)
+            T = self._poses.at(frame.stamp, self._max_gap)
             if T is not None and np.isfinite(T).all():
                 self._drop_waiting(n, NEWER)
                 return frame, T
             self._skip(LOST if T is not None else LATE if late else GAP, frame.stamp)
         return None
-
-    def _pose_at(self, stamp: float) -> np.ndarray | None:
-        """The pose [4, 4] at a moment [s]; NaN or None as ``interpolate_pose``."""
-        index = bisect_left(self._times, stamp)
-        around = slice(max(index - 1, 0), index + 1)
-        if not self._times[around]:
-            return None
-        trajectory = Trajectory(np.array(self._times[around]), np.stack(self._poses[around]))
-        return interpolate_pose(trajectory, stamp, self._max_gap)
 
     def _process(self, frame: _Waiting, T: np.ndarray, resetting: bool) -> bool:
         """Predict and deliver an image. Returns whether the state has changed."""
@@ -408,8 +379,7 @@ class LiveDepth:
 
     def _save(self) -> None:
         if self._state is not None:
-            values = self.model.stream_state()
-            write_atomic(self._state, lambda file: torch.save(values, file))
+            self._state.save(self.model)
             with self._changed:
                 self._counts["saved"] += 1
 
@@ -417,25 +387,13 @@ class LiveDepth:
         """Count an unusable image; logs the first one for each reason with the time range of the poses."""
         self._skipped[reason] += 1
         if self._skipped[reason] == 1:
-            span = f"{self._times[0]:.3f} to {self._times[-1]:.3f} s" if self._times else "none"
-            LOGGER.warning("image at %.3f s skipped: %s (poses: %s; logged once)", stamp, reason, span)
+            LOGGER.warning("image at %.3f s skipped: %s (poses: %s; logged once)", stamp, reason, self._poses.span)
 
     def _drop_waiting(self, count: int, reason: str) -> None:
         """Drop the ``count`` oldest waiting images."""
         del self._waiting[:count]
         if count:
             self._dropped[reason] += count
-
-
-def load_state(model: UncertainDepth, file: Path) -> None:
-    """Load the state in a file. Raises ValueError: the model cannot continue from it, and is unchanged."""
-    try:
-        with file.open("rb") as opened:
-            state = read_tensors(opened, "it")
-        model.load_stream_state(state)
-    except (RuntimeError, TypeError, ValueError, OSError) as error:
-        text = f"state {file} cannot be continued: {error}. Delete the file, or name another one, to begin anew"
-        raise ValueError(text) from error
 
 
 def _seconds(stamp: float) -> float:

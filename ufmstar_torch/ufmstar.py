@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from types import NoneType
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -12,24 +13,20 @@ from torch import Tensor
 from ufmstar_torch.anchors.anchors import Anchors, check_anchors
 from ufmstar_torch.anchors.doubts import AnchorDoubts
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.frames.arguments import Array, CameraLike, as_device, as_tensor, require_flag
+from ufmstar_torch.frames.arguments import Array, CameraLike, as_device, as_tensor, require_flag, require_kind
 from ufmstar_torch.frames.frame import FrameInput, as_confidence, check_frame, raise_faults
-from ufmstar_torch.frames.output import MeanUncertainty, StepOutput, UncertaintyOutput
+from ufmstar_torch.frames.output import MeanUncertainty, UncertaintyOutput
 from ufmstar_torch.frames.warnings import StreamWarnings
 from ufmstar_torch.gaussians.mixture import GaussianMixture
-from ufmstar_torch.gaussians.state import NAMES, UfMStarState
-from ufmstar_torch.kernels.select import FrameKernels, LateStep, select_frame, select_step
-from ufmstar_torch.posterior import memory
+from ufmstar_torch.gaussians.state import ALWAYS_FLOAT64, NAMES, UfMStarState
+from ufmstar_torch.kernels.select import FrameKernels, select_frame, select_step
 from ufmstar_torch.posterior.recalibrate import CONFIDENCE, Recalibration
-from ufmstar_torch.runtime.one_caller import one_caller
-from ufmstar_torch.runtime.stateful import StatefulModule, full_precision, outliving
+from ufmstar_torch.runtime.stateful import StatefulModule, full_precision, one_caller, outliving
 from ufmstar_torch.runtime.warm_up import warm_up
 from ufmstar_torch.steps import variance
-from ufmstar_torch.steps.query import query
-from ufmstar_torch.steps.regress import Regression, at_pixels
+from ufmstar_torch.steps.regress import Regression, query
 from ufmstar_torch.steps.sample import mean_uncertainty, sample_size
-from ufmstar_torch.steps.step import Step
-from ufmstar_torch.steps.step_parts import StepObserver
+from ufmstar_torch.steps.step import Step, StepObserver
 
 
 @one_caller("forward", "mean_uncertainty", "query", "reset", "state", "__getstate__")
@@ -50,12 +47,13 @@ class UfMStar(StatefulModule):
         dtype: of the state, torch.float32 or torch.float64.
         device: of the state until ``.to()``; None = that of the first frame.
 
-    Attribute ``observer``: receives the stages of every step, to time them (``step_parts.StepObserver``), or None.
+    Attribute ``observer``: receives the stages of every step, to time them (``step.StepObserver``), or None.
 
     Example: ``ufm = UfMStar()``; for every image, ``out = ufm(depth, T_world_cam, K)``; ``out.std`` [m].
     """
 
     STATE = NAMES
+    ALWAYS_FLOAT64 = ALWAYS_FLOAT64
     config: UfMStarConfig
     observer: StepObserver | None = None
     _cached_step: tuple[tuple[str, str], Step, FrameKernels] | None = None
@@ -69,16 +67,14 @@ class UfMStar(StatefulModule):
         device: torch.device | str | None = None,
     ) -> None:
         super().__init__()
-        if config is not None and not isinstance(config, UfMStarConfig):
-            raise TypeError(f"config must be a UfMStarConfig or None, got {type(config).__name__}")
+        require_kind("config", config, (UfMStarConfig, NoneType), "a UfMStarConfig or None")
         if not isinstance(dtype, torch.dtype) or dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         self.config = config if config is not None else UfMStarConfig()
         self.recalibration = variance.require_map(recalibration, self.config)
         self._warnings, self._doubts = StreamWarnings(), AnchorDoubts()
-        self._empty = memory.initial(0, self.config, dtype, as_device("device", device))
+        self._empty = UfMStarState.initial(0, self.config, dtype, as_device("device", device))
         self.STATE = tuple(self._empty.tensors())
-        self.ALWAYS_FLOAT64 = (*UfMStar.ALWAYS_FLOAT64, *memory.ALWAYS_FLOAT64)
         for name, value in self._empty.tensors().items():
             self.register_buffer(name, value)
 
@@ -112,7 +108,7 @@ class UfMStar(StatefulModule):
             epistemic: likewise E [m^2].
             valid: like ``depth``, bool, True = use.
             features: [B, F, H, W] with F = ``config.features``, averaged per component and regressed; of at most 1e12.
-            member: index of the network, or random sample, that predicted, an integer or [B]; see ``views``.
+            member: index of the network, or random sample, that predicted, an integer or [B]; see ``steps.fuse``.
             informative: [B] bool, False where the image shows nothing, so that the depth is neither fused nor measured.
             anchors: sparse depths of this frame, with ``config.anchors``; None = none.
             confidence: like ``depth``, the network's confidence, with ``config.confidence`` or a recalibration of it.
@@ -129,24 +125,19 @@ class UfMStar(StatefulModule):
             depth, pose, intrinsics, a, e, valid, features, member=member, informative=informative, anchors=anchors,
             confidence=confidence,
         )  # fmt: skip
-        out, maps, quantiles = self._observe(frame)
-        maps |= {} if self.config.variances_in_h else {"aleatoric": a, "epistemic": e}
-        maps |= {"network_depth": depth, "measured": out.measured, "valid": frame.valid}
+        out = self._observe(frame)
+        network = {} if self.config.variances_in_h else {"aleatoric": a, "epistemic": e}
+        maps = {**out.maps, **network, "network_depth": depth, "confidence": frame.confidence}
 
         def shaped(value: Tensor) -> Tensor:  # the argument may be [B, 1, H, W]
             return value if value.shape == depth.shape else value.reshape(depth.shape)
 
-        if self.config.posterior is None:
-            maps["depth"] = depth
-        named = {name: shaped(value) for name, value in maps.items() if value is not None}
-        best, variance, usable = (named.pop(name) for name in ("depth", "variance", "valid"))
+        named = {name: shaped(value) for name, value in maps.items() if name != "features" and value is not None}
         if self.config.features:
             named["features"] = out.features[..., : self.config.features]
-        if frame.confidence is not None:
-            named["confidence"] = shaped(frame.confidence)
-        return UncertaintyOutput(
-            best, variance, usable, named, out.statistics, quantiles=quantiles, current_cam=out.current_cam
-        )
+        best = depth if self.config.posterior is None else shaped(out.depth)
+        variance, valid = shaped(out.variance), shaped(out.valid)
+        return replace(out, depth=best, variance=variance, valid=valid, maps=named)
 
     if TYPE_CHECKING:
         __call__ = forward
@@ -190,8 +181,8 @@ class UfMStar(StatefulModule):
         )  # fmt: skip
         kernels = self._kernels(depth.device.type)[1].sample
         index, used = kernels.pixels(frame.valid, *sample_size(frame.size, pixels, fraction, seed))
-        out, maps, _ = self._observe(frame, index, average=require_flag("average", average))
-        return mean_uncertainty(out, maps, frame.depth, index, used, kernels.statistics)
+        out = self._observe(frame, index, average=require_flag("average", average))
+        return mean_uncertainty(out, used, kernels.statistics)
 
     def warm_up(
         self, size: tuple[int, int], *, streams: int = 1, progress: Callable[[int, int], object] | None = None
@@ -231,7 +222,6 @@ class UfMStar(StatefulModule):
     @property
     def state(self) -> UfMStarState:
         """The state, as an argument of ``ufmstar_torch.steps.step``."""
-        self._settle()
         return self._stored()
 
     def reset(self, streams: Sequence[int] | Tensor | None = None, *, keep_evidence: bool = False) -> None:
@@ -251,7 +241,7 @@ class UfMStar(StatefulModule):
             old, b = self.state, self.mean.shape[0]
             if streams is None:
                 self._warnings.reset()
-                new = memory.initial(b if keep_evidence else 0, self.config, old.mean.dtype, old.mean.device)
+                new = UfMStarState.initial(b if keep_evidence else 0, self.config, old.mean.dtype, old.mean.device)
             else:
                 self._warnings.reset((chosen := self._chosen(streams, b)).nonzero().flatten().tolist())
                 new = old.restarted(chosen)
@@ -265,8 +255,6 @@ class UfMStar(StatefulModule):
 
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
         self._empty.with_tensors(state).require(self.config, self._empty)
-        if state["weight"].device.type != "meta":
-            memory.require(state, self.config)
 
     def _checked(
         self, depth: Tensor, T: CameraLike, K: CameraLike, *maps: Array | None, anchors: Anchors | None,
@@ -290,57 +278,41 @@ class UfMStar(StatefulModule):
         self._doubts.judge(anchors, checked, frame.size)
         return replace(frame, anchors=checked)
 
-    def _observe(
-        self, frame: FrameInput, pixels: Tensor | None = None, *, average: bool = True
-    ) -> tuple[StepOutput, dict[str, Tensor | None], Tensor | None]:
-        """Run the step and the corrections by anchors, and store the new state.
-
-        Returns:
-            The step's output; the maps by name (``MAPS``) at every pixel [B, H, W], or at ``pixels`` [B, n] of the
-            flattened image; and the quantiles of intervals [B, 3], or None.
-        """
+    def _observe(self, frame: FrameInput, pixels: Tensor | None = None, *, average: bool = True) -> UncertaintyOutput:
+        """Run the step and the corrections by anchors, and store the new state. The maps are [B, H, W], or [B, n] at
+        ``pixels``, indices into the flattened image."""
         # Outside the caller's inference mode, since the state must outlive it.
         with outliving(), torch.no_grad(), full_precision(frame.depth.device):
-            state = memory.for_frame(self._stored(), frame, self.config)
+            state = self._stored().for_frame(frame, self.config)
             if self.config.on_bad_frame == "raise":
                 raise_faults(frame)
             if self.observer is not None:
                 self.observer.stage("check")
             step, kernels = self._kernels(frame.depth.device.type)
             state, out = step(state, frame, self.config, pixels=pixels, smooth=average, observer=self.observer)
-            after = variance.corrected(state, frame, out, self.config, self.recalibration, pixels, kernels.merge)
+            merging = kernels.merge
+            state, out, factor = variance.corrected(state, frame, out, self.config, self.recalibration, pixels, merging)
         # With gradients to A and E.
-        V = variance.total_variance(
-            after.disagreement, frame, out, self.config, self.recalibration, pixels, after.factor
-        )
-        network = variance.network_variances_at(frame, out.features, self.config, pixels)
-        maps = {"depth": at_pixels(frame.depth, pixels), "variance": V, "ufm_variance": V, **network._asdict()}
-        maps |= {"disagreement": out.disagreement, **after.maps}
-        self._store(after.state.tensors())  # last, so that an earlier error changes nothing
-        out = replace(out, statistics=replace(out.statistics, **after.counts))
-        self._warnings.after_frame(frame, out.statistics, after.state.frames, self.config)
-        return out, maps, after.quantiles
+        network = variance.network_maps(frame, out.features, self.config, pixels)
+        V = variance.total_variance(out.variance, network, frame, self.config, self.recalibration, pixels, factor)
+        maps = {"depth": out.depth, "variance": V, "ufm_variance": V, **network, **out.maps}
+        out = replace(out, depth=maps.pop("depth"), variance=maps.pop("variance"), maps=maps)
+        self._store(state.tensors())  # last, so that an earlier error changes nothing
+        self._warnings.after_frame(frame, out.statistics, state.frames, self.config)
+        return out
 
     def _stored(self) -> UfMStarState:
         return self._empty.with_tensors(cast("dict[str, Tensor]", self._buffers))  # avoids ``__getattr__``
 
     def _kernels(self, device_type: str) -> tuple[Step, FrameKernels]:
-        """The step and the check for a device. The step is cached, since it may hold pending components."""
+        """The step and the check for a device. The step is cached, since a GPU's counts components."""
         key = (self.config.backend, device_type)
         if self._cached_step is None or self._cached_step[0] != key:
-            self._settle()
             self._cached_step = key, select_step(*key), select_frame(*key)
         return self._cached_step[1:]
 
-    def _settle(self) -> None:
-        """Write the step's pending components into the state before it is saved, copied or moved."""
-        if self._cached_step is not None and isinstance(self._cached_step[1], LateStep):
-            with outliving(), torch.no_grad():
-                self._store(self._cached_step[1].settled(self._stored(), self.config).tensors())
-
     def __getstate__(self) -> dict[str, Any]:
         """A copy creates its own step."""
-        self._settle()
         return self.__dict__ | {"_cached_step": None}
 
     def extra_repr(self) -> str:

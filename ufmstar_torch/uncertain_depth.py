@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
+from types import NoneType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
@@ -31,7 +33,7 @@ from ufmstar_torch.frames.arguments import (
     require_kind,
     require_whole,
 )
-from ufmstar_torch.frames.image_check import ImageCheck
+from ufmstar_torch.frames.image_check import ImageCheck, warn_of_range
 from ufmstar_torch.frames.networks import (
     SAMPLES,
     NetworksInTurn,
@@ -42,18 +44,16 @@ from ufmstar_torch.frames.networks import (
     weights_mark,
 )
 from ufmstar_torch.frames.output import FrameStatistics, MeanUncertainty, UncertaintyOutput
-from ufmstar_torch.frames.prediction import DepthPrediction
+from ufmstar_torch.frames.prediction import DepthPrediction, copied
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.posterior.recalibrate import Recalibration
-from ufmstar_torch.runtime.one_caller import OneCaller, one_caller
+from ufmstar_torch.runtime.stateful import OneCaller, one_caller
 from ufmstar_torch.runtime.warm_up import along_wall, camera_of, require_size, warm_up
 from ufmstar_torch.ufmstar import UfMStar
 
-_BLACK = {torch.uint8: 1, torch.float32: 1 / 255, torch.float64: 1 / 255}  # largest value of a black image
 # Keys of a stream's state, or prefixes of keys: of UfM*, of the anchors' source, the number of processed images, and a
 # checksum of the networks' weights.
 _UFM, _LANDMARKS, _INDEX, _MARK = "ufm.", "landmarks.", "image_index", "weights_mark"
-_BRIGHT = 8.0  # largest value of a normalised image, by a wide margin
 _MISSED = "UfM* alone, without anchors and the depth that the posterior corrects with them: %s"
 
 
@@ -155,42 +155,24 @@ class UncertainDepth(NetworksInTurn):
         multiview_device: torch.device | str | None = None,
     ) -> None:
         members, preprocess = ([], None) if networks is None else self.accepted(networks, preprocess)
-        single, posterior = len(members) == 1, require_flag("posterior", posterior)
-        if not isinstance(mode, str) or mode not in ("alternate", "full"):
-            raise ValueError(f"mode must be 'alternate' or 'full', got {mode!r}")
-        if samples is not None and (require_whole("samples", samples) < 2 or not single or mode != "full"):
-            raise ValueError("samples must be at least 2 and goes with one network in mode 'full'")
-        if mode == "full" and single and samples is None:
-            raise ValueError("mode 'full' needs several networks, or samples for a stochastic one")
-        if len({id(member) for member in members}) < len(members):
-            raise ValueError("networks must differ, got one of them twice: for passes of a stochastic one set samples")
+        _require_passes(members, mode, samples)
         super().__init__(members or None, samples=samples, preprocess=preprocess)
-        self._caller = OneCaller()
-        config = UfMStarConfig() if config is None else config
-        for name, value, kind in (("config", config, UfMStarConfig), ("recalibration", recalibration, Recalibration)):
-            if value is not None and not isinstance(value, kind):
-                raise TypeError(f"{name} must be a {kind.__name__} or None, got {type(value).__name__}")
-        self._by_default = posterior and anchors is None
-        if self._by_default and (missed := _missed(networks)):
-            self._by_default, posterior = False, config.anchors is not None
-            if networks is not None or not posterior:
-                LOGGER.warning(_MISSED, missed)
-        anchors = "dense" if self._by_default else anchors
-        if posterior or anchors is not None:
-            config = config.replace(anchors=config.anchors or AnchorConfig())
-        if posterior:
-            config = config.replace(posterior=config.posterior or PosteriorConfig())
+        self._caller, self.mode = OneCaller(), mode
+        require_kind("config", config, (UfMStarConfig, NoneType), "a UfMStarConfig or None")
+        require_kind("recalibration", recalibration, (Recalibration, NoneType), "a Recalibration or None")
+        config, source = _with_evidence(
+            config or UfMStarConfig(), networks, require_flag("posterior", posterior), anchors
+        )
         self.ufm = UfMStar(config.within(self.max_depth, self.states_confidence), recalibration=recalibration)
-        self.landmarks = None if anchors is None else StreamLandmarks(anchors)
+        self.landmarks = None if source is None else StreamLandmarks(source)
+        self._by_default = source is not None and anchors is None
         self._unsearchable = False  # whether an image could not be searched for anchors
         self._searched = False  # whether the source of anchors has processed the current image
         # A source that searches the images compares their poses itself, but does not name the mistake.
         searching = self.landmarks is not None and self.landmarks.searching and not self._by_default
-        if isinstance(check_poses, bool) or not isinstance(check_poses, int) or check_poses < 0:
-            raise ValueError(f"check_poses must be a number of images of at least 0, got {check_poses!r}")
-        self._pose_check = PoseCheck(0 if searching else check_poses, self.ufm.config.rotation_tolerance)
+        images = require_whole("check_poses", check_poses, 0)
+        self._pose_check = PoseCheck(0 if searching else images, self.ufm.config.rotation_tolerance)
         self._image_check = ImageCheck()
-        self.mode = mode
         self.multiview_device = None if multiview_device is None else as_device("multiview_device", multiview_device)
         self._next = 0  # number of processed images
 
@@ -237,11 +219,13 @@ class UncertainDepth(NetworksInTurn):
     if TYPE_CHECKING:
         __call__ = forward
 
-    def stream(self, frames: Iterable[tuple[ImageLike, CameraLike, CameraLike]]) -> Iterator[UncertaintyOutput]:
+    def stream(
+        self, frames: Iterable[tuple[ImageLike, CameraLike, CameraLike]]
+    ) -> Generator[UncertaintyOutput, None, None]:
         """The predictions of a video, in order, with the networks one image ahead of UfM*.
 
-        With networks on a GPU and ``multiview_device="cpu"``, both run at the same time. Each result is yielded after
-        the next frame has been read.
+        Both run at the same time: networks on a GPU with ``multiview_device="cpu"``, those on the CPU in a thread of
+        their own. Each result is yielded after the next frame has been read.
 
         Args:
             frames: image, pose and intrinsics of each frame, as in :meth:`forward`.
@@ -252,15 +236,29 @@ class UncertainDepth(NetworksInTurn):
         waiting: _Predicted | None = None
         if isinstance(frames, Tensor | np.ndarray):
             raise TypeError(f"frames must be an iterable of (image, pose, intrinsics), got {type(frames).__name__}")
-        for frame in require_kind("frames", frames, Iterable, "an iterable of (image, pose, intrinsics)"):
-            if not isinstance(frame, tuple | list) or len(frame) != 3:
-                raise TypeError(f"frames must yield (image, pose, intrinsics), got {type(frame).__name__}")
-            ahead = self._predicted(*frame, ahead=waiting is not None)
-            if waiting is not None:
-                yield self._fused(waiting)
-            waiting = ahead
+        with ThreadPoolExecutor(1, thread_name_prefix="network") as pool:
+            for frame in require_kind("frames", frames, Iterable, "an iterable of (image, pose, intrinsics)"):
+                if not isinstance(frame, tuple | list) or len(frame) != 3:
+                    raise TypeError(f"frames must yield (image, pose, intrinsics), got {type(frame).__name__}")
+                if waiting is None or not self._networks_on_cpu():
+                    ahead = self._predicted(*frame, ahead=waiting is not None)
+                    if waiting is not None:
+                        yield self._fused(waiting)
+                    waiting = ahead
+                    continue
+                predicting = pool.submit(self._predict, *frame, number=self._next + 1)
+                out = self._fused(waiting)
+                wait([predicting])  # the networks are idle while the caller has the result
+                yield out
+                waiting = predicting.result()
         if waiting is not None:
             yield self._fused(waiting)
+
+    def _networks_on_cpu(self) -> bool:
+        """True if a second thread may run the networks: those on an accelerator run beside the CPU anyway, and autocast
+        holds for one thread."""
+        device = self._device()
+        return (device is None or device.type == "cpu") and not torch.is_autocast_enabled("cpu")
 
     def update(
         self,
@@ -285,7 +283,7 @@ class UncertainDepth(NetworksInTurn):
             ValueError, TypeError: as :meth:`UfMStar.forward`; the image is then not counted.
         """
         require_kind("prediction", prediction, DepthPrediction, "a DepthPrediction")
-        maps = maps_of(prediction, self.ufm)
+        maps = prediction.arguments(confidence=self.ufm.uses_confidence)
         out = self.ufm(pose=pose, intrinsics=intrinsics, valid=valid, features=features, anchors=anchors, **maps)
         self._next += 1
         if prediction.intrinsics is None:
@@ -319,11 +317,11 @@ class UncertainDepth(NetworksInTurn):
             ValueError, TypeError: as :meth:`UfMStar.mean_uncertainty`; alternation and landmarks then do not advance.
         """
         predicted = self._predicted(image, pose, intrinsics, features)
-        sample: dict[str, Any] = {"pixels": pixels, "fraction": fraction, "seed": seed, "average": average}
         with self._anchored(predicted, anchors, search=not self._by_default) as (found, p):
+            maps = p.arguments(confidence=self.ufm.uses_confidence)
             mean = self.ufm.mean_uncertainty(
                 pose=predicted.pose, intrinsics=p.K, valid=valid, features=predicted.features, anchors=found,
-                **maps_of(p, self.ufm), **sample,
+                pixels=pixels, fraction=fraction, seed=seed, average=average, **maps,
             )  # fmt: skip
         self._undo(mean.statistics)
         self._next += 1
@@ -442,27 +440,35 @@ class UncertainDepth(NetworksInTurn):
         ahead: bool = False,
     ) -> _Predicted:
         """The prediction for the next image, or, with ``ahead``, for the one after that."""
+        return self._predict(image, pose, intrinsics, features, number=self._next + ahead)
+
+    def _predict(
+        self,
+        image: ImageLike,
+        pose: CameraLike,
+        intrinsics: CameraLike,
+        features: Array | None = None,
+        *,
+        number: int,
+    ) -> _Predicted:
+        """The prediction for the image of an index."""
         if not self.networks:
             raise ValueError("UncertainDepth(None) has no networks: pass predictions to update")
         picture, T, K_image = as_image(image), as_pose(pose), as_intrinsics(intrinsics)
-        first = self._next == 0 and not ahead and picture.is_cpu and picture.dtype in _BLACK
-        if first and float(picture.max()) <= _BLACK[picture.dtype]:
-            LOGGER.warning("the first image is black: was it divided by 255 twice, or cast to whole numbers?")
-        if first and picture.is_floating_point() and float(picture.max()) > _BRIGHT and float(picture.min()) >= 0:
-            brightest = f"the first image has floats up to {float(picture.max()):g}"
-            LOGGER.warning("%s: pass bytes, or floats in [0, 1], unless the network expects this", brightest)
+        if number == 0:
+            warn_of_range(picture)
         if not isinstance(image, Tensor):  # a tensor's device is the caller's choice
             picture = picture.to(self._device() or picture.device)
-        member = None if self.mode == "full" else self.turn(self._next + ahead)
+        member = None if self.mode == "full" else self.turn(number)
         with torch.no_grad():
             x, K = self.prepare(picture, K_image.expand(len(picture), 3, 3))
             prediction = self.every(x, K) if member is None else self.member(x, K, member)
-        index = 0 if member is None else (self._next + ahead) % SAMPLES if self.stochastic else member
+        index = 0 if member is None else number % SAMPLES if self.stochastic else member
         prediction = replace(prediction, member=index)
         tensors = {name: value for name, value in vars(prediction).items() if isinstance(value, Tensor)}
         if features is not None:
             tensors["features"] = as_tensor("features", features)
-        there, ready = _copied(tensors, self.multiview_device)
+        there, ready = copied(tensors, self.multiview_device)
         H = there.pop("features", None)
         return _Predicted(picture, T, K_image, replace(prediction, **there), member, H, ready)
 
@@ -545,17 +551,33 @@ class UncertainDepth(NetworksInTurn):
         self._image_check.reset()
 
 
-def maps_of(prediction: DepthPrediction, ufm: UfMStar) -> dict[str, Any]:
-    """The arguments of :meth:`UfMStar.forward` from a prediction: depth, A, E, the network's index, whether the image
-    shows something, and the confidence if used."""
-    maps = {
-        "depth": prediction.depth,
-        "aleatoric": prediction.aleatoric_variance,
-        "epistemic": prediction.epistemic_variance,
-        "member": prediction.member,
-        "informative": prediction.informative,
-    }
-    return maps | ({"confidence": prediction.confidence} if ufm.uses_confidence else {})
+def _require_passes(members: Sequence[nn.Module], mode: object, samples: object) -> None:
+    """Raise a TypeError or ValueError unless the networks, their mode and ``samples`` fit."""
+    single = len(members) == 1
+    if not isinstance(mode, str) or mode not in ("alternate", "full"):
+        raise ValueError(f"mode must be 'alternate' or 'full', got {mode!r}")
+    if samples is not None and (require_whole("samples", samples) < 2 or not single or mode != "full"):
+        raise ValueError("samples must be at least 2 and goes with one network in mode 'full'")
+    if mode == "full" and single and samples is None:
+        raise ValueError("mode 'full' needs several networks, or samples for a stochastic one")
+    if len({id(member) for member in members}) < len(members):
+        raise ValueError("networks must differ, got one of them twice: for passes of a stochastic one set samples")
+
+
+def _with_evidence(config: UfMStarConfig, networks: object, posterior: bool, anchors: Any) -> tuple[UfMStarConfig, Any]:
+    """The config with the sections ``anchors`` and ``posterior`` that are used, and the source of anchors, or None.
+    Logs a warning if the default source cannot serve."""
+    if posterior and anchors is None and (missed := _missed(networks)):
+        posterior = config.anchors is not None
+        if networks is not None or not posterior:
+            LOGGER.warning(_MISSED, missed)
+    elif posterior and anchors is None:
+        anchors = "dense"
+    if posterior or anchors is not None:
+        config = config.replace(anchors=config.anchors or AnchorConfig())
+    if posterior:
+        config = config.replace(posterior=config.posterior or PosteriorConfig())
+    return config, anchors
 
 
 def _missed(networks: object) -> str:
@@ -573,19 +595,3 @@ def _require_count(value: object, name: str) -> None:
     """Raise a ValueError unless ``value`` is a whole number of at least 0."""
     if not isinstance(value, Tensor) or value.dtype != torch.int64 or value.dim() or bool(value < 0):
         raise ValueError(f"{name} must be a whole number of at least 0, got {value}")
-
-
-def _copied(values: dict[str, Tensor], device: torch.device | None) -> tuple[dict[str, Any], torch.cuda.Event | None]:
-    """Copy the values to ``device`` (None: no copy). Copies from CUDA to the CPU are asynchronous, into pinned memory,
-    and return an event to wait for."""
-    if device is None:
-        return values, None
-    source = values["depth"].device
-    if source.type != "cuda" or device.type != "cpu":
-        return {name: value.to(device, non_blocking=True) for name, value in values.items()}, None
-    copies = {name: torch.empty(value.shape, dtype=value.dtype, pin_memory=True) for name, value in values.items()}
-    for name, value in values.items():
-        copies[name].copy_(value.detach(), non_blocking=True)
-    ready = torch.cuda.Event()
-    ready.record(torch.cuda.current_stream(source))
-    return copies, ready

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 from datetime import UTC, datetime
 from typing import Any
 
@@ -11,9 +11,9 @@ from torch import Tensor, nn
 
 from ufmstar_torch.eval.bench.measure import Plan, measure
 from ufmstar_torch.eval.bench.networks import ONCE, TimedNetwork
+from ufmstar_torch.eval.bench.overlap import time_overlap
 from ufmstar_torch.eval.bench.parts import MULTIVIEW
 from ufmstar_torch.eval.bench.settings import ARCHITECTURES, TOUR, BenchSettings
-from ufmstar_torch.eval.bench.streams import time_streams
 from ufmstar_torch.eval.bench.timing import most_threads
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.methods.method import BASES, Method
@@ -55,9 +55,10 @@ def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None
         rows = [Row(Method.parse(name), setting) for name, setting in _rows(network.base, options.backends)]
         devices: dict[str, Any] = {"device": device, "multiview_device": device, "plan": plan}
         result = measure(rows, {network.base: network}, sequence, **devices)
-        result["streams"] = []
-        if options.streams:
-            result["streams"] = time_streams(network, sequence, options.streams, device=device, plan=plan)
+        result["overlapped"] = (
+            None if isinstance(network, _Random) else time_overlap(network, sequence, device=device, plan=plan)
+        )
+        result["ratios"] = _ratios(result, {row.label for row in rows if not row.setting.overrides})
         results.append(result)
     used = {name: str(value) for name, value in vars(options).items() if value is not None}
     return {"schema": 2, "date": datetime.now(UTC).isoformat(timespec="seconds"), "options": used, "results": results}
@@ -72,6 +73,24 @@ def _rows(base: str, backends: tuple[str, ...]) -> list[tuple[str, Setting]]:
         kinds: tuple[dict[str, Any], ...] = ({}, {"anchors": "corners"}, {"anchors": "dense", "posterior": True})
         rows += [(f"UfM*-{alone}", Setting(overrides=overrides, **kind)) for kind in kinds]
     return rows
+
+
+def _ratios(result: Mapping[str, Any], labels: Set[str]) -> dict[str, float]:
+    """The figures of the rows of UfM* with these ``labels`` to compare between machines and versions: medians of ratios
+    within one frame."""
+    ratios = {}
+    for row in result["rows"]:
+        if row["row"] not in labels or row["method"].startswith("UfM-"):
+            continue
+        kind = {"": "step", "corners": "step with corners", "dense": "default"}[row["setting"].get("anchors", "")]
+        ratios[f"{kind} / network"] = row["ratios_to_depth"][MULTIVIEW]["median"]
+        if row["sample"] is not None:
+            ratios["mean of 1,000 pixels / step"] = row["sample"]["ratio_to_step"]["median"]
+            ratios["check and average / step"] = row["stages"]["beyond_the_paper"]["median"]
+    if result["overlapped"] is not None:
+        name = "default, network and UfM* in two threads (wall time) / network"
+        ratios[name] = result["overlapped"]["ratio_to_network"]["median"]
+    return ratios
 
 
 class _Random(TimedNetwork):
@@ -139,12 +158,5 @@ def _lines(result: Mapping[str, Any]) -> list[str]:
         if row["stages"] is not None:
             stages = row["stages"]["stages"].items()
             lines.append(f"stages of {row['row']}: " + ", ".join(f"{n} {t['median_ms']:.2f}" for n, t in stages))
-        if (sample := row["sample"]) is not None:
-            times, ratio = sample["latency"], sample["ratio_to_step"]["median"]
-            share = row["stages"]["beyond_the_paper"]["median"]
-            lines.append(f"mean over 1,000 pixels {times['median_ms']:.2f} ms, x step {ratio:.3f}; ")
-            lines[-1] += f"check and average, which the paper does not have, x step {share:.3f}"
-    for line in result["streams"]:
-        forms = (f"{name} {line[name]['median_ms']:.2f} ms" for name in ("step", "graph") if name in line)
-        lines.append(f"{line['streams']} streams at once: {', '.join(forms)}")
+    lines += [f"{name}: {ratio:.3f}" for name, ratio in result["ratios"].items()]
     return [*lines, *(f"no energy of the {unit}: {why}" for unit, why in result["power"]["missing"].items())]

@@ -21,10 +21,10 @@ from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, 
 from ufmstar_torch.eval.bench.parts import ANCHORS, MULTIVIEW, SAMPLE, Part, TimedParts, inference_of, time_parts
 from ufmstar_torch.eval.bench.timing import CLOCKS, most_threads, paired_ratio, pinned_threads, spread
 from ufmstar_torch.eval.engine.evaluate import require_usable
+from ufmstar_torch.eval.engine.files import write_json_atomic
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.run.files import write_json_atomic
 from ufmstar_torch.eval.run.machine import device_of, hardware, load_average, versions
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.suite.job import EvalJob

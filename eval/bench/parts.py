@@ -28,7 +28,6 @@ from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.frames.image_check import reduced, shows_something
 from ufmstar_torch.frames.prediction import DepthPrediction
-from ufmstar_torch.uncertain_depth import maps_of
 
 MULTIVIEW, SAMPLE = "multiview", "sample"
 # ``Setting.anchors`` that are measured: the name of their source of landmarks.
@@ -63,7 +62,8 @@ class MultiviewStep:
             self.reset()
         assert isinstance(self.estimator, Gaussians)
         prediction, T = prediction.to(self._device), torch.from_numpy(frame.T_world_cam)
-        maps = maps_of(self.estimator.used(prediction), self.estimator.ufm)
+        used = self.estimator.used(prediction)
+        maps = used.arguments(confidence=self.estimator.ufm.uses_confidence)
         self.estimator.ufm.mean_uncertainty(pose=T, intrinsics=prediction.K, **maps)
 
     def reset(self) -> None:

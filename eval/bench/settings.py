@@ -32,7 +32,6 @@ class BenchSettings:
         threads: Use this many CPU threads (default: the cores of this process).
         clock: Measure wall time, or cpu: the processor time of one thread, on a machine with other load.
         device: Run network and UfM* on cpu, cuda or cuda:N.
-        streams: Also time UfM* alone on these numbers of simultaneous streams.
         json: Write the report to this file.
     """
 
@@ -49,7 +48,6 @@ class BenchSettings:
     threads: int | None = None
     clock: Literal["wall", "cpu"] = "wall"
     device: str = "cpu"
-    streams: tuple[int, ...] = ()
     json: Path | None = None
 
     def __post_init__(self) -> None:
@@ -60,7 +58,5 @@ class BenchSettings:
         for name in ("frames", "history"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
-        if any(count < 1 for count in self.streams):
-            raise ValueError(f"--streams must be positive, got {list(self.streams)}")
         if not self.sizes or any(size < 64 or size % 32 for size in self.sizes):
             raise ValueError(f"--sizes must be multiples of 32 from 64 on [px], got {list(self.sizes)}")

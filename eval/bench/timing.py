@@ -24,7 +24,7 @@ from ufmstar_torch.eval.run.machine import available_cores
 # Seconds since an arbitrary moment: wall-clock time, or the processor's time for this process.
 Clock = Callable[[], float]
 CLOCKS: dict[str, Clock] = {"wall": time.perf_counter, "cpu": time.process_time}
-# The stages of a step, without gaps between them; see ``ufmstar_torch.steps.step_parts.StepObserver``.
+# The stages of a step, without gaps between them; see ``ufmstar_torch.steps.step.StepObserver``.
 STAGES = ("check", "segment", "correspond", "fuse", "append", "regress", "average")
 _CPU = torch.device("cpu")
 
@@ -72,7 +72,7 @@ def paired_ratio(numerator: Sequence[float], denominator: Sequence[float]) -> di
 
 
 class StagedStep:
-    """Times the stages of UfM*'s steps, as the observer (``ufmstar_torch.steps.step_parts.StepObserver``) of a module
+    """Times the stages of UfM*'s steps, as the observer (``ufmstar_torch.steps.step.StepObserver``) of a module
     on a device. ``step`` runs the module once. The assembly of the output, after the last stage, is not timed."""
 
     def __init__(

@@ -18,7 +18,7 @@ from ufmstar_torch.anchors.pose_fit import UNCHANGED, ImageFit
 from ufmstar_torch.eval.check.depth_image_fit import DepthImageFit, depth_image_fit
 from ufmstar_torch.eval.check.image_fit import image_fit, track_corners
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
-from ufmstar_torch.frames.frame import doubtful_centre
+from ufmstar_torch.frames.warnings import doubtful_centre
 from ufmstar_torch.gaussians.conventions import CONVENTIONS, OURS
 
 _SCALES = 10.0 ** np.arange(-4, 4.01, 0.125)

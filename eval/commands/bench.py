@@ -14,7 +14,7 @@ read = reader(BenchSettings, "ufmstar bench")
 def main(options: BenchSettings) -> int:
     """Run the benchmark, print its table and write its JSON; the exit code."""
     from ufmstar_torch.eval.bench.benchmark import format_report, run_benchmark
-    from ufmstar_torch.eval.run.files import write_json_atomic
+    from ufmstar_torch.eval.engine.files import write_json_atomic
 
     with usage_errors(ValueError, FileNotFoundError, ModuleNotFoundError):
         report = run_benchmark(options, progress=lambda text: print(text, file=sys.stderr, flush=True))

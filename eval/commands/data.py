@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 from ufmstar_torch.eval.commands.errors import usage_errors
-from ufmstar_torch.eval.commands.opening import OpeningOptions
+from ufmstar_torch.eval.commands.opening import Recording
 from ufmstar_torch.eval.commands.options import Flag, Positional, arg, reader
 
 # With one of these options the path is one sequence, whatever is below its folder.
@@ -36,7 +36,7 @@ class CheckOptions:
     path: Annotated[Positional[str], arg(metavar="PATH")]
     pairs: int = 8
     json: Flag = False
-    opening: OpeningOptions
+    opening: Recording
 
 
 read = reader(CheckOptions, "ufmstar data")
@@ -45,7 +45,7 @@ read = reader(CheckOptions, "ufmstar data")
 def main(options: CheckOptions) -> int:
     """Check, and print the reports. Returns the exit code."""
     from ufmstar_torch.eval.check.data_check import lines, page
-    from ufmstar_torch.eval.run.files import to_json
+    from ufmstar_torch.eval.engine.files import to_json
 
     with usage_errors(OSError, ValueError):
         reports, several = _check(options)

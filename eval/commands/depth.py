@@ -225,6 +225,11 @@ class PosteriorOptions(UfMOptions):
     plain: Flag = False
 
     @property
+    def chosen(self) -> bool:
+        """True if the user chooses anchors, or settings of anchors or the posterior."""
+        return self.anchors is not None or any(key.startswith(("anchors.", "posterior.")) for key in assigned(self.set))
+
+    @property
     def posterior(self) -> bool:
         """True if anchors correct the depth."""
         return not self.plain

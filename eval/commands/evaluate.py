@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from ufmstar_torch.eval.commands.errors import usage_errors
-from ufmstar_torch.eval.commands.opening import OpeningOptions
+from ufmstar_torch.eval.commands.opening import Recording
 from ufmstar_torch.eval.commands.options import (
     Count,
     Flag,
     MachineOptions,
     Text,
     Words,
+    arg,
     as_dict,
     joined,
     reader,
     require_least,
 )
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-from ufmstar_torch.eval.methods.method import NETWORKS, UFM_STAR
+from ufmstar_torch.eval.methods.method import UFM_STAR
 from ufmstar_torch.eval.methods.setting import DEFAULTS, started
 from ufmstar_torch.eval.methods.suite import listing, suite_named
 from ufmstar_torch.eval.sequences.frame import parse_slice
@@ -30,6 +32,11 @@ if TYPE_CHECKING:
     from ufmstar_torch.eval.suite.job import EvalJob
     from ufmstar_torch.eval.suite.tasks import EvalOutcome
 
+# Meaning of the options that an evaluation needs and a dry run does not.
+_MISSING = {
+    "root": "folders with sequences, [DATASET=]DIR, or tour:SEED for rendered rooms",
+    "out": "the folder for the results",
+}
 # Options that are fields of a job with the same name.
 _OF_JOB = ("device", "bins", "examples", "samples", "runtime", "precision")
 
@@ -142,9 +149,9 @@ class EvalOptions(MachineOptions):
     processes: int = 1
     scheduler: Text = None
     dry_run: Flag = False
-    what: SuiteOptions
+    what: Annotated[SuiteOptions, arg(name="suite")]
     data: DataOptions
-    opening: OpeningOptions
+    opening: Recording
     output: EvalOutputOptions
 
     def __post_init__(self) -> None:
@@ -171,7 +178,10 @@ def main(options: EvalOptions) -> int:
         print(listing())
         return 0
     with usage_errors(FileNotFoundError, ValueError):
-        return _dry_run(options) if options.dry_run else _evaluate(options)
+        if not options.dry_run:
+            return _evaluate(options)
+        print("\n".join(_dry_run(options)))
+    return 0
 
 
 def job_from(options: EvalOptions) -> EvalJob:
@@ -220,7 +230,7 @@ def _evaluate(options: EvalOptions) -> int:
     with Bars() as bars, stop_signals(bars.say) as stop:
         job = job_from(options)
         for base in job.unused:
-            bars.say(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")
+            bars.say(_unused(base, job))
         if rows := [row for row in job.suite.rows if row.method.fusion == UFM_STAR]:
             anchors = {row.setting.anchors for row in rows}
             posterior = any(row.setting.posterior for row in rows)
@@ -235,10 +245,10 @@ def _evaluate(options: EvalOptions) -> int:
 
 def _report(job: EvalJob, outcome: EvalOutcome, options: EvalOptions) -> int:
     """Print the table, measure, draw the report, print the failures. Returns the exit code."""
+    from ufmstar_torch.eval.engine.record import ResultsError
     from ufmstar_torch.eval.report.data import load_results
     from ufmstar_torch.eval.report.text import summary, written
     from ufmstar_torch.eval.report.write import write_report
-    from ufmstar_torch.eval.suite.record import ResultsError
 
     try:
         print(summary(load_results(job.out, with_sums=False)))
@@ -278,45 +288,16 @@ def _measure(job: EvalJob, threads: int | None) -> None:
         print(f"no {EFFICIENCY}: {' '.join(str(error).split())}")
 
 
-# Meaning of the options that an evaluation needs and a dry run does not.
-_MISSING = {
-    "root": "folders with sequences, [DATASET=]DIR, or tour:SEED for rendered rooms",
-    "out": "the folder for the results",
-}
+def _dry_run(options: EvalOptions) -> Iterator[str]:
+    """Lines of what the evaluation would do and what is missing for it."""
+    from ufmstar_torch.eval.suite.dry_run import network_lines, sequence_lines
+
+    job, values = job_from(options), as_dict(options)
+    yield from (_unused(base, job) for base in job.unused)
+    yield from network_lines(job, suite_named(str(options.what.suite), options.what.base, options.what.ufm_preset))
+    yield from (f"no --{name}: {meaning}" for name, meaning in _MISSING.items() if not values[name])
+    yield from sequence_lines(job)
 
 
-def _dry_run(options: EvalOptions) -> int:
-    """Print the rows with their networks and needs, and the sequences with their number of frames."""
-    import torch
-
-    job, suite = job_from(options), suite_named(str(options.what.suite), options.what.base, options.what.ufm_preset)
-    for base in job.unused:
-        print(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")
-    networks = job.load(torch.device("cpu"))
-    rows = [*job.suite.rows, *(row for row in suite.rows if row not in job.suite.rows)]
-    print(f"{job.suite.name}: {job.suite.title}\n{len(rows)} rows:")
-    for row in rows:
-        network = networks.get(row.method.base)
-        print(f"  {row.label}  [{'no network' if network is None else network.label}]  needs {row.needs}")
-    if job.missing_bases:
-        print("left out, without a --network:")
-        for base in job.missing_bases:
-            print(f"  --network {base}=MODEL:FILE: {NETWORKS[base]}")
-    if job.suite.efficiency:
-        print("measures time, energy and memory: energy needs zeus and a meter (NVML, AMD SMI, RAPL, Jetson's rails)")
-    values = as_dict(options)
-    for name, words in _MISSING.items():
-        if not values[name]:
-            print(f"no --{name}: {words}")
-    print(f"{len(job.items)} sequences:")
-    total = 0
-    for item in job.items:
-        try:
-            frames = len(range(len(item.open()))[job.frames])
-        except (OSError, ValueError) as error:
-            print(f"  {item.label}: cannot be opened: {' '.join(str(error).split())}")
-            continue
-        print(f"  {item.label}: {frames} frames")
-        total += frames
-    print(f"{total} frames, {len(job.items) * len(job.suite.rows)} records")
-    return 0
+def _unused(base: str, job: EvalJob) -> str:
+    return f"--network {base}=...: not used, suite {job.suite.name} has no row of it"

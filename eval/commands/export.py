@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from ufmstar_torch.eval.commands.errors import usage_errors
-from ufmstar_torch.eval.commands.opening import OpeningOptions
+from ufmstar_torch.eval.commands.opening import Recording
 from ufmstar_torch.eval.commands.options import Positional, Text, arg, reader, require_positive
 
 
@@ -40,7 +40,7 @@ class ExportOptions:
     max_sigma: float = float("inf")
     max_relative_sigma: float = float("inf")
     voxel: float = 0.02
-    opening: OpeningOptions
+    opening: Recording
 
     def __post_init__(self) -> None:
         require_positive(self, "max_sigma", "max_relative_sigma", "voxel")
@@ -55,7 +55,8 @@ read = reader(ExportOptions, "ufmstar export")
 
 def main(options: ExportOptions) -> int:
     """Export, and print what was written; the exit code."""
-    from ufmstar_torch.eval.run.export import GateCount, gated_frames, run_summary, with_images
+    from ufmstar_torch.eval.run.export import GateCount, gated_frames, with_images
+    from ufmstar_torch.eval.run.summary import read_summary
     from ufmstar_torch.eval.sequences.open import open_sequence
 
     out, to = options.out, options.to
@@ -70,7 +71,7 @@ def main(options: ExportOptions) -> int:
         print(_exporter(to)(frames, out, **how))
         if min(options.max_sigma, options.max_relative_sigma) < math.inf and to != "tum":
             print(f"the limits of sigma keep {counts.share:.1%} of the pixels with a depth")
-            if reason := _unsupported(run_summary(out)):
+            if reason := _unsupported(read_summary(out)):
                 remedy = "`ufmstar run` without --plain makes a sigma that anchors test (docs/thresholds.md)"
                 print(f"warning: nothing supports this sigma, {reason}: the pixels that are left may be bad; {remedy}")
     return 0

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import json
-import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from ufmstar_torch.eval.commands.depth import NetworkOptions, PosteriorOptions
 from ufmstar_torch.eval.commands.errors import usage_errors
-from ufmstar_torch.eval.commands.opening import OpeningOptions
+from ufmstar_torch.eval.commands.opening import Recording
 from ufmstar_torch.eval.commands.options import (
     File,
     Flag,
@@ -26,7 +24,7 @@ from ufmstar_torch.eval.commands.options import (
     require_least,
     require_positive,
 )
-from ufmstar_torch.eval.commands.terminal import Bars
+from ufmstar_torch.eval.commands.terminal import Bars, interrupted_by_sigterm
 from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
 
 if TYPE_CHECKING:
@@ -34,14 +32,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ufmstar_torch.eval.engine.realtime import RealTime
-    from ufmstar_torch.eval.run.export import RunFrame
     from ufmstar_torch.eval.run.rerun_log import RerunLog
     from ufmstar_torch.eval.sequences.live import LiveEvent
     from ufmstar_torch.live import LiveDepth, LiveResult, LiveStatistics
     from ufmstar_torch.uncertain_depth import UncertainDepth
 
 _STANDARD_INPUT, _SUMMARY = "-", "realtime.json"
-_ARRAYS = ("depth", "variance", "disagreement", "T_world_cam", "intrinsics")  # of an image's file
 # Options for opening that are also valid for a source that is no recording.
 _OF_LIVE = ("intrinsics", "trajectory", "poses", "pose_scale", "max_pose_gap")
 
@@ -87,7 +83,7 @@ class LiveOptions(MachineOptions):
     overwrite: Flag = False
     view: Flag = False
     json: Flag = False
-    opening: OpeningOptions
+    opening: Recording
     network: NetworkOptions
     uncertainty: PosteriorOptions
 
@@ -122,10 +118,11 @@ read = reader(LiveOptions, "ufmstar live")
 
 def main(options: LiveOptions) -> int:
     """Run until the source ends, and print the real-time table; the exit code."""
+    from ufmstar_torch.eval.engine.files import write_json_atomic
     from ufmstar_torch.eval.engine.realtime import RealTime
     from ufmstar_torch.eval.report.text import realtime_table
-    from ufmstar_torch.eval.run.files import write_json_atomic
     from ufmstar_torch.eval.run.folder import FolderKind, output_folder
+    from ufmstar_torch.eval.run.live_output import ARRAYS
     from ufmstar_torch.eval.run.machine import share_threads
     from ufmstar_torch.eval.run.rerun_log import RerunLog, open_viewer
     from ufmstar_torch.eval.run.writers import is_frame
@@ -133,7 +130,7 @@ def main(options: LiveOptions) -> int:
 
     if options.threads is None:
         share_threads()
-    ours = {"*.npz": partial(is_frame, names=_ARRAYS)}
+    ours = {"*.npz": partial(is_frame, names=ARRAYS)}
     kind = FolderKind("ufmstar live", "live run", _SUMMARY, ("*.npz",), recognise=ours, lock=".lock")
     started = {"state": "started"}  # a later run may replace finished results only
     with ExitStack() as stack:
@@ -168,14 +165,15 @@ def _shown_by(
     options: LiveOptions, live: LiveDepth, times: RealTime, view: RerunLog | None
 ) -> Callable[[LiveResult], None]:
     """A function that writes and shows the result of an image."""
+    from ufmstar_torch.eval.run.live_output import figures_of, viewer_frame, write_result
 
     def on_result(result: LiveResult) -> None:
         times.take(result)
         if options.out is not None:
-            _write(options.out, result)
-        figures = _figures(result, live)
+            write_result(options.out, result)
+        figures = figures_of(result, live.statistics)
         if view is not None:
-            view.add(_shown(result, len(times.latency), figures))
+            view.add(viewer_frame(result, len(times.latency), figures))
         if options.json:
             print(json.dumps(figures), flush=True)
         elif len(times.latency) % 30 == 1:
@@ -188,7 +186,7 @@ def _run(options: LiveOptions, live: LiveDepth, events: Iterator[LiveEvent]) -> 
     """Push the events until they end, the time is over, or a signal comes. Returns the counts, and the error if any."""
     deadline, warm = monotonic() + options.seconds, False
     try:
-        with _interrupted_by_sigterm(), live, suppress(KeyboardInterrupt):
+        with interrupted_by_sigterm(), live, suppress(KeyboardInterrupt):
             for event in events:
                 if monotonic() >= deadline:
                     break
@@ -253,56 +251,3 @@ def _model(options: LiveOptions) -> UncertainDepth:
     with Bars() as bars:
         warm_up_command(model.ufm.config, bars.show, [] if config.anchors is None else [anchors or DENSE])
     return model
-
-
-def _write(out: Path, result: LiveResult) -> None:
-    """Write the maps of an image to OUT/STAMP.npz."""
-    import numpy as np
-
-    from ufmstar_torch.eval.run.files import write_atomic
-
-    of = result.out
-    maps = {"depth": of.depth, "variance": of.variance, "disagreement": of.disagreement}
-    if of.posterior_outlier is not None:
-        maps |= {"network_depth": of.network_depth, "ufm_variance": of.ufm_variance}
-    arrays = {name: value[0].cpu().numpy() for name, value in maps.items()}
-    camera = {"T_world_cam": result.T_world_cam, "intrinsics": result.out.intrinsics[0].cpu().numpy()}
-    write_atomic(out / f"{result.stamp:.6f}.npz", lambda file: np.savez(file, allow_pickle=False, **arrays, **camera))
-
-
-def _shown(result: LiveResult, number: int, figures: dict[str, float]) -> RunFrame:
-    """The result in the viewer's form."""
-    import numpy as np
-    import torch
-
-    from ufmstar_torch.eval.run.export import RunFrame
-
-    out, valid = result.out, result.out.valid[0]
-    depth, sigma = (torch.where(valid, values[0], torch.nan).cpu().float().numpy() for values in (out.depth, out.std))
-    about = (f"{result.stamp:.6f}", number, result.stamp, result.T_world_cam)
-    K = out.intrinsics[0].cpu().double().numpy()
-    return RunFrame(*about, K, depth, sigma, figures=figures, image=np.asarray(result.image))
-
-
-def _figures(result: LiveResult, live: LiveDepth) -> dict[str, float]:
-    """The figures of an image, and the counts so far."""
-    depth, std, counts = result.out.depth, result.out.std, live.statistics
-    return {
-        "stamp": round(result.stamp, 6),
-        "latency_ms": round(1000 * result.latency, 2),
-        "depth_m": round(float(depth.nanmedian()), 3),
-        "sigma_m": round(float(std.nanmedian()), 3),
-        "components": int(result.out.statistics.components[0]),
-        "dropped": sum(counts.dropped.values()),
-        "skipped": sum(counts.skipped.values()),
-    }
-
-
-@contextmanager
-def _interrupted_by_sigterm() -> Iterator[None]:
-    """SIGTERM raises KeyboardInterrupt, as Ctrl-C does."""
-    previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, previous)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from ufmstar_torch.eval.commands.options import Number, Repeated, Text, Texts, assigned
+from ufmstar_torch.eval.commands.options import Number, Repeated, Text, Texts, arg, assigned
 from ufmstar_torch.eval.sequences.options import Options
 
 
@@ -56,11 +56,14 @@ class OpeningOptions:
         if unknown := sorted(rarer.keys() - expected):
             raise ValueError(f"--reader has no {', '.join(unknown)}; it has {', '.join(sorted(expected))}")
         for name in ("depth_intrinsics", "topics"):
-            if isinstance(text := rarer.get(name), str):
-                rarer[name] = tuple(text.split(","))
+            if name in rarer:
+                rarer[name] = tuple(str(rarer[name]).split(","))
         empty = {name: value for name, value in values.items() if value != ()}
         return Options(**empty, **rarer)
 
     def changed(self) -> dict[str, Any]:
         """The options that are not the default, as arguments of ``open_sequence``."""
         return self.of_reader.changed()
+
+
+Recording = Annotated[OpeningOptions, arg(name="recording")]  # the title of its group in the help

@@ -94,7 +94,8 @@ def parse(options: type[T], words: Sequence[str], prog: str) -> T:
     except SystemExit as ended:
         if not ended.code:
             raise
-        raise ValueError(_first_lines(message.getvalue())) from None
+        text = _first_lines(message.getvalue())
+        raise ValueError(f"{text}{_rarer(text, options)}") from None
 
 
 def reader(options: type[T], prog: str) -> Callable[[Sequence[str]], T]:
@@ -222,9 +223,22 @@ def _description(options: type) -> str:
     return "\n".join(line.strip() for line in lines)
 
 
+def _rarer(text: str, options: type) -> str:
+    """How to type an unknown option that is a rarer one of the readers; "" for others."""
+    from ufmstar_torch.eval.sequences.options import Options
+
+    unknown = re.match(r"Unrecognized options: --([\w-]+)", text)
+    name = unknown[1].replace("-", "_") if unknown else ""
+    rarer = "reader" in _names(options) and name in (f.name for f in fields(Options))
+    return f"; it is a rarer option of readers: --reader {name}=VALUE" if rarer else ""
+
+
 def _first_lines(message: str) -> str:
-    """The lines of tyro's error in a box up to its first rule, as one line, without the name of a group."""
-    lines = [line.strip("│ ") for line in message.splitlines() if line.startswith("│")]
-    rules = [number for number, line in enumerate(lines) if line.startswith("─")]
-    text = " ".join(" ".join(lines[: rules[0] if rules else None]).split())
+    """The text of tyro's error up to its rule, as one line, without the name of a group. Where the terminal has UTF-8,
+    the message stands in a box; elsewhere it follows a title and a rule."""
+    boxed = [line for line in message.splitlines() if line.startswith("│")]
+    lines = [line.strip("│ ") for line in boxed or message.splitlines()]
+    rules = [number for number, line in enumerate(lines) if line and not line.strip("─-")]
+    first = 0 if boxed or not rules else rules.pop(0) + 1
+    text = " ".join(" ".join(lines[first : rules[0] if rules else None]).split())
     return re.sub(r"^Error parsing (?!--)\S+: ", "", text)

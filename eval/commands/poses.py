@@ -91,7 +91,7 @@ def main(options: PosesOptions) -> int:
     from ufmstar_torch.eval.run.folder import FolderError, output_folder
 
     require_pycolmap()
-    with usage_errors(FolderError, FileNotFoundError, ValueError):
+    with usage_errors(FolderError, FileNotFoundError, NotADirectoryError, ValueError):
         images, size = _images(options)
         with output_folder(options.out, POSES, {}, overwrite=options.overwrite):
             result = _reconstruct(options, images, size)
@@ -124,10 +124,10 @@ def _plain(name: str) -> str:
 def _reconstruct(options: PosesOptions, images: list[Any], size: tuple[int, int]) -> dict[str, Any]:
     import numpy as np
 
+    from ufmstar_torch.eval.engine.files import write_atomic, write_bytes_atomic, write_json_atomic
     from ufmstar_torch.eval.engine.progress import Progress
     from ufmstar_torch.eval.reconstruct.keyframes import write_keyframes
     from ufmstar_torch.eval.reconstruct.reconstruct import POSES, gaps, landmarks, reconstruct, scale_model
-    from ufmstar_torch.eval.run.files import write_atomic, write_bytes_atomic, write_json_atomic
     from ufmstar_torch.eval.run.machine import available_cores
     from ufmstar_torch.eval.sequences.poses import read_trajectory
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -124,9 +125,8 @@ def _write(options: RankOptions, scores: ImageScores) -> int:
     """Write scores.csv, the contact sheet and rank.json, and print the first images; the exit code."""
     import pandas as pd
 
-    from ufmstar_torch.eval.report.table import csv_text
-    from ufmstar_torch.eval.report.text import aligned
-    from ufmstar_torch.eval.run.files import write_bytes_atomic, write_json_atomic
+    from ufmstar_torch.eval.engine.files import write_bytes_atomic, write_json_atomic
+    from ufmstar_torch.eval.report.table import aligned, csv_text
     from ufmstar_torch.eval.run.panels import contact_sheet
     from ufmstar_torch.eval.run.pictures import SHEET
 
@@ -150,4 +150,7 @@ def _write(options: RankOptions, scores: ImageScores) -> int:
     print("\n".join(aligned(shown)))
     above = f", the first {_SHOWN} above" if len(chosen) > _SHOWN else ""
     print(f"{out}: {', '.join(files)}; {len(lines)} images, {len(chosen)} with a rank{above}")
+    if unmeasured := sum(math.isnan(image.score) for image in scores.images):
+        seen = f"less than {options.measured:.0%} of their pixels were seen from two places (--measured)"
+        print(f"{unmeasured} of them cannot be ranked: {seen}")
     return 0 if chosen else 1

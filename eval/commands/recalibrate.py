@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.options import Positional, arg, reader
 from ufmstar_torch.eval.methods.method import UFM_STAR
-from ufmstar_torch.eval.report.names import count
+from ufmstar_torch.eval.report.quantities import count
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -47,7 +47,7 @@ read = reader(RecalibrateOptions, "ufmstar recalibrate")
 def main(options: RecalibrateOptions) -> int:
     """Fit, write the file, and print the figures on held-out sequences. Returns the exit code."""
     from ufmstar_torch.eval.report.data import load_results
-    from ufmstar_torch.eval.report.text import aligned
+    from ufmstar_torch.eval.report.table import aligned
 
     with usage_errors(ValueError):
         results = load_results(options.out, with_sums=False)
@@ -76,11 +76,12 @@ def _fit(counts: Sequence[NDArray[Any]], covariate: str) -> Recalibration:
 def _counts(results: Results, row: Row, covariate: str) -> dict[str, NDArray[Any]]:
     """By "DATASET/SEQUENCE", the histogram [V, e] of pixels over variance and squared error; for the covariate
     confidence, samples [n, 3]. Raises ValueError: the network states no confidence."""
-    from ufmstar_torch.eval.engine.judge import CONFIDENCE, METRICS
+    from ufmstar_torch.eval.engine.judge import CONFIDENCE
+    from ufmstar_torch.eval.engine.record import METRICS
 
     counts = {}
     for record in results.of(row):
-        sums = record.sums()
+        sums = record.load_sums()
         if covariate == CONFIDENCE and CONFIDENCE not in sums:
             raise ValueError(f"--covariate confidence needs a network that states one: {row.label} has none")
         chosen = (CONFIDENCE, "samples") if covariate == CONFIDENCE else (METRICS, "metrics.SpearmanCorrelation.joint")

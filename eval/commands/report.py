@@ -14,8 +14,8 @@ from ufmstar_torch.eval.commands.options import Flag, Positional, arg, reader
 class ReportOptions:
     """Tables, figures and a page from the results of an evaluation.
 
-    Draws tables (Markdown, LaTeX and CSV), figures, one page (report.html) and tidy results (CSV) from what
-    `ufmstar eval` has left in a folder, finished or not, and prints the main table.
+    Draws tables (LaTeX), figures, one page (report.html) and tidy results (CSV) from what `ufmstar eval` has left in a
+    folder, finished or not, and prints the main table.
 
     Attributes:
         out: The folder of `ufmstar eval`.
@@ -31,10 +31,10 @@ read = reader(ReportOptions, "ufmstar report")
 
 def main(options: ReportOptions) -> int:
     """Draw the report, and print the main table; the exit code."""
+    from ufmstar_torch.eval.engine.record import ResultsError
     from ufmstar_torch.eval.report.data import load_results
     from ufmstar_torch.eval.report.text import summary, written
     from ufmstar_torch.eval.report.write import write_report
-    from ufmstar_torch.eval.suite.record import ResultsError
 
     with usage_errors(ResultsError):
         print(summary(load_results(options.out, with_sums=False)))

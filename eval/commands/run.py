@@ -8,9 +8,16 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar
 
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.commands.depth import SECTIONS, MapOptions, NetworkOptions, PosteriorOptions, UfMOptions
+from ufmstar_torch.eval.commands.depth import (
+    OWN_DEPTH,
+    SECTIONS,
+    MapOptions,
+    NetworkOptions,
+    PosteriorOptions,
+    UfMOptions,
+)
 from ufmstar_torch.eval.commands.errors import usage_errors
-from ufmstar_torch.eval.commands.opening import OpeningOptions
+from ufmstar_torch.eval.commands.opening import Recording
 from ufmstar_torch.eval.commands.options import Flag, MachineOptions, Positional, Text, arg, as_dict, reader
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_slice
@@ -31,7 +38,7 @@ class StreamOptions(MachineOptions):
     """
 
     frames: Text = None
-    opening: OpeningOptions
+    opening: Recording
     network: NetworkOptions
     maps: MapOptions
     uncertainty: UfMOptions
@@ -63,7 +70,7 @@ class RunOptions(StreamOptions):
 
     Depths that are searched in earlier images correct the predicted depth and its sigma; --plain is UfM* alone. The
     predicted depth comes from a network (--model, --weights), from maps that another program predicted (--depth DIR),
-    or from the sequence itself (--depth self).
+    or from the sequence itself (--depth self), which no anchors correct unless --anchors names them.
 
     Attributes:
         sequence: The folder of the sequence, or a video file, or tour:SEED for rendered rooms.
@@ -120,7 +127,7 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
     from ufmstar_torch.eval.sequences.open import open_sequence, scale_poses
 
     sequence = open_sequence(path, **options.opening.changed())
-    options = _without_images(options, sequence)
+    options = _without_posterior(options, sequence)
     ufm = options.uncertainty
     if not sequence.posed:
         raise ValueError(f"{sequence.name!r} holds single images without poses, which UfM* needs to compare views")
@@ -156,15 +163,23 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
     )
 
 
-def _without_images(options: Stream, sequence: FrameSequence) -> Stream:
-    """The options, plain if the default anchors are searched in images that the sequence lacks."""
+def _without_posterior(options: Stream, sequence: FrameSequence) -> Stream:
+    """The options, plain where the default anchors serve nothing: the depth is the sequence's own, which a correction
+    makes worse, or the sequence lacks the images in which they are searched."""
     from ufmstar_torch.frames.warnings import LOGGER
 
     ufm = options.uncertainty
-    if not isinstance(ufm, PosteriorOptions) or ufm.plain or ufm.anchors is not None or _has_images(sequence):
+    if not isinstance(ufm, PosteriorOptions) or ufm.plain or ufm.chosen:
         return options
-    missed = "UfM* alone, without anchors and the depth that the posterior corrects with them"
-    LOGGER.warning("%s: the sequence %r has no images", missed, sequence.name)
+    if options.maps.depth in OWN_DEPTH:
+        LOGGER.warning(
+            "UfM* alone: the recording's own depth is not corrected (--anchors dense corrects it all the same)"
+        )
+    elif _has_images(sequence):
+        return options
+    else:
+        missed = "UfM* alone, without anchors and the depth that the posterior corrects with them"
+        LOGGER.warning("%s: the sequence %r has no images", missed, sequence.name)
     return replace(options, uncertainty=replace(ufm, plain=True))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import MISSING, fields, replace
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
@@ -18,12 +18,10 @@ from ufmstar_torch.eval.methods.method import ALONE, RELATIVE, RHO, UFM, UFM_STA
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import configured
 from ufmstar_torch.eval.methods.ufm import UfM
-from ufmstar_torch.frames.output import FrameStatistics, UncertaintyOutput
+from ufmstar_torch.frames.output import EVERY_FRAME, FrameStatistics, UncertaintyOutput
 from ufmstar_torch.frames.prediction import DepthPrediction
-from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.posterior.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar
-from ufmstar_torch.uncertain_depth import maps_of
 
 
 class Estimator(ABC):
@@ -106,8 +104,8 @@ def output_of(depth: Tensor, variance: Tensor | None, valid: Tensor, **maps: Ten
     valid pixels are 0. ``variance``: None = the method states none."""
     variance = torch.full_like(depth, torch.nan) if variance is None else variance
     none = torch.zeros(len(depth), dtype=torch.int64)
-    counts = {f.name: none for f in fields(FrameStatistics) if f.default is MISSING}
-    statistics = FrameStatistics(**{**counts, "valid_pixels": valid.sum((1, 2)).cpu()})
+    counts = dict.fromkeys(EVERY_FRAME, none)
+    statistics = FrameStatistics({**counts, "valid_pixels": valid.sum((1, 2)).cpu()})
     named = {name: value for name, value in maps.items() if value is not None}
     return UncertaintyOutput(depth, torch.where(valid, variance, torch.nan), valid, named, statistics)
 
@@ -157,9 +155,8 @@ class Pointwise(Estimator):
 
     def memory(self) -> dict[str, float]:
         """Bytes and number of the points."""
-        cloud = self.ufm.cloud
-        count, size = (0, 0) if cloud is None else (len(cloud.count), len(cloud.count) * cloud.bytes_per_point)
-        return {"bytes": size, "count": count, "smoothing_bytes": 0}
+        counts = [(len(cloud.count), cloud.bytes_per_point) for cloud in self.ufm.clouds]
+        return {"bytes": sum(n * each for n, each in counts), "count": sum(n for n, _ in counts), "smoothing_bytes": 0}
 
 
 class Gaussians(Estimator):
@@ -180,16 +177,11 @@ class Gaussians(Estimator):
     def update(
         self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None
     ) -> UncertaintyOutput:
-        maps = maps_of(self.used(prediction), self.ufm)
+        maps = self.used(prediction).arguments(confidence=self.ufm.uses_confidence)
         out = self.ufm(pose=T_world_cam, intrinsics=prediction.K, anchors=anchors, **maps)
         used = out.statistics.anchors_used
         self._anchors = 0 if used is None else int(used[0])
         return out
-
-    def mixture_world(self) -> GaussianMixture:
-        """[1, K] M_i in the world's frame, float64; after a frame."""
-        T = self.ufm.T_world_first.double()
-        return self.ufm.mixture.to(torch.float64).rigid(T[:, :3, :3], T[:, :3, 3])
 
     def memory(self) -> dict[str, float]:
         """Bytes and number of the occupied components, anchor terms included; bytes of the moving average."""

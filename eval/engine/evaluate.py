@@ -20,9 +20,10 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.anchors import anchor_sources
 from ufmstar_torch.eval.engine.estimators import make_estimator
 from ufmstar_torch.eval.engine.examples import ExampleWriter
-from ufmstar_torch.eval.engine.judge import RowFigures, RowJudge, SequenceError, references
+from ufmstar_torch.eval.engine.judge import RowJudge, SequenceError, references
 from ufmstar_torch.eval.engine.predictions import DepthSource, PredictionCache
 from ufmstar_torch.eval.engine.progress import Progress, frame_progress
+from ufmstar_torch.eval.engine.record import Record
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import frame_results
 from ufmstar_torch.eval.methods.method import ALONE
@@ -59,14 +60,15 @@ def evaluate_sequence(
     examples: Path | None = None,
     progress: Callable[[Progress], object] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
-) -> list[RowFigures]:
-    """Evaluate every row on the frames of a posed sequence with ground truth. Returns one result per row, in order.
+) -> list[Record]:
+    """Evaluate every row on the frames of a posed sequence with ground truth. Returns a record for each
+    row, in order, without the names of suite, data set and network.
 
     Args:
         sequence: with poses and ground truth.
         rows: to evaluate.
         judge: networks and metrics.
-        examples: folder for maps and mixtures of a few frames (``ExampleWriter``); None = none.
+        examples: folder for maps of a few frames (``ExampleWriter``); None = none.
         progress: called at the start and after every frame.
         stop: called before every frame.
 
@@ -91,7 +93,7 @@ def evaluate_sequence(
     tracked = any(row.setting.anchors in (CORNERS, DENSE) for row in rows)
     check = partial(require_usable, sources=sources.values(), tracked=tracked)
     shown = frame_progress(progress, len(indices))
-    writer = None if examples is None else ExampleWriter(examples, len(indices), runners)
+    writer = None if examples is None else ExampleWriter(examples, len(indices))
     stream = frame_results(sequence, indices, runners, cache=judge.store, device=judge.device, check=check, stop=stop)
     with closing(stream) as results:
         for result in results:
@@ -100,11 +102,9 @@ def evaluate_sequence(
             if writer is not None:
                 writer.add(result)
             shown(result)
-    if writer is not None:
-        writer.end()
     opened = dict(sorted(Counter(skipped.reason for skipped in sequence.skipped).items()))
-    figures = [one.figures() for one in judges]
-    return [replace(one, frames={**one.frames, "left_out_on_opening": opened}) for one in figures]
+    records = [one.record() for one in judges]
+    return [replace(one, frames={**one.frames, "left_out_on_opening": opened}) for one in records]
 
 
 def require_usable(frame: Frame, sources: Collection[DepthSource], tracked: bool) -> None:

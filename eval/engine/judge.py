@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from statistics import median
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from ufmstar_torch.eval.engine.record import METRICS, Record
 from ufmstar_torch.eval.engine.rows import RowResult, RowRunner
 from ufmstar_torch.eval.engine.stream import FrameResult
 from ufmstar_torch.eval.methods import method
@@ -28,8 +28,8 @@ if TYPE_CHECKING:  # torchmetrics takes seconds to import, and a sequence withou
 
 # Names of a run's figures: of UfM*, of the network alone, and of the posterior if there is one.
 UFM, ALONE, POSTERIOR = "ufm", "network_alone", "posterior"
-# Names of a row's sums.
-METRICS, BY_ERROR, CONFIDENCE = "metrics", "nll_by_error", "confidence"
+# Names of a row's sums, beside METRICS.
+BY_ERROR, CONFIDENCE = "nll_by_error", "confidence"
 EACH = 512  # evenly spaced pixels of a frame for ``ufmstar recalibrate --covariate confidence``
 # The user's metrics by name (``sequences.plugins``).
 PluginMetrics = Mapping[str, Any]
@@ -80,22 +80,6 @@ class RunMetrics:
                 metrics.update(depth, variance, target, valid, mixture, level)
 
 
-@dataclass(frozen=True)
-class RowFigures:
-    """The figures of one row on one sequence."""
-
-    row: Row
-    # The following fields are those of ``Record``.
-    frames: dict[str, Any]
-    figures: dict[str, float]
-    curves: dict[str, Any]
-    state: dict[str, float]
-    ms: dict[str, float]
-    # States of the metrics on the CPU by name: "metrics" (``SequenceMetrics``) and "nll_by_error:REFERENCE"
-    # (``NLLByError``), to be added over sequences; and "confidence", samples of pixels (``_samples``).
-    sums: dict[str, dict[str, Tensor]]
-
-
 class RowJudge:
     """Collects counts, metrics, times and memory of one row over a sequence. ``reference_names`` has, by key, the names
     of the rows on whose confident pixels the NLL by error is computed."""
@@ -108,7 +92,7 @@ class RowJudge:
         bins: str,
         plugins: PluginMetrics = NO_PLUGINS,
     ) -> None:
-        self.row, self._runner = row, runner
+        self.row, self._runner, self._multiview = row, runner, row.method.fusion == method.UFM_STAR
         self._references, self._bins, self._plugins = reference_names, bins, plugins
         self._metrics: dict[str, SequenceMetrics] = {}
         self._by_error: dict[str, NLLByError] = {}
@@ -119,14 +103,15 @@ class RowJudge:
 
     def add(self, result: FrameResult) -> None:
         """Add a frame. Invalid pixels are NaN, not masked, so that the metrics count them."""
-        if self.row.slug in result.skipped:
-            self._reasons[result.skipped[self.row.slug]] += 1
-        if self.row.slug in result.rows:
-            self._add(result.rows[self.row.slug], result.rows)
+        key = self._runner.key
+        if key in result.skipped:
+            self._reasons[result.skipped[key]] += 1
+        if key in result.rows:
+            self._add(result.rows[key], result.rows)
 
     def _add(self, result: RowResult, rows: Mapping[str, RowResult]) -> None:
-        statistics, multiview = result.out.statistics, self.row.method.fusion == method.UFM_STAR
-        if multiview:
+        statistics = result.out.statistics
+        if self._multiview:
             segments, matched = (int(count[0]) for count in (statistics.segments, statistics.matched))
             # In the first frame there is no component to match.
             self._idle.update(without_segment=int(not segments), without_match=int(bool(self._ms) and not matched))
@@ -148,14 +133,15 @@ class RowJudge:
             metrics_of(self._metrics, part, **how).update(depth, variance, target, mask, mixture, level)
         if variance is None:
             return
-        if multiview and (confidence := result.prediction.confidence) is not None:
+        if self._multiview and (confidence := result.prediction.confidence) is not None:
             self._samples.append(_samples(confidence[0], depth, variance, target))
         for other, name in self._references.items():
             by_error = self._by_error.setdefault(f"{BY_ERROR}:{name}", NLLByError(sync_on_compute=False))
             by_error.update(depth, variance, target, rows[other].confident)
 
-    def figures(self) -> RowFigures:
-        """The figures after the last frame. Raises SequenceError: no frame was evaluated."""
+    def record(self) -> Record:
+        """The row's figures after the last frame, as a record without a data set. Raises SequenceError: no frame was
+        evaluated."""
         reasons, done, skipped = dict(sorted(self._reasons.items())), len(self._ms), self._reasons.total()
         if not self._judged:
             worst = "; ".join(f"{count} x {reason}" for reason, count in list(reasons.items())[:3])
@@ -163,7 +149,7 @@ class RowJudge:
         frames = {"selected": done + skipped, "done": done, "judged": self._judged, "skipped": skipped}
         metrics = self._metrics[METRICS]
         curves: dict[str, Any] = metrics.curves()
-        sums = {METRICS: metrics.state_dict()}
+        sums: dict[str, dict[str, Tensor]] = {METRICS: metrics.state_dict()}
         for name, by_error in self._by_error.items():
             curves[name] = by_error.compute()["nll_by_error"].tolist()
             sums[name] = by_error.state_dict()
@@ -171,8 +157,9 @@ class RowJudge:
             sums[CONFIDENCE] = {"samples": torch.cat(self._samples)}
         stages = ("network", "anchors", "uncertainty")
         times = {stage: [ms[stage] for ms in self._ms if stage in ms] for stage in stages}
-        return RowFigures(
-            row=self.row,
+        return Record(
+            method=self.row.method.name,
+            setting=self.row.setting.to_dict(),
             frames={**frames, **self._idle, "reasons": reasons},
             figures=metrics.compute() | self._parts(),
             curves=curves,

@@ -91,6 +91,10 @@ def folder_source(
         raise ValueError(
             f"{variance} is the output of a run, whose variance contains M: --variance takes what the network states"
         )
+    if run and scale is not None:
+        raise ValueError(
+            f"{folder} is the output of a run, whose maps are in metres: --depth-scale does not go with it"
+        )
     chosen = range(len(sequence)) if indices is None else indices
     selected = [name for index in chosen if (name := sequence.names[index]) not in (run.skipped if run else ())]
     if not selected:

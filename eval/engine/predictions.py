@@ -18,8 +18,8 @@ from torch import Tensor
 
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.eval.sequences.images import image_tensor
-from ufmstar_torch.files.arrays import read_npz_whole
-from ufmstar_torch.files.atomic import write_atomic
+from ufmstar_torch.files.read import read_npz_whole
+from ufmstar_torch.files.write import write_atomic
 from ufmstar_torch.frames.image_check import reduced, shows_something
 from ufmstar_torch.frames.networks import SAMPLES, combine
 from ufmstar_torch.frames.prediction import DepthPrediction

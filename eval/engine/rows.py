@@ -166,7 +166,8 @@ class RowRunner:
         with timed(times, "uncertainty", prediction.depth.device):
             out = on_cpu(self.estimator.update(prediction, torch.from_numpy(T), anchors))
         self.images += 1
-        fault = int(out.statistics.fault[0])
+        faults = out.statistics.fault  # None: a method that does not check frames
+        fault = 0 if faults is None else int(faults[0])
         if self._skips_faults and fault:
             if self._tracks is not None:
                 self._tracks.undo()

@@ -52,27 +52,17 @@ class Row:
         return f"{name}@{setting}" if setting else name
 
     @property
-    def name(self) -> str:
-        """The method's name; with tracked corners "UfM*-Anchored-Ensemble" or "UfM*-Posterior-Ensemble"."""
-        if self.setting.anchors != CORNERS:
-            return self.method.name
-        kind = "Posterior" if self.setting.posterior else "Anchored"
-        return self.method.name.replace("UfM*-", f"UfM*-{kind}-", 1)
-
-    @property
-    def changed(self) -> dict[str, Any]:
-        """Settings that are not the default and not part of ``name``."""
-        values = self.setting.to_dict()
-        if self.setting.recalibration:  # without the folder
-            values["recalibration"] = Path(self.setting.recalibration).name
-        named = {"anchors", "posterior"} if self.setting.anchors == CORNERS else set()
-        return {name: value for name, value in values.items() if name not in named}
-
-    @property
     def label(self) -> str:
         """The displayed name: "UfM*-Ensemble", "UfM*-Ensemble (ema_alpha 1.0)"."""
-        changed = ", ".join(f"{name} {value}" for name, value in self.changed.items())
-        return f"{self.name} ({changed})" if changed else self.name
+        return self.label_without()
+
+    def label_without(self, *settings: str) -> str:
+        """The displayed name without some settings."""
+        values = {name: value for name, value in self.setting.to_dict().items() if name not in settings}
+        if self.setting.recalibration:  # without the folder
+            values["recalibration"] = Path(self.setting.recalibration).name
+        changed = ", ".join(f"{name} {value}" for name, value in values.items())
+        return f"{self.method.name} ({changed})" if changed else self.method.name
 
     def to_dict(self) -> dict[str, Any]:
         """The row as plain values for eval.json."""

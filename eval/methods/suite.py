@@ -36,6 +36,7 @@ from typing import Any
 from ufmstar_torch.eval.methods.method import BASES, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import setting_from
+from ufmstar_torch.files.limits import read_text
 
 _NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 _SHIPPED = files("ufmstar_torch.eval.methods") / "suites"
@@ -144,7 +145,8 @@ def _file(name: str) -> Traversable:
 
 def _read(name: str) -> dict[str, Any]:
     """The content of a suite's file. Raises ValueError: unknown keys or bases."""
-    values = tomllib.loads(_file(name).read_text(encoding="utf-8"))
+    file = _file(name)
+    values = tomllib.loads(read_text(file) if isinstance(file, Path) else file.read_text(encoding="utf-8"))
     _check(values, _KEYS, "the suite")
     for base in (*values.get("bases", []), values.get("base", "ensemble")):
         _require_base(base)

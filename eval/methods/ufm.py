@@ -26,23 +26,23 @@ from ufmstar_torch.runtime.stateful import full_precision, outliving
 class UfMOutput(NamedTuple):
     """The variance of one frame."""
 
-    variance: Tensor  # [1, H, W] S_zz of the newest point at each pixel, s^2 without a point [m^2]; NaN: not valid
-    valid: Tensor  # [1, H, W] True where the pixel was used
+    variance: Tensor  # [B, H, W] S_zz of the newest point at each pixel, s^2 without a point [m^2]; NaN: not valid
+    valid: Tensor  # [B, H, W] True where the pixel was used
 
 
 class UfM:
-    """Uncertainty from Motion: a variance per pixel from one predicted depth map per image.
+    """Uncertainty from Motion: a variance per pixel from one predicted depth map per image, for B streams at once.
 
     A frame that raises an error leaves the state unchanged. There are no gradients.
 
     Args:
-        max_points: largest number of points; the paper's 100,000 at 224 x 224, 300,000 at 518 x 518. None = no limit.
-            With fewer than an image has pixels, points are dropped before they are observed again.
+        max_points: largest number of points of a stream; the paper's 100,000 at 224 x 224, 300,000 at 518 x 518. None =
+            no limit. With fewer than an image has pixels, points are dropped before they are observed again.
         dtype: of the points and of the computation, torch.float32 or torch.float64.
 
     Attributes:
-        cloud: the points, in the frame of the first camera; None before the first frame.
-        T_world_first: [1, 4, 4] float64 camera-to-world of the first camera [m].
+        clouds: the points of each stream, in the frame of its first camera; empty before the first frame.
+        T_world_first: [B, 4, 4] float64 camera-to-world of the first camera [m].
     """
 
     def __init__(self, max_points: int | None = 100_000, *, dtype: torch.dtype = torch.float32) -> None:
@@ -53,7 +53,7 @@ class UfM:
 
     def reset(self) -> None:
         """Forget all frames."""
-        self.cloud: Cloud | None = None
+        self.clouds: tuple[Cloud, ...] = ()
         self.T_world_first = torch.zeros(0, 4, 4, dtype=torch.float64)
 
     def __call__(
@@ -65,13 +65,13 @@ class UfM:
         epistemic: Tensor | None = None,
         valid: Tensor | None = None,
     ) -> UfMOutput:
-        """Process one predicted depth map and return its variance.
+        """Process one predicted depth map of each stream and return the variances.
 
         Args:
-            depth: [1, H, W] metric depth along the optical axis [m]. Pixels that are NaN, infinite, zero or negative
+            depth: [B, H, W] metric depth along the optical axis [m]. Pixels that are NaN, infinite, zero or negative
                 are ignored.
-            pose: [1, 4, 4] or [4, 4] camera-to-world (T_world_cam) [m].
-            intrinsics: [1, 3, 3] or [3, 3] in pixels of this depth map, first pixel's centre at (0, 0).
+            pose: [B, 4, 4] or [4, 4] camera-to-world (T_world_cam) [m].
+            intrinsics: [B, 3, 3] or [3, 3] in pixels of this depth map, first pixel's centre at (0, 0).
             aleatoric: like ``depth``, the network's variance A [m^2]; pixels where it is not a finite number >= 0 are
                 ignored.
             epistemic: likewise E [m^2].
@@ -79,22 +79,22 @@ class UfM:
 
         Raises:
             TypeError: wrong kind of argument or dtype.
-            ValueError: wrong shape, a pose that is not rigid, or bad intrinsics.
+            ValueError: wrong shape, another number of streams than before, a pose that is not rigid, or bad intrinsics.
         """
         frame = check_frame(
             depth, pose, intrinsics, aleatoric, epistemic, valid, None,
             feature_count=0, rotation_tolerance=UfMStarConfig.rotation_tolerance,
         )  # fmt: skip
-        if len(frame.depth) != 1:
-            raise ValueError(f"depth must be of one stream, [1, H, W], got {tuple(depth.shape)}")
+        if self.clouds and len(frame.depth) != len(self.clouds):
+            raise ValueError(f"depth must be of {len(self.clouds)} streams as before, got {tuple(depth.shape)}")
         raise_faults(frame)
         with outliving(), torch.no_grad(), full_precision(frame.depth.device):
-            first = frame.T_world_cam if self.cloud is None else self.T_world_first
-            cloud = Cloud.empty(self._dtype, frame.depth.device) if self.cloud is None else self.cloud
-            R, t = relative_pose(frame.T_world_cam, first)
+            first = self.T_world_first if self.clouds else frame.T_world_cam
+            clouds = self.clouds or [Cloud.empty(self._dtype, frame.depth.device)] * len(frame.depth)
             stated = [value.detach() for value in (frame.aleatoric, frame.epistemic) if value is not None]
             s2 = sum(stated, start=torch.zeros_like(frame.depth))
-            view = View(frame.depth[0], s2[0], frame.valid[0], frame.intrinsics[0], R[0], t[0])
-            cloud, variance = take_in(cloud, view, self.max_points)
-        self.cloud, self.T_world_first = cloud, first
-        return UfMOutput(variance[None].to(frame.depth.dtype), frame.valid)
+            views = map(View, frame.depth, s2, frame.valid, frame.intrinsics, *relative_pose(frame.T_world_cam, first))
+            steps = [take_in(cloud, view, self.max_points) for cloud, view in zip(clouds, views, strict=True)]
+            variance = torch.stack([variance for _, variance in steps]).to(frame.depth.dtype)
+        self.clouds, self.T_world_first = tuple(cloud for cloud, _ in steps), first
+        return UfMOutput(variance, frame.valid)

@@ -7,16 +7,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ufmstar_torch.runtime.lazy import lazy_names
+from ufmstar_torch.runtime.optional import lazy_names
 
 if TYPE_CHECKING:
-    from ufmstar_torch.eval.metrics.accuracy import RMSE as RMSE
-    from ufmstar_torch.eval.metrics.accuracy import AbsRel as AbsRel
-    from ufmstar_torch.eval.metrics.accuracy import Delta1 as Delta1
+    from ufmstar_torch.eval.metrics.accuracy import DepthAccuracy as DepthAccuracy
     from ufmstar_torch.eval.metrics.calibration import ECEDelta as ECEDelta
     from ufmstar_torch.eval.metrics.calibration import ECEQuantile as ECEQuantile
     from ufmstar_torch.eval.metrics.intervals import Coverage as Coverage
-    from ufmstar_torch.eval.metrics.intervals import IntervalWidth as IntervalWidth
     from ufmstar_torch.eval.metrics.likelihood import NLL as NLL
     from ufmstar_torch.eval.metrics.likelihood import EntropyHistogram as EntropyHistogram
     from ufmstar_torch.eval.metrics.ranking import NLLByError as NLLByError

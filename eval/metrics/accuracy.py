@@ -1,4 +1,4 @@
-"""Accuracy of the depth: delta1, AbsRel, RMSE over the pixels with valid ground truth."""
+"""Accuracy of the depth: delta1, AbsRel, RMSE."""
 
 from __future__ import annotations
 
@@ -12,25 +12,30 @@ from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, SumMetric, share
 TOLERANCE = 0.25  # [1] of delta1, in both definitions
 
 
-class Delta1(SumMetric):
-    """delta1, the share of pixels whose depth is right within 25 % (section "Experimental Setup").
+class DepthAccuracy(SumMetric):
+    """Accuracy of the depth d over the pixels with ground truth g and a finite depth.
 
-    ``compute()``: ``delta1``, in the paper's words "within 25 % of the ground truth", |d - g| <= .25 g;
-    ``delta1_ratio``, as elsewhere in the literature, max(d/g, g/d) < 1.25, False for d <= 0; ``pixels``, their number;
-    ``left_out_share``, the share of pixels with ground truth whose depth is NaN or infinite.
-    Without a pixel the figures are NaN.
+    ``compute()``: ``delta1``, the share of pixels whose depth is right within 25 % (section "Experimental Setup"), in
+    the paper's words "within 25 % of the ground truth", |d - g| <= .25 g; ``delta1_ratio``, as elsewhere in the
+    literature, max(d/g, g/d) < 1.25, False for d <= 0; ``abs_rel``, the mean of |d - g| / g; ``rmse`` [m], the root of
+    the mean of (d - g)^2; ``pixels``, their number; ``left_out_share``, the share of pixels with ground truth whose
+    depth is NaN or infinite. Without a pixel the figures are NaN.
     """
 
-    STATES = (("hits", COUNT), ("hits_ratio", COUNT), ("pixels", COUNT), ("with_truth", COUNT))
+    STATES = (
+        *((name, COUNT) for name in ("hits", "hits_ratio", "pixels", "with_truth")),
+        *((name, SUM) for name in ("relative", "squared")),
+    )
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        chosen = pixels.depths
-        d, g = chosen
+        d, g = chosen = pixels.depths
         return {
             "hits": chosen.number((d - g).abs() <= TOLERANCE * g),
             "hits_ratio": chosen.number((d > 0) & (torch.maximum(d / g, g / d) < 1 + TOLERANCE)),
             "pixels": chosen.number(),
             "with_truth": pixels.with_truth.sum(),
+            "relative": chosen.total((d - g).abs() / g),
+            "squared": chosen.total((d - g).square()),
         }
 
     def compute(self) -> dict[str, Tensor]:
@@ -39,30 +44,6 @@ class Delta1(SumMetric):
             "delta1_ratio": share(self.hits_ratio, self.pixels),
             "pixels": self.pixels.double(),
             "left_out_share": share(self.with_truth - self.pixels, self.with_truth),
+            "abs_rel": share(self.relative, self.pixels),
+            "rmse": share(self.squared, self.pixels).sqrt(),
         }
-
-
-class AbsRel(SumMetric):
-    """Mean of |d - g| / g; ``compute()`` returns ``abs_rel``, NaN without a pixel."""
-
-    STATES = (("total", SUM), ("pixels", COUNT))
-
-    def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        d, g = pixels.depths
-        return {"total": pixels.depths.total((d - g).abs() / g), "pixels": pixels.depths.number()}
-
-    def compute(self) -> dict[str, Tensor]:
-        return {"abs_rel": share(self.total, self.pixels)}
-
-
-class RMSE(SumMetric):
-    """Root of the mean of (d - g)^2 over all pixels [m]; ``compute()`` returns ``rmse``, NaN without one."""
-
-    STATES = (("total", SUM), ("pixels", COUNT))
-
-    def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        d, g = pixels.depths
-        return {"total": pixels.depths.total((d - g).square()), "pixels": pixels.depths.number()}
-
-    def compute(self) -> dict[str, Tensor]:
-        return {"rmse": share(self.total, self.pixels).sqrt()}

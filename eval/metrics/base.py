@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
-from torchmetrics import Metric
+
+from ufmstar_torch.eval.metrics.torchmetrics_import import Metric
 
 COUNT, SUM = torch.int64, torch.float64  # kinds of states
 
@@ -120,12 +121,14 @@ class SumMetric(Metric):
 
     Attributes:
         OF_VARIANCE: the name, in messages, of a metric that needs a variance; "" if it needs depth alone.
+        NEEDS: the part of ``Pixels`` without which ``SequenceMetrics`` leaves the metric out; "" = it needs none.
         STATES: name, ``COUNT`` or ``SUM``, and sizes of the dimensions of each state; initially zeros.
         CONSTANTS: tensors by name, as edges of bins, that move to the metric's device and are not saved.
         settings: of the instance; sums with other settings cannot be merged.
     """
 
     OF_VARIANCE: ClassVar[str] = ""
+    NEEDS: ClassVar[str] = ""
     STATES: tuple[tuple[Any, ...], ...] = ()
     CONSTANTS: Mapping[str, Tensor] = MappingProxyType({})
     settings: Mapping[str, Any] = MappingProxyType({})
@@ -168,7 +171,7 @@ class SumMetric(Metric):
 
     @abstractmethod
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        """The pixels' contribution to each state, by name; a missing state stays unchanged. On a GPU it must not wait
+        """The pixels' contribution to each state, by name. On a GPU it must not wait
         for a value, so it selects pixels by ``Selection``."""
 
     def merge_state(self, incoming_state: dict[str, Any] | Metric) -> None:

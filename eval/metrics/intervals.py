@@ -32,11 +32,10 @@ class IntervalCoverage(SumMetric):
     """
 
     OF_VARIANCE = "the coverage of intervals"
+    NEEDS = "level"
     STATES = (("levels", COUNT, _PERCENT),)
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        if not len(pixels.level):
-            return {}
         chosen = Selection((pixels.level,), pixels.with_truth & pixels.level.isfinite())
         kind = (chosen.maps[0] * _PERCENT - 1e-9).ceil().long() - 1
         return {"levels": chosen.histogram(kind.clamp(0, _PERCENT - 1), _PERCENT)}
@@ -52,60 +51,32 @@ class IntervalCoverage(SumMetric):
 
 
 class Coverage(SumMetric):
-    """Share of the pixels whose ground truth lies in the central interval of N(d, v) of a level.
+    """Coverage and mean width of the central interval of N(d, v) of a level, over the pixels with ground truth.
 
-    ``compute()``: ``coverage``, NaN without a pixel; it equals ``level`` for a calibrated variance.
+    ``compute()``: ``coverage``, the share of the pixels whose ground truth lies in the interval, which equals ``level``
+    for a calibrated variance; ``interval_width`` [m]. NaN without a pixel. Of two variances with the right coverage,
+    the one with the narrower intervals says more.
 
     Args:
         level: probability of the interval, in (0, 1).
     """
 
     OF_VARIANCE = "the coverage"
-    STATES = (("covered", COUNT), ("pixels", COUNT))
+    STATES = (("covered", COUNT), ("width", SUM), ("pixels", COUNT))
 
     def __init__(self, level: float = 0.9, **kwargs: Any) -> None:
-        self.half_width, self.settings = _half_width(level), {"level": level}
+        if not 0 < level < 1:
+            raise ValueError(f"level must lie in (0, 1), got {level}")
+        self.half_width, self.settings = NormalDist().inv_cdf(0.5 + level / 2), {"level": level}
         super().__init__(**kwargs)
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        d, v, g = pixels.judged
-        covered = pixels.judged.number((g - d).square() <= self.half_width**2 * v)
-        return {"covered": covered, "pixels": pixels.judged.number()}
+        d, v, g = chosen = pixels.judged
+        covered = chosen.number((g - d).square() <= self.half_width**2 * v)
+        return {"covered": covered, "width": chosen.total(2 * self.half_width * v.sqrt()), "pixels": chosen.number()}
 
     def compute(self) -> dict[str, Tensor]:
-        return {"coverage": share(self.covered, self.pixels)}
-
-
-class IntervalWidth(SumMetric):
-    """Mean width of the central interval of N(d, v) of a level, over the pixels with ground truth.
-
-    ``compute()``: ``interval_width`` [m], NaN without a pixel. Of two variances with the right :class:`Coverage`, the
-    one with the narrower intervals says more.
-
-    Args:
-        level: probability of the interval, in (0, 1).
-    """
-
-    OF_VARIANCE = "the width of intervals"
-    STATES = (("total", SUM), ("pixels", COUNT))
-
-    def __init__(self, level: float = 0.9, **kwargs: Any) -> None:
-        self.half_width, self.settings = _half_width(level), {"level": level}
-        super().__init__(**kwargs)
-
-    def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        _, v, _ = pixels.judged
-        return {"total": pixels.judged.total(2 * self.half_width * v.sqrt()), "pixels": pixels.judged.number()}
-
-    def compute(self) -> dict[str, Tensor]:
-        return {"interval_width": share(self.total, self.pixels)}
-
-
-def _half_width(level: float) -> float:
-    """Half the width of the central interval of N(0, 1). Raises ValueError: the level is not in (0, 1)."""
-    if not 0 < level < 1:
-        raise ValueError(f"level must lie in (0, 1), got {level}")
-    return NormalDist().inv_cdf(0.5 + level / 2)
+        return {"coverage": share(self.covered, self.pixels), "interval_width": share(self.width, self.pixels)}
 
 
 class GatedPixels(SumMetric):

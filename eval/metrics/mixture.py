@@ -26,6 +26,7 @@ class Mixture(SumMetric):
     """
 
     OF_VARIANCE = "the mixture"
+    NEEDS = "inlier"
     STATES = (
         *(("total", SUM), ("confidence", SUM, _BINS), ("covered", COUNT)),
         *((name, COUNT, _BINS) for name in ("accurate", "pixels", "at_or_below")),
@@ -34,8 +35,6 @@ class Mixture(SumMetric):
     CONSTANTS = MappingProxyType({"levels": quantile_levels(_BINS)})
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        if not len(pixels.inlier):
-            return {}
         maps = pixels.depth, pixels.variance, pixels.target, pixels.inlier, pixels.outlier
         v1, p = pixels.inlier, pixels.outlier
         used = (v1 > 0) & v1.isfinite() & (p >= 0) & (p <= 1)

@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from ufmstar_torch.eval.metrics.accuracy import RMSE, AbsRel, Delta1
+from ufmstar_torch.eval.metrics.accuracy import DepthAccuracy
 from ufmstar_torch.eval.metrics.base import SumMetric, flat_pixels
 from ufmstar_torch.eval.metrics.calibration import ECEDelta, ECEQuantile
 from ufmstar_torch.eval.metrics.intervals import GatedPixels, IntervalCoverage
@@ -48,7 +48,7 @@ class SequenceMetrics(nn.Module):
         if bins not in BINS:
             raise ValueError(f"bins must be one of {', '.join(BINS)}, got {bins!r}")
         self.with_variance = with_variance
-        kinds: list[type[SumMetric]] = [Delta1, AbsRel, RMSE]
+        kinds: list[type[SumMetric]] = [DepthAccuracy]
         if with_variance:
             kinds += [NLL, ECEDelta, ECEQuantile, EntropyHistogram, Sparsification, SpearmanCorrelation, Mixture]
             kinds += [IntervalCoverage, GatedPixels]
@@ -79,7 +79,8 @@ class SequenceMetrics(nn.Module):
         """
         pixels = flat_pixels(depth, variance, target, valid, mixture, level)
         for metric in self._all():
-            metric.add(pixels)
+            if not metric.NEEDS or len(getattr(pixels, metric.NEEDS)):
+                metric.add(pixels)
 
     def compute(self) -> dict[str, float]:
         """The scalar figures by name: delta1, delta1_ratio, abs_rel, rmse [m], nll, ece_delta, ece_q, ...
@@ -130,8 +131,6 @@ def mean_and_ci(values: Iterable[float]) -> tuple[float, float]:
     finite = [float(v) for v in values if not math.isnan(v)]
     if len(finite) < 2:
         return (finite[0] if finite else math.nan), math.nan
-    from scipy.stats import t
+    from scipy.stats import sem, t
 
-    n, mean = len(finite), math.fsum(finite) / len(finite)
-    deviation = math.sqrt(math.fsum((v - mean) ** 2 for v in finite) / (n - 1))
-    return mean, float(t.ppf(0.975, n - 1)) * deviation / math.sqrt(n)
+    return math.fsum(finite) / len(finite), float(t.ppf(0.975, len(finite) - 1) * sem(finite))

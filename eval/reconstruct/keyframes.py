@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ufmstar_torch.eval.run.files import write_bytes_atomic
+from ufmstar_torch.eval.engine.files import write_bytes_atomic
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError
 
 # An image is a keyframe if the median corner has moved by this share of the image's width since the last keyframe, or

@@ -9,10 +9,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ufmstar_torch.eval.engine.judge import CONFIDENCE, METRICS
+from ufmstar_torch.eval.engine.judge import CONFIDENCE
+from ufmstar_torch.eval.engine.record import FORMAT, METRICS, Record, ResultsError, Sums
 from ufmstar_torch.eval.methods.row import Row, plain_rows, row_from
 from ufmstar_torch.eval.suite.folder import FAILED, EvalFolder
-from ufmstar_torch.eval.suite.record import FORMAT, Record, ResultsError, Sums
 
 Curves = Mapping[str, list[float]]
 
@@ -147,22 +147,16 @@ def _about(out: Path) -> dict[str, Any]:
     if not path.is_file():
         raise ResultsError(f"{out} is no folder of `ufmstar eval`: it has no eval.json")
     about = _read_json(path)
-    if not isinstance(about, dict) or about.get("format") != FORMAT or not isinstance(about.get("suite"), str):
-        raise ResultsError(f"{path} is not the description of an evaluation of format {FORMAT}")
-    sequences = about.get("sequences", [])
-    named = ("dataset", "sequence")
-    datasets = about.get("datasets", [])
-    if not isinstance(datasets, list) or not all(isinstance(name, str) for name in datasets):
-        raise ResultsError(f"{path} lists data sets that cannot be: each has a name")
-    if not isinstance(sequences, list) or not all(
-        isinstance(one, dict) and all(isinstance(one.get(name), str) for name in named) for one in sequences
-    ):
-        raise ResultsError(f"{path} lists sequences that cannot be: each has a dataset and a sequence")
     try:
+        if about["format"] != FORMAT:
+            raise ValueError(f"its format is {about['format']}")
+        named = [sequence[key] for sequence in about.get("sequences", []) for key in ("dataset", "sequence")]
+        if not all(isinstance(name, str) for name in (about["suite"], *about.get("datasets", []), *named)):
+            raise TypeError("a name is no text")
         listed_rows(about)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ResultsError(f"{path} lists a row that cannot be: {error}") from error
-    return about
+    except (AttributeError, LookupError, TypeError, ValueError) as error:
+        raise ResultsError(f"{path} is not the description of an evaluation of format {FORMAT}: {error!r}") from error
+    return dict(about)
 
 
 def _read_json(path: Path) -> Any:
@@ -204,7 +198,7 @@ def _merged(records: Sequence[Record]) -> tuple[dict[tuple[str, Row], Curves], l
         total: Sums = {}
         try:
             for record in of_row:  # their order decides the last bits
-                total = _added(total, record.sums())
+                total = _added(total, record.load_sums())
             merged[dataset, row] = _curves(total)
         except RuntimeError as error:
             text = " ".join(str(error).split())[:200]

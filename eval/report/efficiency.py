@@ -1,4 +1,4 @@
-"""The paper's table of efficiency: the cost of uncertainty in time, power, energy and memory; one per architecture.
+"""The cost of uncertainty: the paper's table of time, power, energy and memory, one per architecture, and its figures.
 
 The cell of a part that was not measured has words instead of a number: "not measurable here" without a sensor, "not
 separable" if a network predicts depth and variance together. A difference below the noise is an upper bound.
@@ -6,14 +6,18 @@ separable" if a network predicts depth and variance together. A difference below
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import row_from
-from ufmstar_torch.eval.report.names import count, row_labels
+from ufmstar_torch.eval.report import style
+from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.paper import PaperTable, paper_tables
-from ufmstar_torch.eval.report.table import Cell, Table, frame_of
+from ufmstar_torch.eval.report.quantities import count, row_labels
+from ufmstar_torch.eval.report.table import Table
+from ufmstar_torch.eval.run.colours import INK, plain
 
 # Keys and words of ``efficiency.json``, as eval/bench writes them.
 DEPTH, NETWORK, MULTIVIEW = "depth", "network_uncertainty", "multiview"
@@ -56,24 +60,24 @@ def _table(run: Mapping[str, Any], label: str) -> Table:
     )
     name = f"efficiency-{''.join(c if c.isalnum() else '-' for c in label.lower())}"
     notes = _notes(run, rows, run["networks"][bases[0]])
-    return Table(name, f"Efficiency of uncertainty, {label}", "Method", frame_of(lines, _COLUMNS), notes)
+    return Table.of(name, f"Efficiency of uncertainty, {label}", lines, _COLUMNS, notes)
 
 
 def _paper_table(quoted: PaperTable) -> Table:
     """The paper's table 2 of one network, with our columns."""
     bases = list(dict.fromkeys(Method.parse(method).base for method in quoted.rows))
-    further = [Cell()] * (len(_COLUMNS) - len(quoted.columns))
+    further = [""] * (len(_COLUMNS) - len(quoted.columns))
     lines = [
-        (bases.index(Method.parse(method).base), method, [*(cells.get(c, Cell()) for c in quoted.columns), *further])
+        (bases.index(Method.parse(method).base), method, [*(cells.get(c, "") for c in quoted.columns), *further])
         for method, cells in quoted.rows.items()
     ]
     alone = f"Depth alone: {quoted.alone['latency_ms']} ms, {quoted.alone['memory_mb']} MB."
     notes = (alone, f"Measured by the paper on {quoted.measured_on}.")
     title = f"The paper's table 2, {quoted.network}"
-    return Table(f"paper-efficiency-{quoted.network}", title, "Method", frame_of(lines, _COLUMNS), notes)
+    return Table.of(f"paper-efficiency-{quoted.network}", title, lines, _COLUMNS, notes)
 
 
-def _cells(row: Mapping[str, Any], units: Mapping[str, str]) -> list[Cell]:
+def _cells(row: Mapping[str, Any], units: Mapping[str, str]) -> list[str]:
     """One row, in the order of ``_COLUMNS``."""
     cells: list[str] = []
     for unit in UNITS:
@@ -91,7 +95,7 @@ def _cells(row: Mapping[str, Any], units: Mapping[str, str]) -> list[Cell]:
     else:
         overhead, buffers = _percent(memory["overhead_percent"]), megabytes(memory["buffers_bytes"])
         cells += [megabytes(memory["network_uncertainty_bytes"]), end, overhead, mean, buffers]
-    return list(map(Cell, cells))
+    return cells
 
 
 def _counts(row: Mapping[str, Any], part: str) -> bool:
@@ -166,3 +170,42 @@ def _notes(run: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], network: M
     notes.append(f"Medians of {of}, measured in a pass of their own; {machine}.")
     notes.append("Memory is that of parameters and, after the last frame, of the multiview state; buffers beside.")
     return [*notes, *(f"{method} is left out: {why}." for method, why in run["left_out"].items())]
+
+
+# ---- the paper's figures of the time of UfM*'s stages, and of cumulative time and energy on a small computer ----
+
+# The stages of a step of UfM*, from dark to light, for prints in grey.
+STAGES = {
+    "check": "#4d4d4d", "segment": "#0072B2", "correspond": "#009E73", "fuse": "#D55E00", "append": "#CC79A7",
+    "regress": "#E69F00", "average": "#56B4E9",
+}  # fmt: skip
+
+
+def draw_stages(results: Results) -> Any | None:
+    """The paper's figure of the stages' shares in a step of UfM*, with numbers in wide bars and the sum at the right;
+    None unless ``efficiency.json`` has stages."""
+    measured = [] if results.efficiency is None else architectures(results.efficiency)
+    staged = [row for run in measured for row in run["rows"] if row.get("stages")]
+    if not staged:
+        return None
+    figure = style.new_figure(8.6, 1.5 + 0.5 * len(staged), "Where the time of UfM* goes")
+    axes = figure.subplots()
+    for y, row in enumerate(staged):
+        times = {name: stage["median_ms"] for name, stage in row["stages"]["stages"].items()}
+        total, left = math.fsum(times.values()), 0.0
+        for name, colour in STAGES.items():
+            share = 100 * times[name] / total
+            label = name if y == 0 else ""
+            axes.barh(y, share, left=left, color=colour, label=label, height=0.62, edgecolor="white", linewidth=0.5)
+            if share >= 6:
+                letters = INK if name in ("regress", "average") else "white"  # dark on the light colours
+                words = {"size": style.TICK, "color": letters, "ha": "center", "va": "center"}
+                axes.text(left + share / 2, y, f"{share:.0f} %", **words)
+            left += share
+        axes.text(101, y, f"{total:.1f} ms", size=style.TICK, color=INK, va="center")
+    axes.set_yticks(range(len(staged)), [plain(f"{row['row']}\n{row['network']}") for row in staged])
+    style.finish(axes, x="share of the step [%], medians of its stages")
+    axes.grid(visible=False)
+    axes.set(xlim=(0, 100), ylim=(len(staged) - 0.4, -0.6))
+    style.legend_below(figure)
+    return figure

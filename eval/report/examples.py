@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.eval.run.colours import known_where, striped
-from ufmstar_torch.files.arrays import read_npz_whole
-from ufmstar_torch.steps import unmeasured
+from ufmstar_torch.files.read import read_npz_whole
+from ufmstar_torch.steps.regress import HALF
 
 Map = NDArray[np.float32]
 _SCENE = ("image", "truth", "K")
@@ -56,7 +56,7 @@ class RowMaps:
             sigma=_root(variance, valid),
             nll=exact**2 / (2 * v) + 0.5 * np.log(2 * math.pi * v),
             roots={name: _root(stored[name], valid) for name in PARTS if name in stored},
-            unmeasured=stored["measured"] < unmeasured.HALF if "measured" in stored else None,
+            unmeasured=stored["measured"] < HALF if "measured" in stored else None,
         )
 
     @property

@@ -10,25 +10,23 @@ from typing import Any
 
 import numpy as np
 
-from ufmstar_torch.anchors.tracker import TrackerConfig
-from ufmstar_torch.eval.engine.anchors import TRUTH_COUNT
+from ufmstar_torch.eval.engine.record import Record
 from ufmstar_torch.eval.methods.method import ALONE, BASES, Method
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import CORNERS, DEFAULTS, DENSE, TRUTH, default_of
-from ufmstar_torch.eval.report import names, style
+from ufmstar_torch.eval.methods.setting import DEFAULTS, default_of
+from ufmstar_torch.eval.report import quantities, style
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.means import Mean, difference, mean_of
+from ufmstar_torch.eval.report.quantities import Mean, difference, mean_of
 from ufmstar_torch.eval.report.style import LineStyle
 from ufmstar_torch.eval.run.colours import FAINT
-from ufmstar_torch.eval.suite.record import Record
 
-COUNT, SKIP = "anchor_count", "skip"
+SKIP = "skip"
 Rest = tuple[tuple[str, Any], ...]
-# Largest number of anchors of rows without ``anchor_count``.
-_COUNTS = {"": 0, CORNERS: TrackerConfig().max_points, TRUTH: TRUTH_COUNT}
-# Prefixes of settings that a row without anchors cannot have.
-_OF_ANCHORS = ("anchor", "track_noise", "posterior")
-_ANCHORED = {CORNERS: "anchored", DENSE: "dense anchors", TRUTH: "truth anchors"}
+# Units of the axes.
+UNITS = {
+    "rotation_noise": "°", "translation_noise": "m", "rotation_drift": "°/√frame", "translation_drift": "m/√frame",
+    "track_noise": "px", "prior_weight": "px/m³", "prior_mean": "m²", "segment.min_pixels": "px",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +40,8 @@ class SweepLine:
 
     @property
     def words(self) -> str:
-        """The fixed settings of the line: "", "anchored", "truth anchors, shrinkage κ 1 anchors"."""
-        values = dict(self.rest)
-        anchors = _ANCHORED.get(kind := values.pop("anchors", ""), kind)
-        return ", ".join(filter(None, (anchors, names.setting_label(values))))
+        """The fixed settings of the line, "" for the default: "anchors corners"."""
+        return ", ".join(f"{name} {value}" for name, value in self.rest)
 
 
 def sweeps(results: Results) -> list[tuple[str, str]]:
@@ -64,12 +60,6 @@ def sweep_lines(results: Results, base: str, name: str) -> list[SweepLine]:
         if not math.isnan(value := _value(row, name)):
             rest = tuple(sorted((other, v) for other, v in _changed(row).items() if other not in left_out))
             groups.setdefault((row.method, rest), {}).setdefault(value, []).append(row)
-    if name == COUNT:  # lines over several numbers of anchors begin with the rows without anchors
-        for (method, rest), by_value in groups.items():
-            without = tuple(item for item in rest if not item[0].startswith(_OF_ANCHORS))
-            plain = groups.get((method, without), {})
-            if len(by_value) > 1 and 0.0 in plain:
-                by_value.setdefault(0.0, plain[0.0])
     return [
         SweepLine(
             method, rest, {value: [r for row in by_value[value] for r in results.of(row)] for value in sorted(by_value)}
@@ -94,8 +84,6 @@ def _number(value: Any) -> float:
 
 
 def _value(row: Row, name: str) -> float:
-    if name == COUNT and row.setting.anchor_count is None:
-        return _COUNTS.get(row.setting.anchors, math.nan)
     values = _changed(row)
     return _number(values[name]) if name in values else default_value(name, row.setting.ufm_preset)
 
@@ -107,13 +95,9 @@ def _changed(row: Row) -> dict[str, Any]:
 
 # ---- figures ----
 
-SHOWN = (names.NLL, names.ECE_DELTA, names.ECE_Q)
-# Colours and markers of lines of the same method by ``rest``; they differ from all of ``line_style``'s.
-_FIXED: dict[Rest, tuple[str, str]] = {
-    (("anchors", CORNERS),): ("#882255", "d"),
-    (("anchors", TRUTH),): ("#222222", "*"),
-}
-_OTHERS = (("#117733", "h"), ("#88CCEE", "p"), ("#999933", "<"), ("#AA4499", ">"))
+SHOWN = (quantities.NLL, quantities.ECE_DELTA, quantities.ECE_Q)
+# Colours and markers of lines with other settings; they differ from all of ``line_style``'s.
+_OTHERS = (("#882255", "d"), ("#222222", "*"), ("#117733", "h"), ("#88CCEE", "p"), ("#999933", "<"), ("#AA4499", ">"))
 _DASHED: Mapping[str, Any] = {"linestyle": "--", "linewidth": 1.4}
 # Beyond this mean NLL an axis is logarithmic: pixels with nearly no variance make the mean arbitrarily large.
 _HIGH = 50.0
@@ -128,11 +112,11 @@ def draw_sweep(results: Results, base: str, name: str) -> Any:
     styles, spare = {line: style.line_style(line.method) for line in [*alone, *fused]}, cycle(_OTHERS)
     for line in fused:
         if line.rest:
-            styles[line] = LineStyle(line.words or styles[line].name, *(_FIXED.get(line.rest) or next(spare)))
-    shown = (*SHOWN, names.SPEARMAN) if any("anchors" in dict(line.rest) for line in fused) else SHOWN
+            styles[line] = LineStyle(line.words or styles[line].name, *next(spare))
+    shown = (*SHOWN, quantities.SPEARMAN) if any("anchors" in dict(line.rest) for line in fused) else SHOWN
     values = sorted({value for line in fused if len(line.points) > 1 for value in line.points})
-    label, unit = names.SETTINGS.get(name, (names.setting_name(name), ""))
-    title = f"{label[:1].upper()}{label[1:]}: {BASES[base][0]}, {names.count(len(results.sequences()), 'sequence')}"
+    label, unit = name.replace("_", " "), UNITS.get(name)
+    title = f"{label.capitalize()}: {BASES[base][0]}, {quantities.count(len(results.sequences()), 'sequence')}"
     gains = {line: _gains(alone[0], line) for line in fused if len(line.points) > 1} if name == SKIP and alone else {}
     figure = style.new_figure(4.0 * (len(shown) + bool(gains)), 3.4, title)
     panels = list(figure.subplots(1, len(shown) + bool(gains)))
@@ -142,7 +126,7 @@ def draw_sweep(results: Results, base: str, name: str) -> Any:
         for line, means in gains.items():
             _draw_means(panel, means, styles[line])
         panel.axhline(0, **_DASHED, color=FAINT, label=styles[alone[0]].name)
-        style.finish(panel, title=f"NLL of {styles[alone[0]].name} – NLL: improvement {names.HIGHER}", x=x_label)
+        style.finish(panel, title=f"NLL of {styles[alone[0]].name} – NLL: improvement {quantities.HIGHER}", x=x_label)
         _scale(panel, values)
         style.name_lines(panel)
     for panel, quantity in zip(panels, shown, strict=True):
@@ -162,7 +146,7 @@ def draw_sweep(results: Results, base: str, name: str) -> Any:
 def _gains(alone: SweepLine, line: SweepLine) -> dict[float, Mean]:
     """NLL of the network alone minus NLL of a line, by the values that both have, paired by sequence."""
     return {
-        value: difference(alone.points[value], records, names.NLL)
+        value: difference(alone.points[value], records, quantities.NLL)
         for value, records in line.points.items()
         if value in alone.points
     }
@@ -179,7 +163,7 @@ def _draw_means(axes: Any, means: Mapping[float, Mean], line_style: LineStyle) -
     return list(y.tolist())
 
 
-def _draw_line(axes: Any, line: SweepLine, line_style: LineStyle, quantity: names.Quantity) -> list[float]:
+def _draw_line(axes: Any, line: SweepLine, line_style: LineStyle, quantity: quantities.Quantity) -> list[float]:
     """Draw means over the values of a setting with their band; references are dashed, without a band. Returns the
     means."""
     means = {value: mean_of(records, quantity) for value, records in line.points.items()}

@@ -8,16 +8,14 @@ import json
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
 
+from ufmstar_torch.eval.engine.files import write_bytes_atomic
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.means import FEW_SEQUENCES
-from ufmstar_torch.eval.report.names import row_labels
 from ufmstar_torch.eval.report.pictures import Picture
-from ufmstar_torch.eval.report.table import WIDE, Table
-from ufmstar_torch.eval.run.files import write_bytes_atomic
+from ufmstar_torch.eval.report.quantities import row_labels
+from ufmstar_torch.eval.report.table import Table, typeset
 
 PAGE = "report.html"
 TEMPLATES = Path(__file__).parent / "templates"
@@ -26,7 +24,6 @@ QUALITY = 84
 # Kinds of figures (the first words of their files' names) in each section of the page, and what they show.
 CURVES = {
     "calibration": "Calibration: how often is the depth right where a row says so? On the diagonal: as often as stated",
-    "intervals": "Intervals: which share of the true depths lies in the stated intervals?",
     "gates": "Gates: what remains of an image under a limit on σ, and how wrong is it?",
     "error": "Errors: is the likelihood bad only where the error is large?",
     "entropy": "Entropy: how uncertain is each row, by environment?",
@@ -49,10 +46,9 @@ def write_page(
         ValueError: a picture cannot be read.
         ImportError: Pillow or Jinja2 is missing.
     """
-    parts: dict[str, list[Table]] = {"main": [], "efficiency": [], "further": []}
+    parts: dict[str, list[Table]] = {"main": [], "efficiency": [], "extra": []}
     for name, listed in tables.items():
-        kind = name.partition("-")[0]
-        parts[kind if kind in parts else "further"] += listed
+        parts[name.partition("-")[0]] += listed
     made = {name: results.about.get(name) for name in ("networks", "settings", "versions", "machine")}
     digests = {f"{r.dataset}, {r.sequence}": r.provenance.get("sequence") for r in results.records}
     made["sequences (SHA-256)"] = {name: digest for name, digest in digests.items() if digest}
@@ -64,8 +60,6 @@ def write_page(
         pictures=[(picture, _embedded(results.out / "figures" / picture.file)) for picture in pictures],
         cost_figures=_figures(figures, COST),
         limits=limits(results, undrawn),
-        few_sequences=FEW_SEQUENCES,
-        wide=WIDE,
         command=command(results.about),
         made=json.dumps(made, indent=1, ensure_ascii=False, default=str),
     )
@@ -85,12 +79,6 @@ def _template() -> Any:
     for name in ("css", "js"):
         environment.globals[name] = Markup((TEMPLATES / f"report.{name}").read_text(encoding="utf-8"))
     return environment.get_template("report.html.j2")
-
-
-def typeset(text: str) -> str:
-    """Text as HTML, with a minus for a hyphen before a number, and narrow no-break spaces around units and ±."""
-    text = re.sub(r"(?<![\w.–-])-(?=\d)", "−", escape(text))
-    return text.replace(" ± ", "\u202f±\u202f").replace(" %", "\u202f%")
 
 
 def _figures(paths: Sequence[Path], kinds: Mapping[str, str]) -> list[tuple[str, list[tuple[str, str, bool]]]]:

@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
 
-from ufmstar_torch.eval.report.table import Cell
-
 
 @dataclass(frozen=True)
 class PaperTable:
@@ -19,7 +17,7 @@ class PaperTable:
     network: str
     measured_on: str  # data and machine
     columns: tuple[str, ...]  # keys; for equal quantities those of Record.figures
-    rows: Mapping[str, Mapping[str, Cell]]  # printed cells by method and column, without dashes
+    rows: Mapping[str, Mapping[str, str]]  # printed cells by method and column, without dashes
     suite: str = ""  # name of the suite that repeats it
     alone: Mapping[str, str] = field(default_factory=dict)  # latency_ms, memory_mb without uncertainty (table 2)
 
@@ -32,7 +30,7 @@ def paper_tables() -> tuple[PaperTable, ...]:
     for entry in listed:
         columns = tuple(entry.pop("columns"))
         printed = {name: zip(columns, values, strict=True) for name, values in entry.pop("rows").items()}
-        rows = {name: {c: Cell(*v.split(" ± ")) for c, v in cells if v != "-"} for name, cells in printed.items()}
+        rows = {name: {c: v for c, v in cells if v != "-"} for name, cells in printed.items()}
         tables.append(PaperTable(columns=columns, rows=rows, **entry))
     return tuple(tables)
 

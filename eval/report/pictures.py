@@ -16,14 +16,12 @@ from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.examples import PARTS, Example, RowMaps, find_examples
-from ufmstar_torch.eval.report.names import row_labels
-from ufmstar_torch.eval.report.rooms import Snapshot, draw_room, find_rooms
+from ufmstar_torch.eval.report.quantities import row_labels
 from ufmstar_torch.eval.run.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range
 from ufmstar_torch.eval.run.panels import Bar, GridRow, Panel, draw_grid
 
-OVERVIEW, STRIP, BREAKDOWN, COMPARE, ROOM = "overview", "strip", "breakdown", "compare", "room"
-# Limits that keep a report of a hundred sequences readable and small.
-MOST_FRAMES, MOST_ROOMS = 4, 3
+OVERVIEW, STRIP, BREAKDOWN, COMPARE = "overview", "strip", "breakdown", "compare"
+MOST_FRAMES = 4  # keeps a report of a hundred sequences readable and small
 _BREAKDOWN_BASES = ("ensemble", "aleatoric")
 # [nats] One scale for all strips, so that they can be compared. 6 is an error of about 3.5 sigma (for sigma = .3 m); a
 # larger range would reduce the contrast of the rest. The map differs from those of depth and lengths, and has no grey.
@@ -44,7 +42,7 @@ Drawing = tuple[str, Callable[[], Picture]]
 
 
 def pictures_of(results: Results, folder: Path) -> Iterator[Drawing]:
-    """Yield name and function of strips, breakdowns, comparisons and rooms of the example frames. The function writes
+    """Yield name and function of strips, breakdowns and comparisons of the example frames. The function writes
     the picture into ``folder``. Raises ValueError: an example cannot be read; the message names the file.
     """
     labels = {row.slug: label for row, label in row_labels(results.rows).items()}
@@ -53,7 +51,6 @@ def pictures_of(results: Results, folder: Path) -> Iterator[Drawing]:
     yield from _overview(results, folder, chosen)
     for e in chosen:
         yield from _of_frame(results, folder, e)
-    yield from _of_rooms(results, folder)
 
 
 def file_name(*parts: str) -> str:
@@ -109,28 +106,7 @@ def _of_frame(results: Results, folder: Path, e: Example) -> Iterator[Drawing]:
             yield f"{e.title}: comparison of {base}", partial(draw_comparison, folder, e, pair, base)
 
 
-def _of_rooms(results: Results, folder: Path) -> Iterator[Drawing]:
-    drawn = 0
-    for dataset, sequence in results.sequences():
-        rooms = find_rooms(results.folder(dataset, sequence))
-        # One row per room: the suite's first UfM* with default settings.
-        row = next((row for row in results.rows if row.slug in rooms and row.setting.plain), None)
-        if row and drawn < MOST_ROOMS and any(len(snapshot.mean) for snapshot in rooms[row.slug]):
-            drawn += 1
-            path = folder / file_name(ROOM, dataset, sequence, row.slug)
-            yield f"{sequence}: room", partial(_room, path, row_labels([row])[row], sequence, rooms[row.slug])
-
-
 # ---- drawing: each function writes its PNG into the folder and returns the Picture ----
-
-
-def _room(path: Path, label: str, sequence: str, snapshots: Sequence[Snapshot]) -> Picture:
-    draw_room(path, snapshots, f"{label}, {sequence}")
-    caption = (
-        "Each Gaussian is an ellipse as large as the patch it stands for. What lies above the camera (the ceiling) is "
-        "left out. Grey: seen from one view only. Black: no disagreement. Blue: the camera's path."
-    )
-    return Picture(path.name, f"{sequence}: the Gaussians of {label}", caption)
 
 
 def fit_strip_scales(example: Example, rows: Sequence[str]) -> tuple[ColourScale, ColourScale]:

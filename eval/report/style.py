@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ufmstar_torch.eval.engine.files import write_atomic
 from ufmstar_torch.eval.methods.method import ALONE, RELATIVE, RHO, UFM, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.run.colours import FAINT, INK, plain, require_matplotlib
-from ufmstar_torch.eval.run.files import write_atomic
 
 GRID = "#e6e6e6"
 TITLE, LABEL, TICK = 11, 9, 8  # font sizes [pt]
@@ -96,7 +96,8 @@ def name_lines(axes: Any) -> None:
 def legend_below(figure: Any) -> None:
     """Add the names of all lines below the panels."""
     named = {label: h for axes in figure.axes for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    how: dict[str, Any] = {"ncols": len(named), "frameon": False, "fontsize": TICK}
+    columns = max(2, int(figure.get_figwidth() / 1.3))  # a name takes some 1.3 inches
+    how: dict[str, Any] = {"ncols": min(len(named), columns), "frameon": False, "fontsize": TICK}
     figure.legend(list(named.values()), list(named), loc="outside lower center", **how)
 
 

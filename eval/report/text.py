@@ -1,17 +1,17 @@
-"""Text for the terminal: results of a run, an evaluation, a report and the onboard demo."""
+"""Text for the terminal: results of a run, an evaluation and a report, and real-time figures."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.engine.judge import POSTERIOR
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.names import count
-from ufmstar_torch.eval.report.table import markdown
+from ufmstar_torch.eval.report.quantities import count
+from ufmstar_torch.eval.report.table import aligned
 from ufmstar_torch.eval.report.tables import main_table
 from ufmstar_torch.eval.report.write import Report
 from ufmstar_torch.eval.run.frame_record import NEAR_ZERO
@@ -23,7 +23,6 @@ _RUN_COLUMNS = {
     "ece_q": "ECE_q", "spearman": "Spearman",
 }  # fmt: skip
 _OFF = 1.1  # ratio of depths from which an error matters
-_TARGET_MS, _TARGET_LOST = 50.0, 0.01  # of the onboard demo
 _CALIBRATED = 4.0  # largest mean z^2 of held-out anchors, and inverse of the smallest: sigma is right within a factor 2
 _UNVERIFIED = "mean sigma not shown: nothing here can verify it"
 # By source of anchors, the names of the count of anchors with a depth and of the total.
@@ -37,7 +36,7 @@ _FOUND = {
 def summary(results: Results) -> str:
     """The main table of an evaluation, failed and missing sequences, and notes."""
     shown = [None] if None in results.tabulated else results.tabulated
-    parts = [markdown(main_table(results, dataset)) for dataset in shown]
+    parts = [main_table(results, dataset).text() for dataset in shown]
     if results.failed:
         parts.append("failed:\n" + "\n".join(f"  {f.dataset}, {f.sequence}: {f.reason}" for f in results.failed))
     if results.missing:
@@ -167,42 +166,6 @@ def _anchor_lines(summary: Mapping[str, Any]) -> list[str]:
     return [line, rest + (f"; {later} later: with what was learnt before" if later else "")]
 
 
-def onboard_table(summary: Mapping[str, Any]) -> str:
-    """The real-time table of ``ufmstar demo --onboard``, its target, and the contrast of disagreement."""
-    measured, network = summary["realtime"], summary["network"]
-    lines = [realtime_table(measured)]
-    latency = measured["latency_ms"] or {}
-    met = latency.get("p99", math.inf) < _TARGET_MS and (measured["lost_share"] or 0) < _TARGET_LOST
-    words = f"p99 below {_TARGET_MS:g} ms and less than {100 * _TARGET_LOST:g} % lost at 30 images/s"
-    lines.append(f"target, {words}: {'met' if met else 'missed'} (load average {number(summary['load_average'])})")
-    if shift := network.get("depth_shift"):
-        lines.append(
-            f"{network['quantised']}: depth shifted by {100 * shift['median']:.2g} % in the median, "
-            f"{100 * shift['p99']:.2g} % at most for 99 % of the pixels"
-        )
-    if contrast := summary.get("contrast"):
-        m = {name: number(value) for name, value in contrast.items()}
-        lines.append(
-            f"where the aleatoric variance is low: RMSE {m['rmse_high']} m at high disagreement "
-            f"({100 * contrast['share']:.0f} % of the pixels; aleatoric sigma {m['aleatoric_sigma_high']} m, sqrt(M) "
-            f"{m['disagreement_high']} m), {m['rmse_low']} m elsewhere"
-        )
-    costs = summary.get("costs") or {}
-    if costs:
-        lines.append(_cost_line(costs))
-    files = ["summary.json", *(["onboard.png"] if contrast else []), *(["onboard_costs.png"] if costs else [])]
-    return "\n".join([*lines, f"{summary['out']}: {', '.join(files)}"])
-
-
-def _cost_line(costs: Mapping[str, Any]) -> str:
-    """The time and energy of the parts of a live run."""
-    seconds = ", ".join(f"{name} {number(values[-1])} s" for name, values in costs["seconds"].items())
-    if "joules" not in costs:
-        return f"time: {seconds}; energy is not measurable here: {costs['not_measurable']}"
-    joules = ", ".join(f"{name} {number(values[-1])} J" for name, values in costs["joules"].items())
-    return f"time: {seconds}; energy: {joules}"
-
-
 def realtime_table(summary: Mapping[str, Any]) -> str:
     """Times, drops and memory of ``RealTime.summary``."""
 
@@ -231,12 +194,3 @@ def realtime_table(summary: Mapping[str, Any]) -> str:
 def number(value: float | None) -> str:
     """Three digits, a dash for no value."""
     return "-" if value is None or math.isnan(value) else f"{value:.3g}"
-
-
-def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table: the first column to the left, the others to the right."""
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return [
-        "  ".join(cell.rjust(w) if i else cell.ljust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True)))
-        for row in rows
-    ]

@@ -8,13 +8,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ufmstar_torch.eval.report import figures_cost, figures_curves, figures_gates, figures_sweep
+from ufmstar_torch.eval.engine.files import remove_temporaries
+from ufmstar_torch.eval.report import efficiency, figures_calibration, figures_error, figures_sweep
 from ufmstar_torch.eval.report.data import Results, load_results
 from ufmstar_torch.eval.report.page import write_page
 from ufmstar_torch.eval.report.pictures import Picture, pictures_of
 from ufmstar_torch.eval.report.style import save_figure
 from ufmstar_torch.eval.report.tables import all_tables, write_tables, write_tidy
-from ufmstar_torch.eval.run.files import remove_temporaries
 from ufmstar_torch.eval.suite.folder import EVALUATION
 
 # Errors of drawing, after which a report continues without the picture.
@@ -57,18 +57,17 @@ def write_report(out: Path, *, figures: bool = True) -> Report:
 def figures_of(results: Results) -> Iterator[tuple[str, Callable[[], Any]]]:
     """Yield name (its first word is the kind) and function of every figure; the function returns None without data."""
     for dataset in results.datasets:
-        yield f"calibration {dataset}", partial(figures_curves.draw_calibration, results, dataset)
+        yield f"calibration {dataset}", partial(figures_calibration.draw_calibration, results, dataset)
         for base in results.bases:
             name = f"calibration sequences {dataset} {base}"
-            yield name, partial(figures_curves.draw_sequence_calibration, results, dataset, base)
-        yield f"intervals {dataset}", partial(figures_gates.draw_intervals, results, dataset)
-        yield f"gates {dataset}", partial(figures_gates.draw_gates, results, dataset)
-        yield f"error {dataset}", partial(figures_curves.draw_error, results, dataset)
+            yield name, partial(figures_calibration.draw_sequence_calibration, results, dataset, base)
+        yield f"gates {dataset}", partial(figures_error.draw_gates, results, dataset)
+        yield f"error {dataset}", partial(figures_error.draw_error, results, dataset)
     for base in results.bases:
-        yield f"entropy {base}", partial(figures_curves.draw_entropy, results, base)
+        yield f"entropy {base}", partial(figures_error.draw_entropy, results, base)
     for base, name in figures_sweep.sweeps(results):
         yield f"sweep {base} {name}", partial(figures_sweep.draw_sweep, results, base, name)
-    yield "latency stages", partial(figures_cost.draw_stages, results)
+    yield "latency stages", partial(efficiency.draw_stages, results)
 
 
 def _draw(results: Results, undrawn: dict[str, str]) -> tuple[list[Path], list[Picture]]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.run.files import write_atomic
+from ufmstar_torch.eval.engine.files import write_atomic
 from ufmstar_torch.runtime.optional import optional
 
 # Depth and uncertainty have different maps, so that their pictures cannot be confused.

@@ -6,7 +6,6 @@ valid, or whose sigma exceeds a limit, are left out.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -16,10 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.eval.engine.files import remove_temporaries, write_bytes_atomic, write_json_atomic
 from ufmstar_torch.eval.run.colours import known_where
-from ufmstar_torch.eval.run.files import remove_temporaries, write_bytes_atomic, write_json_atomic
-from ufmstar_torch.eval.run.gaussians import vertex_table, write_ply
-from ufmstar_torch.eval.run.offset import world_offset
+from ufmstar_torch.eval.run.gaussians import vertex_table, world_offset, write_ply
 from ufmstar_torch.eval.run.writers import encode_length_png, fitting_unit, frame_file, read_frame
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
@@ -230,14 +228,6 @@ def export_transforms(frames: Iterator[RunFrame], out: Path) -> str:
     }
     write_json_atomic(folder / "transforms.json", plain)
     return f"{folder / 'transforms.json'}: {len(listed)} frames"
-
-
-def run_summary(out: Path) -> dict[str, Any]:
-    """The summary of a run. Raises ValueError: it cannot be read."""
-    try:
-        return dict(json.loads((out / "summary.json").read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError, RecursionError) as error:
-        raise ValueError(f"{out}/summary.json is not that of a run: {error}") from error
 
 
 def points_of(u: NDArray[Any], v: NDArray[Any], depth: NDArray[Any], K: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -13,8 +13,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.run.files import remove_temporaries, to_json, write_json_atomic
-from ufmstar_torch.files.lock import hold as hold
+from ufmstar_torch.eval.engine.files import remove_temporaries, to_json, write_json_atomic
+from ufmstar_torch.files.limits import read_text
+from ufmstar_torch.files.write import hold as hold
 from ufmstar_torch.runtime.checked import flat
 
 _SHOWN = 5  # number of differences in a message
@@ -54,7 +55,7 @@ class FolderKind:
         """The manifest of a folder. Raises FolderError: it is damaged, or of another program or format."""
         path = out / self.manifest
         try:
-            manifest = json.loads(path.read_text(encoding="utf-8"))
+            manifest = json.loads(read_text(path))
             if manifest["program"] != self.program or manifest["format"] != self.format:
                 raise ValueError(f"made by {manifest['program']}, format {manifest['format']}")
             return dict(manifest)
@@ -70,7 +71,7 @@ class FolderKind:
         ours, state = (out / self.manifest).is_file(), ""
         if ours and self.format is None:
             try:
-                content = json.loads((out / self.manifest).read_text(encoding="utf-8"))
+                content = json.loads(read_text(out / self.manifest))
             except (OSError, ValueError, RecursionError):
                 content = None
             ours = isinstance(content, dict) and content.get("program") == self.program

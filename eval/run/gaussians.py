@@ -2,7 +2,7 @@
 
 Positions are in the frame of the mixture (the first camera: x right, y down, z forward), or in the world with
 ``T_world_first``. Lengths are in metres. PLY stores float32, as viewers expect, relative to an offset in its header if
-the world's origin is far away (``offset``).
+the world's origin is far away, as UTM's (``world_offset``).
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from ufmstar_torch.eval.engine.files import write_atomic, write_bytes_atomic
 from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range
-from ufmstar_torch.eval.run.files import write_atomic, write_bytes_atomic
-from ufmstar_torch.eval.run.offset import offset_text, world_offset
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 
 # Lower limit of the standard deviation of an axis [m], because files store its logarithm and viewers divide by it.
@@ -29,6 +28,8 @@ SIGMA_FLOOR = 1e-6
 SH_DC = 0.5 / np.sqrt(np.pi)
 OPACITY = 0.8
 RADIUS = 2.0  # of the ellipsoids of a rerun recording
+# Largest coordinate without an offset [m]; float32 has steps of .06 mm there. Offsets are multiples of it.
+_NEAR = 1000.0
 _TYPES = {"<f4": "float", "<f8": "double", "<i4": "int", "|u1": "uchar"}
 
 
@@ -96,6 +97,21 @@ class Components:
         scale = ColourScale(*robust_range([root], from_zero=True), ERROR_MAP)
         self.colour = scale.rgb(root)
         self.legend = f"colour: sqrt(disagreement), {ERROR_MAP} from 0 to {scale.high:.4g} m; grey: seen from one view"
+
+
+def world_offset(position: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[3] whole kilometres near a ``position`` [3] [m], which are subtracted from all positions of a file and written
+    into it; 0 within a kilometre of the origin."""
+    if not (np.abs(position) > _NEAR).any():
+        return np.zeros(3)
+    return np.asarray(np.round(position / _NEAR) * _NEAR)
+
+
+def offset_text(offset: NDArray[np.float64]) -> str:
+    """The sentence that a file states; "" for 0."""
+    if not offset.any():
+        return ""
+    return f"offset {' '.join(f'{x:.0f}' for x in offset)} m: add it to positions for the world of the poses"
 
 
 def vertex_table(kinds: Mapping[str, str], *columns: NDArray[Any]) -> NDArray[Any]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.eval.run import colours
 from ufmstar_torch.eval.run.colours import FAINT, INK, ColourScale
-from ufmstar_torch.steps import unmeasured
+from ufmstar_torch.steps.regress import HALF
 
 # Inches.
 _GAP, _MARGIN, _CAPTION, _BAR, _BARS, _TITLE = 0.06, 0.08, 0.2, 0.1, 0.62, 0.34
@@ -207,7 +207,7 @@ class MapColumn(NamedTuple):
         rgb = self.scale.rgb(panel.maps[self.field])
         of_ufm = "ufm_sigma" if "ufm_sigma" in panel.maps else "sigma"
         measured = panel.maps.get("measured") if self.field == of_ufm else None
-        return rgb if measured is None else colours.striped(rgb, measured < unmeasured.HALF)
+        return rgb if measured is None else colours.striped(rgb, measured < HALF)
 
 
 def map_columns(panels: Sequence[FramePanel]) -> list[MapColumn]:

@@ -27,7 +27,7 @@ from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
 from ufmstar_torch.eval.sequences.intrinsics import pinhole
 from ufmstar_torch.gaussians.camera import resize_intrinsics
 
-SHEET = "contact_sheet.png"
+SHEET, VIDEO = "contact_sheet.png", "preview.mp4"
 SHEET_ROWS, POSTERIOR_ROWS, SCALE_FRAMES = 6, 3, 12
 # Rate of videos without timestamps, and range of rates with them.
 DEFAULT_FPS, FPS_RANGE = 10.0, (2.0, 30.0)
@@ -115,7 +115,7 @@ def draw_sheet(finished: FinishedRun, columns: Sequence[MapColumn], title: str) 
 def draw_video(finished: FinishedRun, columns: Sequence[MapColumn]) -> Iterator[int]:
     """Write preview.mp4 frame by frame. Yields the number of finished frames, so that the caller can report and
     stop."""
-    with write_video(finished.out / "preview.mp4", finished.fps()) as add:
+    with write_video(finished.out / VIDEO, finished.fps()) as add:
         for number in range(len(finished.records)):
             add(preview_frame(finished.panel(number), columns))
             yield number + 1

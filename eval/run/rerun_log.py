@@ -23,19 +23,19 @@ from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range
 from ufmstar_torch.eval.run.export import RunFrame, export_folder, points_of
-from ufmstar_torch.eval.run.gaussians import RADIUS, Components
-from ufmstar_torch.eval.run.offset import offset_text, world_offset
+from ufmstar_torch.eval.run.gaussians import RADIUS, Components, offset_text, world_offset
 from ufmstar_torch.eval.run.writers import fitting_unit
-from ufmstar_torch.files.arrays import read_npz_whole
+from ufmstar_torch.files.read import read_npz_whole
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.runtime.optional import optional
 
 WORLD, CAMERA = "world", "world/camera"
-# Figures of a finished run, and of a live one.
-_PLOTS = (
-    "mean_sigma", "mean_disagreement", "mean_network_sigma", "mean_anchored", "mean_bias", "components",
-    "latency_ms", "depth_m", "sigma_m", "dropped", "skipped",
-)  # fmt: skip
+# Figures of a finished run and of a live one, by plot.
+_PLOTS = {
+    "metres": ("mean_sigma", "mean_network_sigma", "mean_bias", "depth_m", "sigma_m"),
+    "counts": ("components", "dropped", "skipped"),
+    "milliseconds": ("latency_ms",),
+}
 _JPEG = 80  # quality
 _POINTS = 4000  # approximate number of points of a frame
 _LOCAL = "127.0.0.1"
@@ -87,9 +87,10 @@ class RerunLog:
         log(f"{CAMERA}/points", rr.Points3D(points[sample], colors=colours, radii=rr.Radius.ui_points(2)))
         if frame.anchors is not None:
             self._add_anchors(frame, frame.anchors)
-        for name in _PLOTS:
-            if isinstance(value := frame.figures.get(name), int | float):
-                log(f"plots/{name}", rr.Scalars(value))
+        for plot, names in _PLOTS.items():
+            for name in names:
+                if isinstance(value := frame.figures.get(name), int | float):
+                    log(f"{plot}/{name}", rr.Scalars(value))
 
     def _add_anchors(self, frame: RunFrame, anchors: NDArray[np.float32]) -> None:
         """Log anchors [N, 4], and lines from them to the depth of their pixels, coloured by length on sigma's scale."""
@@ -113,7 +114,7 @@ def blueprint() -> Any:
     views = rrb.Vertical(
         rrb.Spatial2DView(origin=f"{CAMERA}/image", name="image"),
         rrb.Spatial2DView(origin=f"{CAMERA}/maps", contents=f"{CAMERA}/maps/sigma", name="sigma"),
-        rrb.TimeSeriesView(origin="plots", name="means of a frame"),
+        rrb.Tabs(*(rrb.TimeSeriesView(origin=plot, name=plot) for plot in _PLOTS)),
     )
     return rrb.Blueprint(
         rrb.Horizontal(rrb.Spatial3DView(origin=WORLD, name="world"), views, column_shares=[2, 1]),

@@ -6,8 +6,8 @@ reuses the networks' predictions.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,9 @@ from ufmstar_torch.eval.engine.writer_thread import WriterThread
 from ufmstar_torch.eval.run.folder import output_folder
 from ufmstar_torch.eval.run.gaussians import write_mixture_npz, write_mixture_ply
 from ufmstar_torch.eval.run.job import RunJob
-from ufmstar_torch.eval.run.pictures import FinishedRun, common_columns, draw_sheet, draw_video
+from ufmstar_torch.eval.run.pictures import SHEET, VIDEO, FinishedRun, common_columns, draw_sheet, draw_video
 from ufmstar_torch.eval.run.run_folder import CACHE, RUN, RunFolder
-from ufmstar_torch.eval.run.summary import FAILED, FINISHED, INTERRUPTED, write_summary
+from ufmstar_torch.eval.run.summary import FAILED, FINISHED, INTERRUPTED, read_summary, write_summary
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.ufmstar import UfMStar
 
@@ -56,30 +56,37 @@ def run(
     with output_folder(path, RUN, {"identity": job.identity()}, overwrite=overwrite):
         folder, row, ufm = RunFolder(job, path), *job.row()
         cache = PredictionCache(path / CACHE) if job.source.cacheable else None
-        no_end = f"no orderly end: the program was killed ({_AGAIN}), or is still running"
-        for text in write_summary(folder, ufm.mixture, INTERRUPTED, no_end)["warnings"]:
-            LOGGER.warning("%s", text)
-        ending, outputs = (FAILED, "an error in the program"), {}
-        try:
+        with _summarised(folder, ufm):
             warm_up_job(job, progress)
             shown = frame_progress(progress, len(job.indices))
             results = frame_results(job.sequence, job.indices, [row], cache=cache, stop=stop)
             with closing(results), WriterThread() as writer:
-                for result in results:  # reads, predicts, updates
+                for result in results:  # read, predict, find anchors, update
                     writer.call(folder.write, result)
                     shown(result)
-            ending = _ending(folder)
-            outputs = _outputs(folder, ufm, progress, stop)
-        except (KeyboardInterrupt, Stopped):
-            ending = INTERRUPTED, f"stopped by the user after {_counts(folder)}; {_AGAIN}"
-        except (OSError, CacheError) as error:
-            ending = FAILED, f"{error}; stopped after {_counts(folder)}; {_AGAIN}"
-        except BaseException as error:
-            ending = FAILED, f"{type(error).__name__}: {error}"
-            raise
-        finally:
-            summary = write_summary(folder, ufm.mixture, *ending, outputs)
-    return summary
+            _write_outputs(folder, ufm, progress, stop)
+    return read_summary(path)
+
+
+@contextmanager
+def _summarised(folder: RunFolder, ufm: UfMStar) -> Iterator[None]:
+    """Write the summary before the frames, with what is wrong with the input, and after them, whatever ends them."""
+    no_end = f"no orderly end: the program was killed ({_AGAIN}), or is still running"
+    for text in write_summary(folder, ufm.mixture, INTERRUPTED, no_end)["warnings"]:
+        LOGGER.warning("%s", text)
+    ending = FAILED, "an error in the program"
+    try:
+        yield
+        ending = _ending(folder)
+    except (KeyboardInterrupt, Stopped):
+        ending = INTERRUPTED, f"stopped by the user after {_counts(folder)}; {_AGAIN}"
+    except (OSError, CacheError) as error:
+        ending = FAILED, f"{error}; stopped after {_counts(folder)}; {_AGAIN}"
+    except BaseException as error:
+        ending = FAILED, f"{type(error).__name__}: {error}"
+        raise
+    finally:
+        write_summary(folder, ufm.mixture, *ending)
 
 
 def warm_up_job(job: RunJob, progress: Show) -> None:
@@ -95,25 +102,21 @@ def _ending(folder: RunFolder) -> tuple[str, str]:
     return FAILED, f"no frame could be used: {'; '.join(reasons[:3])}"
 
 
-def _skipped(folder: RunFolder) -> int:
-    return sum(record["state"] == "skipped" for record in folder.records)
-
-
 def _counts(folder: RunFolder) -> str:
-    skipped = _skipped(folder)
+    skipped = sum(record["state"] == "skipped" for record in folder.records)
     done = f"{len(folder.records) - skipped} of {len(folder.job.indices)} frames"
     return f"{done} ({skipped} skipped)" if skipped else done
 
 
-def _outputs(folder: RunFolder, ufm: UfMStar, progress: Show, stop: Stop) -> dict[str, str | None]:
-    """Write the mixture and pictures of all finished frames. Returns by file None, or why it was not made."""
-    job = folder.job
+def _write_outputs(folder: RunFolder, ufm: UfMStar, progress: Show, stop: Stop) -> None:
+    """Write the mixture and pictures of all finished frames, and note them in ``folder.outputs``."""
+    job, made = folder.job, folder.outputs
     done = [record for record in folder.records if record["state"] == "done"]
     if not done:
-        return {}
+        return
     write_mixture_ply(folder.path / "mixture.ply", ufm.mixture, T_world_first=ufm.T_world_first)
     write_mixture_npz(folder.path / "mixture.npz", ufm.mixture, T_world_first=ufm.T_world_first)
-    made: dict[str, str | None] = dict.fromkeys(("mixture.ply", "mixture.npz"))
+    made |= dict.fromkeys(("mixture.ply", "mixture.npz"))
     with_error = any(record["ground_truth"] for record in done) and not job.source.is_truth
     finished = FinishedRun(folder.path, job.sequence, done, with_error)
     try:
@@ -121,14 +124,13 @@ def _outputs(folder: RunFolder, ufm: UfMStar, progress: Show, stop: Stop) -> dic
             columns = common_columns(finished)
         if job.sheet:
             draw_sheet(finished, columns, f"{job.sequence.name}: {_counts(folder)}")
-            made["contact_sheet.png"] = None
+            made[SHEET] = None
         for drawn in draw_video(finished, columns) if job.video else ():
             progress(Progress("pictures", drawn, len(done)))
             if stop():
                 raise Stopped
         if job.video:
-            made["preview.mp4"] = None
+            made[VIDEO] = None
     except ImportError as error:  # an optional package is missing; the frames are complete
-        expected = {"contact_sheet.png": job.sheet, "preview.mp4": job.video}
-        made |= {name: str(error) for name, requested in expected.items() if requested and name not in made}
-    return made
+        requested = {SHEET: job.sheet, VIDEO: job.video}
+        made |= {name: str(error) for name, wanted in requested.items() if wanted and name not in made}

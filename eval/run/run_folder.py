@@ -15,9 +15,9 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+from ufmstar_torch.eval.engine.files import to_json, write_bytes_atomic
 from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
 from ufmstar_torch.eval.engine.stream import FrameResult
-from ufmstar_torch.eval.run.files import to_json, write_bytes_atomic
 from ufmstar_torch.eval.run.folder import FolderKind
 from ufmstar_torch.eval.run.frame_record import frame_arrays, frame_record
 from ufmstar_torch.eval.run.job import RunJob
@@ -57,11 +57,13 @@ class RunFolder:
         records: the lines of frames.jsonl so far.
         metrics: of these frames.
         seconds: time from the beginning to the last of these frames.
+        outputs: by file that is made from all frames None, or why it was not made.
     """
 
     def __init__(self, job: RunJob, path: Path) -> None:
         self.job, self.path, self.seconds = job, path, 0.0
         self.records: list[dict[str, Any]] = []
+        self.outputs: dict[str, str | None] = {}
         self.metrics = RunMetrics(load_plugins(job.settings.get("plugin", ())).metrics)
         self._unit: float | None = None  # of the depth PNGs [m per count]
         (path / FRAMES).mkdir(exist_ok=True)

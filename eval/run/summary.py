@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
@@ -11,33 +13,29 @@ import numpy as np
 
 from ufmstar_torch.eval.check.depth_image_fit import image_at_map, part_of_image
 from ufmstar_torch.eval.check.image_fit import DepthFit, depth_at_pixels, depth_fit
+from ufmstar_torch.eval.engine.files import to_json, write_json_atomic
 from ufmstar_torch.eval.engine.judge import ALONE, POSTERIOR, UFM
 from ufmstar_torch.eval.engine.maps import MapSource
-from ufmstar_torch.eval.run.files import to_json, write_json_atomic
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.machine import hardware, versions
 from ufmstar_torch.eval.run.run_folder import RUN, RunFolder
 from ufmstar_torch.eval.run.writers import frame_file, read_frame
 from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.eval.sequences.intrinsics import pinhole
+from ufmstar_torch.files.limits import read_text
 from ufmstar_torch.frames.warnings import hardly_compared
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 
+SUMMARY = "summary.json"
 FINISHED, INTERRUPTED, FAILED = "finished", "interrupted", "failed"
 Records = Sequence[Mapping[str, Any]]
 _MAPS = 12  # depth maps that are compared with their images
 STAGES = ("read", "prepare", "network", "anchors", "ufm", "metrics", "write")
 
 
-def write_summary(
-    folder: RunFolder,
-    mixture: GaussianMixture,
-    state: str,
-    reason: str,
-    outputs: Mapping[str, str | None] | None = None,
-) -> dict[str, Any]:
-    """Write summary.json from the run's records and figures, and return its content as plain values. ``outputs`` has by
-    file None, or why the file was not made. Raises OSError: the summary cannot be written."""
+def write_summary(folder: RunFolder, mixture: GaussianMixture, state: str, reason: str) -> dict[str, Any]:
+    """Write summary.json from the run's records and figures, and return its content as plain values. Raises OSError:
+    the summary cannot be written."""
     job, records = folder.job, folder.records
     done = [record for record in records if record["state"] == "done"]
     figures = folder.metrics.figures()
@@ -68,7 +66,7 @@ def write_summary(
         "anchors": _anchors(done),
         "mixture": _mixture(done, mixture),
         "time": _time(done, folder.seconds),
-        "outputs": outputs or {},
+        "outputs": folder.outputs,
         "settings": job.settings,
         "versions": versions(),
         "machine": hardware(),
@@ -76,8 +74,16 @@ def write_summary(
     depth = None if job.image_fit is None or job.image_fit.problem else _depth_fit(folder, done)
     summary |= {"image_fit": job.image_fit, "depth_fit": depth, "warnings": _warnings(folder, depth, done)}
     plain: dict[str, Any] = to_json(summary)
-    write_json_atomic(folder.path / "summary.json", plain)
+    write_json_atomic(folder.path / SUMMARY, plain)
     return plain
+
+
+def read_summary(out: Path) -> dict[str, Any]:
+    """The summary of a run. Raises ValueError: it cannot be read."""
+    try:
+        return dict(json.loads(read_text(out / SUMMARY)))
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        raise ValueError(f"{out}/{SUMMARY} is not that of a run: {error}") from error
 
 
 def _depth_fit(folder: RunFolder, done: Records) -> DepthFit | None:

@@ -25,8 +25,8 @@ from zipfile import BadZipFile, ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.run.files import write_atomic, write_bytes_atomic
-from ufmstar_torch.files.arrays import read_npz_whole
+from ufmstar_torch.eval.engine.files import write_atomic, write_bytes_atomic
+from ufmstar_torch.files.read import read_npz_whole
 
 FRAMES = "frames"
 # Folders of the PNGs, and the arrays of the npz with a frame's depth and variance for them.

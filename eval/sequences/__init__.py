@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ufmstar_torch.runtime.lazy import lazy_names
+from ufmstar_torch.runtime.optional import lazy_names
 
 if TYPE_CHECKING:
     from ufmstar_torch.eval.sequences.depth_folder import DepthFolder as DepthFolder

@@ -27,6 +27,7 @@ from ufmstar_torch.eval.sequences.images import depth_loader, listed_file, liste
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.poses import numbered_lines, poses_from_columns
+from ufmstar_torch.files.limits import read_text
 from ufmstar_torch.frames.warnings import LOGGER
 
 LOOKED_FOR = "cameras and images (.bin or .txt) in sparse/0/ (or another number), sparse/ or the folder itself"
@@ -152,7 +153,7 @@ def _frame_name(view: _View) -> str:
 
 def _metric(root: Path) -> bool:
     with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
-        return json.loads((root / SCALE_FILE).read_text())["scale_from"] is not None
+        return json.loads(read_text(root / SCALE_FILE))["scale_from"] is not None
     return False
 
 

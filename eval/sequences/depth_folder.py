@@ -10,7 +10,14 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.attach import pair_by_name
 from ufmstar_torch.eval.sequences.frame import FrameError
-from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, SCALE_KEY, list_files, read_depth, read_map
+from ufmstar_torch.eval.sequences.images import (
+    DEPTH_SUFFIXES,
+    SCALE_KEY,
+    list_files,
+    read_depth,
+    read_map,
+    require_scale,
+)
 from ufmstar_torch.eval.sequences.options import check_scale
 
 _VARIANCE_SUFFIXES = (".npy", ".npz", ".exr", ".tif", ".tiff")
@@ -53,7 +60,8 @@ class DepthFolder:
 
     Raises:
         NotADirectoryError: a folder does not exist.
-        ValueError: no map, maps of several formats, or integers of unknown scale.
+        ValueError: no map, maps of several formats, integers of unknown scale, or a scale that the first map
+            contradicts.
     """
 
     def __init__(
@@ -65,13 +73,17 @@ class DepthFolder:
         self.scale = scale
         self.files = _maps(self.path, DEPTH_SUFFIXES, "depth")
         self.variance_files = [] if variance is None else _maps(Path(variance), _VARIANCE_SUFFIXES, "variance")
-        for file in self.files if scale is None else ():
+        for file in self.files:
             try:
-                values, named = read_map(file, key=key)
+                values, stated = read_map(file, key=key)
             except FrameError:  # counted when its turn comes
                 continue
-            if named is None and np.issubdtype(values.dtype, np.integer):
+            if scale is None and stated is None and np.issubdtype(values.dtype, np.integer):
                 raise ValueError(f"scale: {file} holds integers and no text {SCALE_KEY!r}: pass metres per unit")
+            try:
+                require_scale(file, scale, stated)
+            except FrameError as error:
+                raise ValueError(f"scale: {error}") from error
             break
 
     def for_frames(

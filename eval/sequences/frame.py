@@ -240,7 +240,7 @@ def check_intrinsics(argument: str, K: np.ndarray, size: Size | None) -> None:
 
 def fits(K: np.ndarray, size: Size) -> bool:
     """True if K's principal point is plausible for images of ``size`` (H, W)."""
-    from ufmstar_torch.frames.frame import CENTRE_RANGE
+    from ufmstar_torch.frames.warnings import CENTRE_RANGE
 
     low, high = CENTRE_RANGE
     return bool(low < K[0, 2] / size[1] < high and low < K[1, 2] / size[0] < high)

@@ -83,7 +83,8 @@ def open_unposed(path: Path, options: Options) -> FrameSequence:
     """Open images with depth maps for uses without poses, such as training: a sequence with ``posed`` False. Images
     without a depth map are skipped. Without ``truth_scale``, maps next to TUM's ``depth.txt`` are in 1/5000 m. Raises
     ValueError: images, depth maps or intrinsics are not found, or no depth map fits an image."""
-    options.reject("unposed", "trajectory", "T_color_depth")
+    if options.trajectory is not None or options.T_color_depth is not None:
+        raise ValueError("images without poses take no trajectory and no T_color_depth")
     if not has_images_and_depth(path):
         raise ValueError(f"{path} must hold one of {', '.join(IMAGES)} and one of {', '.join(DEPTHS)}")
     first = next(name for name in IMAGES if (path / name).is_dir())

@@ -20,8 +20,8 @@ import torch
 from PIL import Image
 
 from ufmstar_torch.eval.sequences.frame import Entry, Frame, FrameError, Loader, Size, Skipped
-from ufmstar_torch.files.arrays import read_npy, read_npz
 from ufmstar_torch.files.limits import MOST_PIXELS, require_pixels
+from ufmstar_torch.files.read import read_npy, read_npz
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.runtime.optional import optional
 
@@ -78,7 +78,12 @@ def grey_bytes(values: np.ndarray, full: int) -> np.ndarray:
 
 
 def read_depth(
-    path: str | Path, scale: float | None = None, key: str = "depth", *, default_scale: float = _MILLIMETRE
+    path: str | Path,
+    scale: float | None = None,
+    key: str = "depth",
+    *,
+    default_scale: float = _MILLIMETRE,
+    invalid: int | None = None,
 ) -> np.ndarray:
     """A depth map as [H, W] float32 [m], 0 = invalid, of a 16-bit PNG or TIFF, float TIFF, EXR, npy or npz (``key``, or
     its only array).
@@ -89,14 +94,26 @@ def read_depth(
             ``depth_scale``, or else ``default_scale``.
         key: name of the depth in an npz with several arrays.
         default_scale: default metres per unit of integers.
+        invalid: stored value of pixels without a depth, besides 0; None = none.
 
     Raises:
-        FrameError: missing, truncated, corrupt, or not a depth map (8-bit, several channels).
+        FrameError: missing, truncated, corrupt, not a depth map (8-bit, several channels), or the file states another
+            scale.
     """
     values, named_scale = read_map(path, key)
+    require_scale(path, scale, named_scale)
+    if invalid is not None:
+        values = np.where(values == invalid, np.zeros((), values.dtype), values)
     if scale is None and np.issubdtype(values.dtype, np.integer):
         scale = named_scale or default_scale
     return positive(values.astype(np.float32) if scale is None else (values * np.float64(scale)).astype(np.float32))
+
+
+def require_scale(path: str | Path, scale: float | None, stated: float | None) -> None:
+    """Raises FrameError: a given ``scale`` contradicts the one that the file states [m per unit]."""
+    if scale is not None and stated is not None and not np.isclose(scale, stated, rtol=1e-6, atol=0):
+        unit = f"its text {SCALE_KEY} states {stated:g} metres per unit, which contradicts the given {scale:g}"
+        raise FrameError(path, f"{unit}: leave that out")
 
 
 def read_map(path: str | Path, key: str) -> tuple[np.ndarray, float | None]:
@@ -196,9 +213,11 @@ def natural_key(path: Path) -> list[tuple[int, int, str]]:
     return [(0, int(part), part) if part.isdigit() else (1, 0, part) for part in parts]
 
 
-def depth_loader(path: Path | None, scale: float | None, default_scale: float = _MILLIMETRE) -> Loader | None:
+def depth_loader(
+    path: Path | None, scale: float | None, default_scale: float = _MILLIMETRE, invalid: int | None = None
+) -> Loader | None:
     """The loader of a depth file for :class:`Entry`; None for None."""
-    return None if path is None else partial(read_depth, path, scale, default_scale=default_scale)
+    return None if path is None else partial(read_depth, path, scale, default_scale=default_scale, invalid=invalid)
 
 
 def within(load: Loader, most: float) -> np.ndarray:
@@ -225,6 +244,8 @@ def _plain_png(path: Path) -> np.ndarray | None:
 
     try:
         return np.asarray(io.read_image_png_u8(str(path), "rgb"))
+    except UnicodeEncodeError:  # a name that is not UTF-8
+        return None
     except Exception as error:
         # kornia_rs raises a plain Exception for a file that it cannot decode.
         if type(error) is not Exception:

@@ -15,6 +15,7 @@ _MODULES = (
     *("tum", "seven_scenes", "scannet", "sens", "tartanair", "kitti360", "nyu", "colmap", "transforms", "euroc"),
     *("bag", "stray", "arkitscenes", "generic"),
 )
+GENERIC = "generic"
 _DEEPEST = 4  # levels of folders that are searched
 READERS: dict[str, Any] = {
     "7scenes" if name == "seven_scenes" else name: import_module(f"ufmstar_torch.eval.sequences.{name}")
@@ -43,10 +44,10 @@ def layout_of(layout: str, path: Path, explicit: bool = False, plugin: Sequence[
     require_layout(layout, plugin)
     by_name = readers(plugin)
     if layout != "auto":
-        if layout != "generic" and not by_name[layout].detect(path):
+        if layout != GENERIC and not by_name[layout].detect(path):
             raise ValueError(f"{path} has not the layout {layout!r}: looked for {by_name[layout].LOOKED_FOR}")
         return layout
-    fitting = layouts_of(path, plugin) or ["generic"] * explicit
+    fitting = layouts_of(path, plugin) or [GENERIC] * explicit
     if len(fitting) > 1:
         raise ValueError(f"{path} fits the layouts {', '.join(fitting)}: pass layout")
     if not fitting:
@@ -58,8 +59,8 @@ def layout_of(layout: str, path: Path, explicit: bool = False, plugin: Sequence[
 
 def layouts_of(path: Path, plugin: Sequence[str] = ()) -> list[str]:
     """All layouts that fit ``path``; ``generic`` only if no other fits."""
-    fitting = [name for name, reader in readers(plugin).items() if name != "generic" and reader.detect(path)]
-    return fitting or (["generic"] if READERS["generic"].detect(path) else [])
+    fitting = [name for name, reader in readers(plugin).items() if name != GENERIC and reader.detect(path)]
+    return fitting or ([GENERIC] if READERS[GENERIC].detect(path) else [])
 
 
 def parts_of(path: Path, layout: str) -> list[Path]:

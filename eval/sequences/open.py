@@ -11,7 +11,7 @@ from typing import Any
 from ufmstar_torch.eval.sequences.assemble import undistort
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence
 from ufmstar_torch.eval.sequences.images import within
-from ufmstar_torch.eval.sequences.layout import READERS, layout_of, readers
+from ufmstar_torch.eval.sequences.layout import GENERIC, READERS, layout_of, readers
 from ufmstar_torch.eval.sequences.lens import Lens, parse_distortion
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import in_metres
@@ -63,10 +63,7 @@ def open_sequence(path: str | Path, layout: str = "auto", **options: Any) -> Fra
         raise FileNotFoundError(f"path: no such file or folder: {path}")
     explicit = chosen.images is not None or chosen.trajectory is not None
     layout = layout_of(layout, path, explicit, chosen.plugin)
-    refused = [name for name, layouts in _USED_BY.items() if layout in READERS and layout not in layouts]
-    refused += ["trajectory", "fps"] if layout == "nyu" else []
-    refused += ["fps"] if layout == "tum" or (layout != "generic" and chosen.trajectory is None) else []
-    chosen.reject(layout, *refused)
+    _require_used(chosen, layout)
     sequence = readers(chosen.plugin)[layout].read(path, chosen)
     if chosen.distortion is not None and layout not in READERS:
         coefficients, fisheye = parse_distortion(chosen.distortion)
@@ -82,6 +79,19 @@ def open_sequence(path: str | Path, layout: str = "auto", **options: Any) -> Fra
     if chosen.max_truth is not None:
         sequence = sequence.changed(partial(_within, most=chosen.max_truth))
     return sequence if chosen.pose_scale is None else scale_poses(sequence, chosen.pose_scale)
+
+
+def _require_used(options: Options, layout: str) -> None:
+    """Raises ValueError: an option is set that the layout does not use."""
+    unused = [name for name, layouts in _USED_BY.items() if layout in READERS and layout not in layouts]
+    unused += ["trajectory", "fps"] if layout == "nyu" else []
+    unused += ["fps"] if layout == "tum" or (layout != "generic" and options.trajectory is None) else []
+    for name in unused:
+        if name in options.changed():
+            users = _USED_BY.get(name, ("generic",))
+            other = f"its files hold that; use layout={GENERIC!r} to combine images, depth and a trajectory freely"
+            other = other if GENERIC in users else f"{name} is an option of {' and '.join(users)}"
+            raise ValueError(f"layout {layout!r} takes no {name}: {other}")
 
 
 def scale_poses(sequence: FrameSequence, metres: float) -> FrameSequence:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from numbers import Integral, Real
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,15 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.intrinsics import DEPTH_FILES, FILES, IntrinsicsLike, camera_file, parse_intrinsics
 from ufmstar_torch.gaussians.conventions import CONVENTIONS, OURS
+
+# Names of options, the types of their values, and these in words.
+_KINDS: tuple[tuple[tuple[str, ...], Any, str], ...] = (
+    (("truth_scale", "max_truth", "pose_scale", "fps", "time_offset"), Real, "a number"),
+    (("max_pose_gap", "max_time_difference"), Real, "a number"),
+    (("model_index", "scans"), Integral, "a whole number"),
+    (("trajectory", "images", "truth"), (str, PathLike), "a path"),
+    (("drive",), (str, Integral), "a name or a number"),
+)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -69,6 +80,11 @@ class Options:
     plugin: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        for names, kinds, expected in _KINDS:
+            for name in names:
+                value = getattr(self, name)
+                if value is not None and (isinstance(value, bool) or not isinstance(value, kinds) or value != value):
+                    raise ValueError(f"{name} must be {expected}, got {value!r:.80}")
         for name, option in (("intrinsics", "--intrinsics"), ("depth_intrinsics", "--reader depth_intrinsics")):
             if isinstance(words := getattr(self, name), tuple) and all(isinstance(word, str) for word in words):
                 object.__setattr__(self, name, parse_intrinsics(words, option))
@@ -84,7 +100,11 @@ class Options:
             value = getattr(self, name)
             if value is not None and not 0 < value < np.inf:
                 raise ValueError(f"{name} must be a positive number of {unit}, got {value}")
-        if self.scans is not None and (self.scans < 0 or self.scans != int(self.scans)):
+        if isinstance(self.topics, str) or not all(isinstance(topic, str) for topic in self.topics):
+            raise ValueError(f"topics must be names, got {self.topics!r:.80}")
+        if not isinstance(self.T_color_depth, (str, PathLike, np.ndarray, type(None))):
+            raise ValueError(f"T_color_depth must be a file or an array [4, 4], got {self.T_color_depth!r:.80}")
+        if self.scans is not None and self.scans < 0:
             raise ValueError(f"scans must be a number of laser scans on either side, at least 0, got {self.scans}")
 
     def changed(self) -> dict[str, Any]:
@@ -92,13 +112,6 @@ class Options:
         values = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not f.default}
         defaults = {f.name: f.default for f in fields(self)}
         return {name: value for name, value in values.items() if defaults[name] is None or value != defaults[name]}
-
-    def reject(self, layout: str, *names: str) -> None:
-        """Raises ValueError: one of the options ``names``, which the layout does not use, is set."""
-        for name in names:
-            if name in self.changed():
-                other = "use layout='generic' to combine images, depth and a trajectory freely"
-                raise ValueError(f"layout {layout!r} takes no {name}: its files hold that; {other}")
 
 
 def check_scale(name: str, scale: float | None) -> None:

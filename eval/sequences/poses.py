@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ufmstar_torch.files.limits import read_text
 from ufmstar_torch.frames.arguments import as_path
 from ufmstar_torch.gaussians.trajectory import Trajectory
 
@@ -144,7 +145,7 @@ def trajectory_of(stamps: np.ndarray, position: np.ndarray, quaternion_xyzw: np.
 def numbered_lines(path: str | Path) -> list[tuple[int, str]]:
     """Line numbers from 1, and the lines of a text file. Raises ValueError: the file is no text (UTF-8)."""
     try:
-        return list(enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1))
+        return list(enumerate(read_text(path).splitlines(), start=1))
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: expected a text file, got bytes that are none: {error.reason}") from error
 

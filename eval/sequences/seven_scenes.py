@@ -20,9 +20,9 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_files
-from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Loader
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Loader
 from ufmstar_torch.eval.sequences.ground_truth import register_depth
-from ufmstar_torch.eval.sequences.images import first_depth_size, first_image_size, natural_key, read_map
+from ufmstar_torch.eval.sequences.images import depth_loader, first_depth_size, first_image_size, natural_key
 from ufmstar_torch.eval.sequences.intrinsics import camera_matrix, pinhole
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, resolve, with_camera_files
@@ -32,7 +32,6 @@ LOOKED_FOR = "frame-NNNNNN.pose.txt files"
 _NATIVE_SIZE = (480, 640)
 _K_COLOR = (525.0, 525.0, 320.0, 240.0)
 _K_DEPTH = (585.0, 585.0, 320.0, 240.0)
-_MILLIMETRE = 1e-3
 _NO_DEPTH = 65535
 # [m] An approximation: the colour camera is 2.5 cm to the right of the depth camera, with the same orientation.
 _T_COLOR_DEPTH = np.array([[1.0, 0, 0, -0.025], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -63,7 +62,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     color_size = first_image_size(kinds["color"] for kinds in files.values() if "color" in kinds) or _NATIVE_SIZE
     frames = []
     for name, kinds in files.items():
-        load = partial(_read_depth, kinds["depth"], options.truth_scale or _MILLIMETRE) if "depth" in kinds else None
+        load = depth_loader(kinds.get("depth"), options.truth_scale, invalid=_NO_DEPTH)
         frames.append(frame_of_files(name, kinds.get("color"), kinds.get("pose"), load, options))
     depth_size = first_depth_size(frames)
     K_color = camera_matrix(options.intrinsics, pinhole(*_K_COLOR), _NATIVE_SIZE, color_size)
@@ -80,14 +79,6 @@ def read(path: Path, options: Options) -> FrameSequence:
             frames[i] = replace(frame, T_world_cam=T_world_color, load_depth=load)
     options = replace(options, depth_intrinsics=None)
     return assemble("7scenes", path, frames, Lens.of(K_color, color_size), options, depth_size=color_size)
-
-
-def _read_depth(path: Path, scale: float) -> np.ndarray:
-    """A depth PNG as [H, W] float32 [m]; 65535 and 0 are invalid. Errors as ``read_depth``."""
-    values, _ = read_map(path, key="depth")
-    if not np.issubdtype(values.dtype, np.integer):
-        raise FrameError(path, f"expected 16-bit depth, got {values.dtype}")
-    return np.where(values == _NO_DEPTH, 0, values * scale).astype(np.float32)
 
 
 def _registered(load: Loader, *cameras: Any) -> np.ndarray:

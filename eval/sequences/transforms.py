@@ -33,6 +33,7 @@ from ufmstar_torch.eval.sequences.images import (
 )
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.files.limits import read_text
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.gaussians.conventions import CONVENTIONS
 
@@ -64,7 +65,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     unknown camera model, or no usable frame."""
     file = _file(path)
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = json.loads(read_text(file))
         frames = [dict(frame) for frame in content["frames"]]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{file}: expected JSON with a list 'frames' of objects: {error}") from error
@@ -91,7 +92,7 @@ def read(path: Path, options: Options) -> FrameSequence:
             entries.append(Skipped(name, "the image's header cannot be read"))
             continue
         depth = None if _SIGMA in frame else frame.get("depth_file_path")
-        load_depth = depth_loader(listed_file(file.parent, depth), scale, scale) if isinstance(depth, str) else None
+        load_depth = depth_loader(listed_file(file.parent, depth), scale) if isinstance(depth, str) else None
         entries.append(Entry(name, _pose(frame, offset, file), partial(read_color, image_file), load_depth))
     if any(_SIGMA in frame for frame in frames):
         LOGGER.warning("%s: no ground truth: its depth is a prediction, with a sigma beside it", file)

@@ -12,15 +12,15 @@ import torch
 from ufmstar_torch.eval.check.check import check_sequence
 from ufmstar_torch.eval.engine.anchors import landmark_digests
 from ufmstar_torch.eval.engine.evaluate import BROKEN, Judge, evaluate_sequence
-from ufmstar_torch.eval.engine.judge import RowFigures, references
+from ufmstar_torch.eval.engine.judge import references
 from ufmstar_torch.eval.engine.predictions import content_digest
 from ufmstar_torch.eval.engine.progress import Progress
+from ufmstar_torch.eval.engine.record import Record
 from ufmstar_torch.eval.engine.stream import Stopped
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.run.machine import hardware, versions
 from ufmstar_torch.eval.suite.job import EvalJob
-from ufmstar_torch.eval.suite.record import Record
 from ufmstar_torch.eval.suite.work_items import TOUR, WorkItem
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.posterior.recalibrate import Recalibration
@@ -81,15 +81,15 @@ def evaluate_item(
         try:
             for problem in check_sequence(sequence).problems if sequence.layout != TOUR else ():
                 LOGGER.warning("%s: %s (ufmstar data check)", item.label, problem)
-            results = evaluate_sequence(sequence, needed, judge, examples=examples, stop=stop, progress=shown)
+            records = evaluate_sequence(sequence, needed, judge, examples=examples, stop=stop, progress=shown)
         except BROKEN as error:
             return folder.fail(item, error, missing)
-        for result in results:
-            if result.row in todo:
-                slug = result.row.slug
+        for record in records:
+            if record.row in todo:
+                slug = record.row.slug
                 anchors = {"landmarks": landmarks[slug]} if slug in landmarks else {}
-                folder.write(item, _record(job, item, judge, result, made_of | anchors), result)
-        frames, seconds = results[0].frames.get("done", 0), time.monotonic() - started
+                folder.write(item, _complete(job, item, judge, record, made_of | anchors))
+        frames, seconds = records[0].frames.get("done", 0), time.monotonic() - started
         lines.append(f"{item.label}: {len(todo)} rows, {frames} frames, {seconds:.1f} s")
     if left_out:
         reason = (_FITTED if sequence.posed else _NO_POSES).format(len(left_out))
@@ -105,17 +105,15 @@ def with_references(missing: Sequence[Row], rows: Sequence[Row]) -> list[Row]:
     return [row for row in rows if row in needed]
 
 
-def _record(job: EvalJob, item: WorkItem, judge: Judge, result: RowFigures, made_of: Mapping[str, Any]) -> Record:
-    """The record of a row's figures with their provenance."""
-    row, network = result.row, judge.networks[result.row.method.base]
+def _complete(job: EvalJob, item: WorkItem, judge: Judge, record: Record, made_of: Mapping[str, Any]) -> Record:
+    """The record with its names and provenance."""
+    network = judge.networks[record.row.method.base]
     computed_with = {"versions": versions(), "machine": hardware(), "threads": torch.get_num_threads()}
-    return Record(
+    return replace(
+        record,
         suite=job.suite.name,
         dataset=item.dataset,
         sequence=item.sequence,
         network=network.label,
-        method=row.method.name,
-        setting=row.setting.to_dict(),
         provenance={**computed_with, "network": network.digest, "runtime": network.runtime, **made_of},
-        **{name: getattr(result, name) for name in ("frames", "figures", "curves", "state", "ms")},
     )

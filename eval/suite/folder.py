@@ -18,18 +18,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.engine.judge import RowFigures
+from ufmstar_torch.eval.engine.files import remove_temporaries, write_json_atomic
+from ufmstar_torch.eval.engine.record import FORMAT, Record, ResultsError
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.run.files import remove_temporaries, write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
-from ufmstar_torch.eval.suite.record import FORMAT, Record, ResultsError
 from ufmstar_torch.eval.suite.work_items import WorkItem
+from ufmstar_torch.files.limits import read_text
 
 FAILED, CACHE, STOP = "failed.json", "cache", "eval.stop"
 # Files of a report; --overwrite removes them.
-_REPORT: tuple[str, ...] = ("efficiency.json", "results.csv", "report.html")
-_REPORT += ("tables/*.md", "tables/*.tex", "tables/*.csv", "figures/*.png", "figures/*.svg", "figures/*.json")
-_OF_SEQUENCE = ("*.json", "*.pt", "examples/*.npz", "room/*.npz")
+_REPORT = ("efficiency.json", "results.csv", "report.html", "tables/*.tex", "figures/*.png", "figures/*.svg")
+_OF_SEQUENCE = ("*.json", "*.pt", "examples/*.npz")
 
 
 def evaluation_folder(
@@ -93,9 +92,9 @@ class EvalFolder:
                     f"computed there (digest was {str(then)[:16]}, now {digest[:16]}); --overwrite starts again"
                 )
 
-    def write(self, item: WorkItem, record: Record, result: RowFigures) -> None:
+    def write(self, item: WorkItem, record: Record) -> None:
         """Store a row, atomically. Raises OSError: it cannot be written."""
-        record.save(self.sequence_folder(item) / f"{result.row.slug}.json", result.sums)
+        record.save(self.sequence_folder(item) / f"{record.row.slug}.json")
 
     def fail(self, item: WorkItem, error: Exception | str, rows: Sequence[Row]) -> str:
         """Store why rows of a sequence cannot be computed, and return a line about it."""
@@ -110,7 +109,7 @@ class EvalFolder:
         reasons = {}
         for path in sorted(self.path.glob(f"records/*/*/{FAILED}")):
             try:
-                stored = json.loads(path.read_text(encoding="utf-8"))
+                stored = json.loads(read_text(path))
                 dataset, sequence, reason = (stored[name] for name in ("dataset", "sequence", "reason"))
                 if not all(isinstance(text, str) for text in (dataset, sequence, reason)):
                     raise TypeError("a data set, a sequence and a reason are texts")

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.files.limits import read_text
 
 TOUR = "tour"
 _ROOT = re.compile(r"(?P<dataset>[A-Za-z0-9][A-Za-z0-9._-]*)=(?P<path>.+)")
@@ -97,7 +98,7 @@ def read_names(file: Path) -> list[str]:
         FileNotFoundError: no such file.
         ValueError: it names nothing.
     """
-    lines = [line.partition("#")[0].strip() for line in file.read_text(encoding="utf-8").splitlines()]
+    lines = [line.partition("#")[0].strip() for line in read_text(file).splitlines()]
     names = [line for line in lines if line]
     if not names:
         raise ValueError(f"--sequence-list {file} names no sequence")

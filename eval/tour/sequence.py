@@ -24,6 +24,7 @@ _FORM = (
     "tour:SEED or tour:SEED?option=value&..., with the options style, frames, size, fov, path, pan, sensor and movers"
 )
 FPS = 15.0  # of the timestamps
+_MOST_MOVERS = 100  # each is placed by trial, which takes a second
 _FRAME_BYTES = 4096  # of a frame's pose and entry, and of the arrays from which its pose is computed
 
 
@@ -86,6 +87,8 @@ def tour_sequence(
     require_bytes("frames", frames * _FRAME_BYTES)
     if not 20 <= fov <= 120:
         raise ValueError(f"fov must be 20 to 120 degrees, got {fov}")
+    if not 0 <= movers <= _MOST_MOVERS:
+        raise ValueError(f"movers must be 0 to {_MOST_MOVERS}, got {movers}")
     tour = make_tour(seed, style)
     poses = tour_path(tour, frames, path_seed, pan=pan)
     K = intrinsics(size[0], size[1], fov)

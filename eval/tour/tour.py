@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 _DARK = [*[0.0] * 6, 1.0, 0.0]  # an unused light, see ``Furnished.lights``
 # Margin of the box around a doorway's opening and frame [m].
 _FRAME = 0.12
+_SEEDS = 2**32  # number of seeds; those of a tour's frames, a million times as many, have 64 bits
 _SHADOWLESS = ("window", "picture", "clock", "skirting")  # flat on the wall
 
 
@@ -46,10 +47,10 @@ class Tour:
 
 @lru_cache(maxsize=8, typed=True)  # True is no seed
 def make_tour(seed: int, style: str = "home") -> Tour:
-    """Make the rooms of a seed in one of ``STYLES``, equal on every machine. Raises ValueError: a negative seed, or no
-    such style."""
-    if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
-        raise ValueError(f"seed must be an integer of at least 0, got {seed!r}")
+    """Make the rooms of a seed in one of ``STYLES``, equal on every machine. Raises ValueError: a seed out of
+    range, or no such style."""
+    if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < _SEEDS:
+        raise ValueError(f"seed must be an integer of at least 0 and below {_SEEDS}, got {seed!r}")
     chosen = style_of(style)
     # Each part of a tour has a separate generator, so that it can change without the others.
     plan, height, looks, things, shifts = (np.random.default_rng([seed, number]) for number in range(5))

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from ufmstar_torch.runtime.lazy import lazy_names
+from ufmstar_torch.runtime.optional import lazy_names
 
 if TYPE_CHECKING:
     from ufmstar_torch.anchors.anchors import Anchors as Anchors

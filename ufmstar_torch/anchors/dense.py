@@ -65,7 +65,6 @@ class DenseConfig(Checked):
         keyframes: number of stored keyframes.
         landmarks: number of stored landmarks.
         corners: number of tracked corners.
-        corner_distance: least distance of a corner from all dense anchors to become an anchor, as a share of the width.
         corner_sigma: largest standard deviation of a corner's depth, as a share of it; also the limit of that by the
             distance of corners from their epipolar lines over their baseline. Where errors of the refined poses exceed
             this limit at the median depth, no pixel is searched.
@@ -73,9 +72,6 @@ class DenseConfig(Checked):
         least_score: least zero-mean normalised cross-correlation (ZNCC) of a match.
         rival: least ratio of 1 - ZNCC of the second-best match to that of a unique match.
         sigmas: largest difference of consistent measurements, and half width of the search, in standard deviations.
-        match_noise: variance of a match over that computed from its residual for independent pixels.
-        min_share: least share of the pixels with two or more matches whose matches all agree. Where it is smaller,
-            poses and images contradict each other, and no match is used.
         memory: share of the running estimates that remains after a frame.
 
     Raises:
@@ -86,15 +82,20 @@ class DenseConfig(Checked):
     keyframes: int = number(50, "", "1", 2)
     landmarks: int = number(2048, "", "1", 100)
     corners: int = number(150, "", "1", 10)
-    corner_distance: float = number(0.04, "", "width", 0)
     corner_sigma: float = number(0.1, "", "1", 0)
     start_depth: float = number(2.0, "", "m", 0, open_low=True)
     least_score: float = number(0.85, "", "1", 0, 1)
     rival: float = number(1.5, "", "1", 1)
     sigmas: float = number(3.5, "", "1", 0, open_low=True)
-    match_noise: float = number(1.0, "", "1", 0, open_low=True)
-    min_share: float = number(0.2, "", "1", 0, 1)
     memory: float = number(0.8, "", "1", 0, 1, open_high=True)
+
+    # [width]: least distance of a corner from all dense anchors to become an anchor
+    corner_distance: ClassVar[float] = 0.04
+    # [1]: variance of a match over that computed from its residual for independent pixels
+    match_noise: ClassVar[float] = 1.0
+    # [1]: least share of the pixels with two or more matches whose matches all agree; where it is smaller, poses and
+    # images contradict each other, and no match is used
+    min_share: ClassVar[float] = 0.2
 
 
 class Depths(NamedTuple):

@@ -8,10 +8,12 @@ from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
-import torch
+from numpy.typing import NDArray
 
-from ufmstar_torch.anchors.anchors import FARTHEST_OFF, Anchors, inside
+from ufmstar_torch.anchors.anchors import FARTHEST_OFF, Anchors
+from ufmstar_torch.anchors.epipolar import median
 from ufmstar_torch.frames.frame import AnchorInput
+from ufmstar_torch.kernels.cpu.calls import array
 
 _LOG = logging.getLogger("ufmstar_torch")
 _FEW = 8  # least anchors of a frame that are judged
@@ -24,6 +26,7 @@ _RATIO, _SUCCESSIVE = 4.0, 8
 # depth, with at least so many anchors, whose logarithms of depth have at least this standard deviation.
 _UNIT, _AT_ONCE = 8.0, 2
 _INVERSE, _RANKED, _SPREAD = -0.3, 20, 0.1
+_COMPARED = 200  # largest number of anchors of which the order is compared
 
 # Frames that are all judged, and the interval of those after them: a frame takes .1 ms.
 _FIRST, _EVERY = 64, 16
@@ -51,19 +54,17 @@ class AnchorDoubts:
 
     def _pixels(self, anchors: Anchors, size: tuple[int, int]) -> Iterator[tuple[int, str, str]]:
         height, width = size
-        pixel = anchors.pixel.detach()
-        use = pixel.isfinite().all(-1) & (anchors.depth > 0)
-        use = use if anchors.valid is None else use & anchors.valid
-        within = inside(pixel, size) & use
-        exchanged = (inside(pixel.flip(-1), size) & use).sum(1).tolist()
-        farthest = torch.where(use, pixel.amax(-1), 0).amax(1).tolist()
-        for b, (count, seen) in enumerate(zip(use.sum(1).tolist(), within.sum(1).tolist(), strict=True)):
-            if count < _FEW:
+        for b, (pixel, depth) in enumerate(zip(array(anchors.pixel), array(anchors.depth), strict=True)):
+            use = np.isfinite(pixel).all(1) & (depth > 0)
+            pixel = pixel[use if anchors.valid is None else use & array(anchors.valid[b])]
+            if (count := len(pixel)) < _FEW:
                 continue
-            if farthest[b] <= 1 and min(size) > 2:
+            nearest = np.rint(pixel)
+            seen, exchanged = (_within(one, size) for one in (nearest, nearest[:, ::-1]))
+            if pixel.max() <= 1 and min(size) > 2:
                 text = f"all {count} anchors lie within 1 px of the image's corner: are their pixels normalised? They "
                 yield b, "pixels", text + f"are columns and rows (u, v) of the {width} x {height} image"
-            elif seen < (1 - _EXCHANGED) * count and exchanged[b] == count:
+            elif seen < (1 - _EXCHANGED) * count and exchanged == count:
                 text = f"{count - seen} of {count} anchors lie outside the {width} x {height} image, and none with "
                 yield b, "pixels", text + "rows and columns exchanged: anchors.pixel is (u, v), the column first"
             elif seen < (1 - _OUTSIDE) * count:
@@ -71,9 +72,10 @@ class AnchorDoubts:
                 yield b, "pixels", text + "those of an image of another size?"
 
     def _depths(self, checked: AnchorInput) -> Iterator[tuple[int, str, str]]:
-        valid, none = checked.valid, torch.nan
-        ratios = torch.where(valid, checked.depth / checked.predicted, none).nanmedian(1).values.tolist()
-        for b, (ratio, count) in enumerate(zip(ratios, valid.sum(1).tolist(), strict=True)):
+        columns = (array(x) for x in (checked.valid, checked.depth, checked.predicted))
+        for b, (valid, depth, predicted) in enumerate(zip(*columns, strict=True)):
+            ratios = depth[valid] / predicted[valid]
+            count, ratio = len(ratios), median(ratios) if len(ratios) else math.nan
             if checked.contradiction is not None and checked.rejected is not None and checked.contradiction[b] > 0:
                 off = int(checked.rejected[b])
                 text = f"{off} of {off + count} anchors are off from the predicted depth by more than a factor of "
@@ -94,13 +96,19 @@ class AnchorDoubts:
 
     def _inverted(self, b: int, checked: AnchorInput) -> str:
         """Count a frame where predicted depths have the anchors' opposite order; returns a warning after some."""
-        valid = checked.valid[b]
-        anchors, predicted = checked.depth[b][valid].log(), checked.predicted[b][valid]
-        if len(anchors) < _RANKED or float(anchors.std()) < _SPREAD:
+        used = np.flatnonzero(array(checked.valid[b]))
+        used = used[:: -(-len(used) // _COMPARED) or 1]
+        anchors, predicted = np.log(array(checked.depth[b])[used]), array(checked.predicted[b])[used]
+        if len(used) < _RANKED or anchors.std() < _SPREAD:
             return ""
-        ranks = torch.stack([anchors.argsort().argsort(), predicted.argsort().argsort()]).double()
-        order = float(np.corrcoef(ranks.cpu().numpy())[0, 1])
+        ranks = [values.argsort().argsort() - (len(used) - 1) / 2 for values in (anchors, predicted)]
+        order = float(ranks[0] @ ranks[1] / (ranks[0] @ ranks[0]))
         self._inverse[b] = self._inverse[b] + 1 if order < _INVERSE else 0
         if self._inverse[b] != _SUCCESSIVE:
             return ""
         return f"far is near in the depth (rank correlation {order:.2f} with the anchors): is it inverse depth?"
+
+
+def _within(pixel: NDArray[np.float64], size: tuple[int, int]) -> int:
+    """How many of the whole positions [N, 2] lie in an image of ``size`` (H, W)."""
+    return int(np.count_nonzero(((pixel >= 0) & (pixel < size[::-1])).all(1)))

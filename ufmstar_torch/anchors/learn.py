@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -84,17 +83,17 @@ def learn(
     return Learnt(evidence, used, *means(evidence, config.anchors.shrinkage))
 
 
-def counts(anchors: AnchorInput | None, used: Tensor) -> dict[str, Any]:
+def counts(anchors: AnchorInput | None, used: Tensor) -> dict[str, Tensor]:
     """The statistics of a frame's anchors, of which ``used`` [B] were used."""
     none = torch.zeros_like(used)
     if anchors is None:
         return {"anchors": none, "anchors_used": used, "anchors_rejected": none, "anchors_moving": none}
+    measured = {"anchors_rejected": anchors.rejected, "pose_error": anchors.pose_error}
     return {
         "anchors": anchors.valid.sum(1),
         "anchors_used": used,
-        "anchors_rejected": anchors.rejected,
         "anchors_moving": none if anchors.moving is None else anchors.moving,
-        "pose_error": anchors.pose_error,
+        **{name: value for name, value in measured.items() if value is not None},
     }
 
 

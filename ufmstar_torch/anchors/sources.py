@@ -18,7 +18,8 @@ from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.anchors.landmarks import Landmarks, LandmarkSource
 from ufmstar_torch.anchors.names import CORNERS, DENSE, FILE_TYPES
 from ufmstar_torch.anchors.tracker import LandmarkTracker
-from ufmstar_torch.files.arrays import read_npz
+from ufmstar_torch.files.limits import read_text
+from ufmstar_torch.files.read import read_npz
 from ufmstar_torch.gaussians.camera import invert_rigid
 
 # Largest number of landmarks in one image; a tracker follows 300.
@@ -167,7 +168,7 @@ class LandmarkMap:
 
 
 def _read_text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    lines = [line.partition("#")[0].replace(",", " ").split() for line in path.read_text(encoding="utf-8").splitlines()]
+    lines = [line.partition("#")[0].replace(",", " ").split() for line in read_text(path).splitlines()]
     rows = [(number, columns) for number, columns in enumerate(lines, start=1) if columns]
     if rows and not _is_number(rows[0][1][0]):
         rows = rows[1:]  # names of the columns

@@ -130,28 +130,25 @@ class StreamLandmarks:
                 self._follow(replaced)
             raise
         self._before, self._replaced, self.last = before, replaced, result
-        for i, landmarks in enumerate(result):
-            late = abs(landmarks.lag) > _LARGEST_LAG and not landmarks.contradicted
-            self._late[i] = self._late[i] + 1 if late and self._late[i] >= 0 else min(self._late[i], 0)
-            if self._late[i] == _SUCCESSIVE:
-                self._late[i] = -1
-                offset = f"{abs(landmarks.lag):.1f} images {'late' if landmarks.lag > 0 else 'early'}"
-                _LOG.warning("stream %d: the poses seem %s. %s", i, offset, _TIMES)
-            if self._contradicted[i] < 0:
-                continue
-            self._contradicted[i] = (
-                self._contradicted[i] + 1 if landmarks.contradicted or landmarks.none == REPEATED else 0
-            )
-            if self._contradicted[i] == _SUCCESSIVE:
-                self._contradicted[i] = -1
-                _LOG.warning("stream %d: %s; no depth is used. %s", i, landmarks.none, _CAUSES)
-        capacity = max(len(landmarks.depth) for landmarks in result)
-        by_stream = [landmarks.anchors(K[i].numpy(), K[i], capacity) for i, landmarks in enumerate(result)]
-        device = pose.device if image is None else image.device
-        if len(by_stream) == 1:
-            return by_stream[0].to(device)
-        fields = {name: torch.cat([getattr(anchors, name) for anchors in by_stream]) for name in _FIELDS}
-        return Anchors(**fields, motion=_padded([anchors.motion for anchors in by_stream])).to(device)
+        for stream, landmarks in enumerate(result):
+            self._warn(stream, landmarks)
+        return _batched(result, K, pose.device if image is None else image.device)
+
+    def _warn(self, stream: int, landmarks: Landmarks) -> None:
+        """Log once that a stream's poses are late, or contradict its images, in several successive images."""
+        late = abs(landmarks.lag) > _LARGEST_LAG and not landmarks.contradicted
+        self._late[stream] = self._late[stream] + 1 if late and self._late[stream] >= 0 else min(self._late[stream], 0)
+        if self._late[stream] == _SUCCESSIVE:
+            self._late[stream] = -1
+            offset = f"{abs(landmarks.lag):.1f} images {'late' if landmarks.lag > 0 else 'early'}"
+            _LOG.warning("stream %d: the poses seem %s. %s", stream, offset, _TIMES)
+        if self._contradicted[stream] < 0:
+            return
+        contradicted = landmarks.contradicted or landmarks.none == REPEATED
+        self._contradicted[stream] = self._contradicted[stream] + 1 if contradicted else 0
+        if self._contradicted[stream] == _SUCCESSIVE:
+            self._contradicted[stream] = -1
+            _LOG.warning("stream %d: %s; no depth is used. %s", stream, landmarks.none, _CAUSES)
 
     def _updated(
         self, source: LandmarkSource, image: NDArray[np.uint8] | None, T: NDArray[np.float64], K: NDArray[np.float64]
@@ -215,6 +212,16 @@ class StreamLandmarks:
     def _restore(self, states: Sequence[Mapping[str, Tensor]], streams: Sequence[int]) -> None:
         for i in streams:
             self._sources[i].load_state(states[i])
+
+
+def _batched(landmarks: Sequence[Landmarks], K: Tensor, device: torch.device) -> Anchors:
+    """The anchors [B, N] of all streams, padded and masked, in pixels of the images with intrinsics K [B, 3, 3]."""
+    capacity = max(len(one.depth) for one in landmarks)
+    by_stream = [one.anchors(K[i].numpy(), K[i], capacity) for i, one in enumerate(landmarks)]
+    if len(by_stream) == 1:
+        return by_stream[0].to(device)
+    fields = {name: torch.cat([getattr(anchors, name) for anchors in by_stream]) for name in _FIELDS}
+    return Anchors(**fields, motion=_padded([anchors.motion for anchors in by_stream])).to(device)
 
 
 def _padded(motion: Sequence[Tensor | None]) -> Tensor | None:

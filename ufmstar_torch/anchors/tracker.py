@@ -68,21 +68,12 @@ class TrackerConfig(Checked):
     Attributes:
         max_points: corners followed at a time.
         window: number of stored views, which are used for triangulation.
-        min_views: least number of views of a triangulated corner.
         spacing: least distance between two corners in an image 640 px wide [px]; proportional to the width.
-        back_tolerance: largest distance of a corner tracked forward and back from its start [px].
         pixel_noise: standard deviation of a tracked position, including errors of the poses, until it is estimated from
             the residuals of the tracks [px].
-        max_error: largest root mean square reprojection error of a track [px]. A track that fits worse than the others
-            gets a larger variance.
         max_relative_sigma: largest standard deviation of the depth, as a share of it, by independent errors of
             ``pixel_noise``: tracks with less parallax yield no anchor. A low limit excludes distant points, which have
             little parallax, and hides errors there.
-        min_share: least share of the triangulated tracks that fit, 0 to 1. Where fewer fit, poses and image contradict
-            each other; the tracks that fit do so by chance, and none is used.
-        max_pose_error: largest standard deviation of tracked corners from the epipolar lines of the refined poses, as a
-            share of the image's width. Where it is larger, poses and images contradict each other, and no depth is
-            used.
         start_depth: initial median depth of the scene, right to a factor of 5 [m].
 
     Raises:
@@ -91,20 +82,24 @@ class TrackerConfig(Checked):
 
     max_points: int = number(300, "", "1", 1)
     window: int = number(10, "", "1", 2)
-    min_views: int = number(2, "", "1", 2)
     spacing: float = number(14.0, "", "px", 0, open_low=True)
-    back_tolerance: float = number(0.5, "", "px", 0, open_low=True)
     pixel_noise: float = number(1.0, "", "px", 0, open_low=True)
-    max_error: float = number(3.0, "", "px", 0, open_low=True)
     max_relative_sigma: float = number(0.4, "", "1", 0, open_low=True)
-    min_share: float = number(0.2, "", "1", 0, 1)
-    max_pose_error: float = number(0.012, "", "width", 0, open_low=True)
     start_depth: float = number(2.0, "", "m", 0, open_low=True)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.min_views > self.window:
-            raise ValueError(f"TrackerConfig.min_views must be at most window = {self.window}, got {self.min_views}")
+    # [1]: least number of views of a triangulated corner
+    min_views: ClassVar[int] = 2
+    # [px]: largest distance of a corner tracked forward and back from its start
+    back_tolerance: ClassVar[float] = 0.5
+    # [px]: largest root mean square reprojection error of a track; one that fits worse than the others gets a larger
+    # variance
+    max_error: ClassVar[float] = 3.0
+    # [1]: least share of the triangulated tracks that fit; where fewer fit, poses and image contradict each other, the
+    # tracks that fit do so by chance, and none is used
+    min_share: ClassVar[float] = 0.2
+    # [width]: largest standard deviation of tracked corners from the epipolar lines of the refined poses; where it is
+    # larger, poses and images contradict each other, and no depth is used
+    max_pose_error: ClassVar[float] = 0.012
 
 
 class LandmarkTracker(SavedState):

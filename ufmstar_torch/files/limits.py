@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import prod
+from pathlib import Path
 
 MOST_BYTES = 2**30  # of one array, of a state, or of a list of frames
 MOST_PIXELS = MOST_BYTES // 12  # of an image, which takes 12 bytes a pixel as float32 RGB
@@ -19,3 +20,15 @@ def require_pixels(what: str, size: tuple[int, int]) -> None:
     if prod(size) > MOST_PIXELS:
         limit = f"more than the limit of {MOST_PIXELS:,} pixels"
         raise ValueError(f"{what} would have {size[0]} x {size[1]} pixels, {limit}")
+
+
+def read_text(path: str | Path) -> str:
+    """The text of a file, in UTF-8 with or without the mark that editors on Windows add. Raises OSError: it cannot be
+    opened; ValueError: it is a device or a pipe, which may have no end, is larger than ``MOST_BYTES``, or is no text.
+    """
+    path = Path(path)
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise ValueError(f"{path} must be a file, got a device or a pipe")
+    if path.is_file():
+        require_bytes(str(path), path.stat().st_size)
+    return path.read_text(encoding="utf-8-sig")

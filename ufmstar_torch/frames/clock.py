@@ -1,13 +1,22 @@
-"""Stamps of a live stream: single wrong ones are recognised, and a clock that jumps is followed."""
+"""Stamps and poses of a live stream: single wrong stamps are recognised, and a clock that jumps is followed."""
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_left
 from enum import Enum
+
+import numpy as np
+
+from ufmstar_torch.frames.warnings import LOGGER
+from ufmstar_torch.gaussians.trajectory import Trajectory, interpolate_pose
 
 # [s] A stamp farther from the stream's last one than this, and than the time since that arrived, is doubted.
 JUMP = 2.0
 _STEPS = 3.0  # a stream of few frames may also advance by so many of its last steps
 _CONFIRMED = 3  # number of consecutive doubtful stamps that agree with each other and become the clock
+_DOUBTFUL = 64  # most poses with doubtful stamps that wait for others
+_MOST_POSES = 4096  # in a buffer: 4 s of an inertial filter at 1 kHz
 
 
 class Verdict(Enum):
@@ -60,3 +69,68 @@ class StreamClock:
         self._step = 0.0 if self.latest is None else stamp - self.latest
         self.latest, self._received, self._doubtful = stamp, now, []
         return verdict
+
+
+class PoseBuffer:
+    """The last poses of a stream [4, 4], by their stamps, which may come in any order within two seconds."""
+
+    def __init__(self) -> None:
+        self._times: list[float] = []  # increasing
+        self._poses: list[np.ndarray] = []
+        self._clock = StreamClock()
+        self._doubtful: list[tuple[float, np.ndarray]] = []  # poses whose stamps nothing has confirmed
+
+    @property
+    def latest(self) -> float:
+        """The last stamp [s]; -inf without poses."""
+        return self._times[-1] if self._times else -math.inf
+
+    @property
+    def span(self) -> str:
+        """The range of the stamps, in words."""
+        return f"{self._times[0]:.3f} to {self._times[-1]:.3f} s" if self._times else "none"
+
+    def at(self, stamp: float, max_gap: float) -> np.ndarray | None:
+        """The pose [4, 4] at a moment [s]; NaN or None as ``interpolate_pose``."""
+        index = bisect_left(self._times, stamp)
+        around = slice(max(index - 1, 0), index + 1)
+        if not self._times[around]:
+            return None
+        trajectory = Trajectory(np.array(self._times[around]), np.stack(self._poses[around]))
+        return interpolate_pose(trajectory, stamp, max_gap)
+
+    def add(self, stamp: float, pose: np.ndarray, now: float, other: float | None) -> int:
+        """Add a pose, instead of the one with the same stamp, or after a jump of the clock instead of all others.
+
+        Args:
+            stamp: [s].
+            pose: [4, 4].
+            now, other: as :meth:`StreamClock.judge`.
+
+        Returns:
+            The number of poses that were dropped for their stamps.
+        """
+        index = bisect_left(self._times, stamp)
+        if index < len(self._times) and self._times[index] == stamp:
+            self._poses[index] = pose
+            return 0
+        before = self._clock.latest
+        verdict = self._clock.judge(stamp, now, other)
+        if verdict == Verdict.WAIT:
+            self._doubtful.append((stamp, pose))
+            dropped = max(len(self._doubtful) - _DOUBTFUL, 0)
+            del self._doubtful[:-_DOUBTFUL]
+            return dropped
+        new = [(stamp, pose)]
+        if verdict == Verdict.JUMPED:
+            LOGGER.warning("the poses' clock jumped from %.3f s to %.3f s", before, stamp)
+            new = [one for one in self._doubtful if abs(one[0] - stamp) <= JUMP] + new
+            self._times, self._poses = [], []
+        dropped = len(self._doubtful) - (len(new) - 1)
+        self._doubtful = []
+        for time, T in new:
+            index = bisect_left(self._times, time)
+            self._times.insert(index, time)
+            self._poses.insert(index, T)
+        del self._times[:-_MOST_POSES], self._poses[:-_MOST_POSES]
+        return dropped

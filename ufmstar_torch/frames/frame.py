@@ -7,7 +7,7 @@ are marked ``valid = False`` and counted.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -45,9 +45,6 @@ DEPTH_RANGE = (1e-6, 1e6)  # [m]
 LARGEST = 1e12  # A and E [m^2], and entries of features
 FOCAL_RANGE = (1e-2, 1e7)  # [px]
 FARTHEST = 1e9  # [m] any coordinate of a camera
-# The principal point of real cameras and usual crops lies within these shares of the image; that of a K for twice or
-# half the size does not.
-CENTRE_RANGE = (0.2, 0.8)
 
 
 @dataclass(frozen=True)
@@ -128,6 +125,13 @@ class FrameInput:
     def size(self) -> tuple[int, int]:
         """Image height and width [px]."""
         return self.depth.shape[-2], self.depth.shape[-1]
+
+    @property
+    def informative_depth(self) -> Tensor:
+        """The depth to segment [B, H, W]: 0 where not valid, and everywhere in an image that shows nothing."""
+        if self.informative is None:
+            return self.depth
+        return torch.where(self.informative[:, None, None], self.depth, torch.zeros_like(self.depth))
 
 
 def check_values(
@@ -242,13 +246,16 @@ def check_frame(
         either = [*shapes, (shape[0], 1, *shape[-2:])]
         mask = _as(require_mask("valid", as_tensor("valid", valid), either, depth), size, torch.bool)
     frame = kernel(plain, T, K, a, e, extra, mask, rotation_tolerance=rotation_tolerance, max_depth=max_depth)
+    informative = _of_streams("informative", informative, plain)
+    if informative is not None and informative.is_cpu and bool(informative.all()):
+        informative = None
     if informative is None and isinstance(member, int) and member == 0:
         return frame
     if isinstance(member, Tensor):
         index = _moved(member.to(torch.float64), plain.device).expand(shape[0])
     else:  # filled on the device: a copy would synchronise
         index = torch.full(shape[:1], float(member), dtype=torch.float64, device=plain.device)
-    return replace(frame, member=index, informative=_of_streams("informative", informative, plain))
+    return replace(frame, member=index, informative=informative)
 
 
 def as_confidence(values: object, frame: FrameInput) -> Tensor:
@@ -349,18 +356,6 @@ def intrinsics_fault(K: Tensor, size: tuple[float, ...]) -> Tensor:
     focal = (torch.minimum(fx, fy) < low) | (torch.maximum(fx, fy) > high)
     outside = (torch.minimum(cx, cy) < -0.5) | (cx > size[1] - 0.5) | (cy > size[0] - 0.5)
     return _code({5: ~K.isfinite().all((-2, -1)), 6: shape, 8: focal, 9: outside})
-
-
-def doubtful_centre(K: Sequence[Sequence[float]], size: tuple[int, int]) -> str:
-    """A warning if the principal point of K [px] is implausible for a map of ``size`` (H, W), else "": it lies near the
-    border, or the product of its shares is about 1/4, as with swapped cx and cy."""
-    x, y = (K[0][2] + 0.5) / size[1], (K[1][2] + 0.5) / size[0]
-    low, high = CENTRE_RANGE
-    swapped = min(abs(x - 0.5), abs(y - 0.5)) > 0.08 and abs(4 * x * y - 1) < 0.15
-    if low < min(x, y) and max(x, y) < high and not swapped:
-        return ""
-    where = f"the principal point lies at {x:.2f} of the width and {y:.2f} of the height, far from the middle"
-    return f"{where}: are cx and cy swapped, or are these the intrinsics of an image of another size?"
 
 
 def _code(checks: dict[int, Tensor]) -> Tensor:

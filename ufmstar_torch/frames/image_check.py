@@ -28,6 +28,20 @@ _DARK, _BRIGHT, _SHARE = 4.0, 251.0, 0.1
 _IMAGES = 8
 # Largest correlation of an image with that at the first of ``_IMAGES`` equal poses: below, the camera must have moved.
 _SAME_SCENE = 0.5
+_BLACK = {torch.uint8: 1, torch.float32: 1 / 255, torch.float64: 1 / 255}  # largest value of a black image
+_BRIGHTEST = 8.0  # largest value of a normalised image, by a wide margin
+
+
+def warn_of_range(image: Tensor) -> None:
+    """Log a warning if the values of a video's first image [B, 3, H, W] are those of a usual mistake; on the CPU."""
+    if not image.is_cpu or image.dtype not in _BLACK:
+        return
+    low, high = (float(value) for value in image.aminmax())
+    if high <= _BLACK[image.dtype]:
+        LOGGER.warning("the first image is black: was it divided by 255 twice, or cast to whole numbers?")
+    if image.is_floating_point() and high > _BRIGHTEST and low >= 0:
+        brightest = f"the first image has floats up to {high:g}"
+        LOGGER.warning("%s: pass bytes, or floats in [0, 1], unless the network expects this", brightest)
 
 
 def reduced(image: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -23,97 +23,92 @@ _NO_ANCHORS_YET = (
 )
 
 
+# The counts that every frame has, per stream [B], in the order of files.
+EVERY_FRAME: dict[str, str] = {
+    "components": "K, occupied components after the frame.",
+    "segments": "C, Gaussians segmented from the frame.",
+    "matched": "segments that match at least one earlier component.",
+    "pairs": "matched pairs (c, k); fused where the view changed (``steps.fuse``).",
+    "new": "segments appended to the mixture.",
+    "dropped": (
+        "components that were dropped because ``max_components`` was reached, the farthest first; and segments nearer "
+        "than the near plane, which are not appended."
+    ),
+    "valid_pixels": "pixels used.",
+    "beyond": "pixels not used because their depth is beyond ``config.segment.max_depth``.",
+    "out_of_range": (
+        "other pixels with a finite positive depth that are not used, because depth, A, E or features lie outside the "
+        "ranges of ``UfMStar.forward``."
+    ),
+    "unmeasured": (
+        "pixels used (with a subset, pixels regressed) where less than half of M rests on surfaces seen from different "
+        "places; ``config.unmeasured`` decides their M."
+    ),
+    "single_view": (
+        "components seen by only one frame. If it stays close to ``components``, hardly anything is compared between "
+        "views; the logger ``ufmstar_torch`` then lists likely causes."
+    ),
+    "fault": "index into ``ufmstar_torch.frames.frame.FRAME_FAULTS``; not 0 = the frame was skipped.",
+    "rotation_deviation": "max |R^T R - I| of the pose, removed by projection onto SO(3).",
+}
+# Every count of a frame; the further ones need anchors.
+COUNTS: dict[str, str] = EVERY_FRAME | {
+    "anchors": "usable anchors (0, for example, while the camera stands still). None without ``config.anchors``.",
+    "anchors_used": (
+        "usable anchors without gross outliers. If 0, the frame adds no evidence: B follows from earlier frames, and "
+        "is 0 at the start."
+    ),
+    "anchors_rejected": (
+        "anchors that differ from the prediction by more than a factor of 100. If they are the majority, they count as "
+        "an error of the prediction and widen the variance."
+    ),
+    "anchors_moving": "depths from images that were not used because the surface moves, or because views disagree.",
+    "pose_error": (
+        "disagreement of poses and images: standard deviation of tracked corners from their epipolar lines [px] of the "
+        "searched image; NaN = not measured, None = no source of anchors measures it. Without anchors it is not "
+        "measured, because the search costs as much as the step; a run measures some pairs of frames instead "
+        "(``image_fit`` of its summary)."
+    ),
+    "calibration": (
+        "running mean of z^2 of held-out anchors: 1 = the posterior variance matches the errors, more = it is too "
+        "small. NaN before any anchor; None without ``config.posterior``."
+    ),
+    "unseen": (
+        "likewise, variance of log g/d at held-out anchors on surfaces far from all other anchors; large where the "
+        "evidence covers little of the image."
+    ),
+    "confidence": (
+        "gain of the network's confidence in log likelihood of held-out anchors, less its standard error [nat]. The "
+        "confidence is ignored where it is at most 0; -inf = too few frames. None without ``config.confidence``."
+    ),
+}
+
+
 @dataclass(frozen=True, repr=False)
 class FrameStatistics:
-    """Counts of one frame, per stream [B].
+    """Counts of one frame, per stream [B]: an attribute for each name in ``COUNTS``; None if it is not counted.
 
     Attributes:
-        components: K, occupied components after the frame.
-        segments: C, Gaussians segmented from the frame.
-        matched: segments that match at least one earlier component.
-        pairs: matched pairs (c, k); fused where the view changed (``views``).
-        new: segments appended to the mixture.
-        dropped: components that were dropped because ``max_components`` was reached, the farthest first; and segments
-            nearer than the near plane, which are not appended.
-        valid_pixels: pixels used.
-        beyond: pixels not used because their depth is beyond ``config.segment.max_depth``.
-        out_of_range: other pixels with a finite positive depth that are not used, because depth, A, E or features lie
-            outside the ranges of ``UfMStar.forward``.
-        unmeasured: pixels used (with a subset, pixels regressed) where less than half of M rests on surfaces seen from
-            different places; ``config.unmeasured`` decides their M.
-        single_view: components seen by only one frame. If it stays close to ``components``, hardly anything is compared
-            between views; the logger ``ufmstar_torch`` then lists likely causes.
-        fault: index into ``ufmstar_torch.frames.frame.FRAME_FAULTS``; not 0 = the frame was skipped.
-        rotation_deviation: max |R^T R - I| of the pose, removed by projection onto SO(3).
-        anchors: usable anchors (0, for example, while the camera stands still). None without ``config.anchors``.
-        anchors_used: usable anchors without gross outliers. If 0, the frame adds no evidence: B follows from earlier
-            frames, and is 0 at the start.
-        anchors_rejected: anchors that differ from the prediction by more than a factor of 100. If they are the
-            majority, they count as an error of the prediction and widen the variance.
-        anchors_moving: depths from images that were not used because the surface moves, or because views disagree.
-        pose_error: disagreement of poses and images: standard deviation of tracked corners from their epipolar lines
-            [px] of the searched image; NaN = not measured, None = no source of anchors measures it. Without anchors
-            it is not measured, because the search costs as much as the step; a run measures some pairs of frames
-            instead (``image_fit`` of its summary).
-        calibration: running mean of z^2 of held-out anchors: 1 = the posterior variance matches the errors, more = it
-            is too small. NaN before any anchor; None without ``config.posterior``.
-        unseen: likewise, variance of log g/d at held-out anchors on surfaces far from all other anchors; large where
-            the evidence covers little of the image.
-        confidence: gain of the network's confidence in log likelihood of held-out anchors, less its standard error
-            [nat]. The confidence is ignored where it is at most 0; -inf = too few frames. None without
-            ``config.confidence``.
+        counts: by name.
     """
 
-    components: Tensor
-    segments: Tensor
-    matched: Tensor
-    pairs: Tensor
-    new: Tensor
-    dropped: Tensor
-    valid_pixels: Tensor
-    beyond: Tensor
-    out_of_range: Tensor
-    unmeasured: Tensor
-    fault: Tensor
-    rotation_deviation: Tensor
-    single_view: Tensor
-    anchors: Tensor | None = None
-    anchors_used: Tensor | None = None
-    anchors_rejected: Tensor | None = None
-    anchors_moving: Tensor | None = None
-    pose_error: Tensor | None = None
-    calibration: Tensor | None = None
-    unseen: Tensor | None = None
-    confidence: Tensor | None = None
+    counts: Mapping[str, Tensor]
+
+    def __getattr__(self, name: str) -> Any:
+        """A count by its name, or None."""
+        if name in COUNTS:
+            return self.counts.get(name)
+        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *self.counts]
 
     def __repr__(self) -> str:
         """The counts that are not 0, in one line."""
-        names = (f.name for f in fields(self) if f.name != "rotation_deviation")
-        counts = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        shown = [f"{name}={_short(value)}" for name, value in counts.items() if _any(value)]
-        return f"FrameStatistics({', '.join(shown)})"
-
-
-@dataclass(frozen=True)
-class StepOutput:
-    """The regressed maps, segments and counts of a step.
-
-    Attributes:
-        disagreement: M [B, H, W] [m^2] after the moving average, NaN where not valid; [B, n] on a subset.
-        features: regressed features [B, H, W, F] or [B, n, F].
-        measured: [B, H, W] or [B, n] share in [0, 1] of M that rests on surfaces seen from different places.
-        residual: [B, H, W, 2] or [B, n, 2] the relative error r and its excess e that anchors let expect
-            (``anchors.evidence``); None without ``config.anchors``.
-        current_cam: C_i in the camera frame.
-        statistics: of this frame.
-    """
-
-    disagreement: Tensor
-    features: Tensor
-    measured: Tensor
-    residual: Tensor | None
-    current_cam: GaussianMixture
-    statistics: FrameStatistics
+        counts = {name: self.counts[name] for name in COUNTS if name in self.counts and name != "rotation_deviation"}
+        return (
+            f"FrameStatistics({', '.join(f'{name}={_short(value)}' for name, value in counts.items() if _any(value))})"
+        )
 
 
 class MapKind(NamedTuple):

@@ -59,7 +59,10 @@ class DepthPrediction:
                 )
 
     def to(self, to: torch.device | torch.dtype) -> DepthPrediction:
-        """A copy with the maps on a device, or of a dtype; the intrinsics are unchanged."""
+        """The prediction with the maps on a device, or of a dtype; the intrinsics are unchanged."""
+        present = (value for name in ("depth", *_OPTIONAL, "informative") if (value := getattr(self, name)) is not None)
+        if all(value.device == to for value in present):
+            return self
         maps = {name: value.to(to) for name in ("depth", *_OPTIONAL) if (value := getattr(self, name)) is not None}
         informative = self.informative
         if informative is not None and isinstance(to, torch.device):
@@ -84,6 +87,15 @@ class DepthPrediction:
         if a is None or e is None:
             return e if a is None else a
         return a + e
+
+    def arguments(self, *, confidence: bool) -> dict[str, Any]:
+        """The arguments of ``UfMStar.forward``: depth, A, E, the network's index, whether the image shows something,
+        and with ``confidence`` the confidence."""
+        maps = {
+            "depth": self.depth, "aleatoric": self.aleatoric_variance, "epistemic": self.epistemic_variance,
+            "member": self.member, "informative": self.informative,
+        }  # fmt: skip
+        return maps | ({"confidence": self.confidence} if confidence else {})
 
 
 def takes_intrinsics(network: Callable[..., Any]) -> bool:
@@ -123,3 +135,19 @@ def infer(network: Callable[..., Any], image: Tensor, intrinsics: Tensor | None,
         raise ValueError(f"{type(network).__name__} takes intrinsics: call network(x, K), K [B, 3, 3] of its input x")
     dtype = torch.promote_types(image.dtype, torch.float32)
     return network(image, intrinsics.to(image.device, dtype).expand(len(image), 3, 3))
+
+
+def copied(values: dict[str, Tensor], device: torch.device | None) -> tuple[dict[str, Any], torch.cuda.Event | None]:
+    """Copy the values to ``device`` (None: no copy). Copies from CUDA to the CPU are asynchronous, into pinned memory,
+    and return an event to wait for."""
+    if device is None:
+        return values, None
+    source = values["depth"].device
+    if source.type != "cuda" or device.type != "cpu":
+        return {name: value.to(device, non_blocking=True) for name, value in values.items()}, None
+    copies = {name: torch.empty(value.shape, dtype=value.dtype, pin_memory=True) for name, value in values.items()}
+    for name, value in values.items():
+        copies[name].copy_(value.detach(), non_blocking=True)
+    ready = torch.cuda.Event()
+    ready.record(torch.cuda.current_stream(source))
+    return copies, ready

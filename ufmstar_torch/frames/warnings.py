@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.frames.frame import FrameInput, doubtful_centre
+from ufmstar_torch.frames.frame import FrameInput
 from ufmstar_torch.frames.output import FrameStatistics
 
 # Least frames and components before a warning about views, and the largest share of components seen in only one view.
@@ -39,6 +39,9 @@ _CLIP, _IN_ORDER, _STEP, _TURN = 5, 0.8, 0.25, 0.35
 # Shares of pixels: of valid ones, below which ``valid`` may be inverted; of those with the largest depth, if it is the
 # same in every frame.
 _SPARSE, _SATURATED = 0.1, 0.2
+# The principal point of real cameras and usual crops lies within these shares of the image; that of a K for twice or
+# half the size does not.
+CENTRE_RANGE = (0.2, 0.8)
 # Stride of the depth maps' rows in these checks.
 _ROWS = 8
 # On an accelerator, reading the counts synchronises: only every so many frames, and not while a graph is recorded.
@@ -80,9 +83,9 @@ class _Track:
     waiting: bool = False  # whether its next prediction is to be compared
 
     def follow(
-        self, T: list[list[float]], focal: tuple[float, float], depth: Tensor, total: float, member: float
+        self, T: list[list[float]], focal: tuple[float, float], depth: Tensor, total: float, mean: float, member: float
     ) -> Iterator[tuple[str, str]]:
-        """Update the statistics with a frame; yields kinds and texts of warnings."""
+        """Update the statistics with a frame of a ``mean`` depth [m]; yields kinds and texts of warnings."""
         step = math.dist(_position(T), _position(self.T))
         if max(max(new / old, old / new) for new, old in zip(focal, self.focal, strict=True)) > _ZOOM:
             each = " and ".join(f"{fx:.2f} of the width, {fy:.2f} of the height" for fx, fy in (self.focal, focal))
@@ -97,14 +100,14 @@ class _Track:
             yield from self._alternate(T, step)
             yield from self._saturate(depth)
             sudden = self.steps >= _FRAMES and step > _JUMP * self.largest
-            if sudden and step > _AWAY * _mean(depth, total):
+            if sudden and step > _AWAY * mean:
                 text = f"the camera jumped by {step:.3g} m, after steps of at most {self.largest:.3g} m. Another "
                 yield "jump", text + "recording, or a map that was moved, begins with reset()"
             if self.steps >= _FRAMES and self.first == T:
                 text = f"the pose is exactly the first one again, {self.steps} poses later. Another recording begins "
                 yield "again", text + "with reset()"
             self.steps, self.largest = self.steps + 1, max(self.largest, step)
-            self.travelled += step / _mean(depth, total)
+            self.travelled += step / mean
         self.before = _position(self.T)
         self.T, self.focal, self.total = T, focal, total
 
@@ -229,13 +232,14 @@ class StreamWarnings:
             if fault or not pixels[b]:
                 continue
             T, focal = poses[b], (cameras[b][0][0] / width, cameras[b][1][1] / height)
+            mean = _mean(rows[b], sums[b])
             if text := doubtful_centre(cameras[b], frame.size):
                 yield b, "centre", text
             if (track := self._tracks.get(b)) is None:
                 self._tracks[b] = track = _Track(T, T, focal, sums[b], _position(T))
             else:
-                yield from ((b, *warning) for warning in track.follow(T, focal, rows[b], sums[b], members[b]))
-            if used is not None and (text := track.anchored(used[b], _mean(rows[b], sums[b]))):
+                yield from ((b, *warning) for warning in track.follow(T, focal, rows[b], sums[b], mean, members[b]))
+            if used is not None and (text := track.anchored(used[b], mean)):
                 yield b, "anchors", text
 
     def _alone(self, statistics: FrameStatistics, frames: Tensor) -> Iterator[tuple[int, str, str]]:
@@ -317,3 +321,15 @@ def hardly_compared(alone: int, components: int, frames: int, travelled: float) 
         f"after {frames} frames {alone} of {components} Gaussians were seen in one view alone, so hardly anything is "
     )
     return text + f"compared between views. {_CAUSES}, or views that do not overlap"
+
+
+def doubtful_centre(K: Sequence[Sequence[float]], size: tuple[int, int]) -> str:
+    """A warning if the principal point of K [px] is implausible for a map of ``size`` (H, W), else "": it lies near the
+    border, or the product of its shares is about 1/4, as with swapped cx and cy."""
+    x, y = (K[0][2] + 0.5) / size[1], (K[1][2] + 0.5) / size[0]
+    low, high = CENTRE_RANGE
+    swapped = min(abs(x - 0.5), abs(y - 0.5)) > 0.08 and abs(4 * x * y - 1) < 0.15
+    if low < min(x, y) and max(x, y) < high and not swapped:
+        return ""
+    where = f"the principal point lies at {x:.2f} of the width and {y:.2f} of the height, far from the middle"
+    return f"{where}: are cx and cy swapped, or are these the intrinsics of an image of another size?"

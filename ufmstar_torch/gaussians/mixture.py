@@ -21,10 +21,10 @@ class GaussianMixture:
         covariance: [B, K, 3, 3] Sigma_XX [m^2], symmetric.
         weight: [B, K] pi, the number of pixels observed so far [px]; 0 = empty slot.
         disagreement: [B, K] m, the mean squared 2-Wasserstein distance of the comparisons that counted [m^2].
-        compared: [B, K] weight of m, the sum of w pi_c over these comparisons (``views``) [px].
+        compared: [B, K] weight of m, the sum of w pi_c over these comparisons (``steps.fuse``) [px].
         views: [B, K] n, the sum of w over the views that were compared; 0 = seen in a single view.
-        reference: [B, K, 5] the reference view (``views``): the camera's centre in the first camera's frame [m], the
-            index of the network, and the largest change q of the view since.
+        reference: [B, K, 5] the reference view (``steps.fuse``): the camera's centre in the first camera's frame [m],
+            the index of the network, and the largest change q of the view since.
         features: [B, K, F] further entries of H, running averages in the caller's units.
     """
 

@@ -9,9 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors import confidence
+from ufmstar_torch.anchors.evidence import SUMS
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.frames.frame import LARGEST, FrameInput
 from ufmstar_torch.gaussians.camera import rotation_deviation
 from ufmstar_torch.gaussians.mixture import GaussianMixture
+from ufmstar_torch.posterior import conformal, running
 
 
 @dataclass(frozen=True)
@@ -28,7 +32,7 @@ class UfMStarState:
         smoothed: [B, H, W] moving average of the dense disagreement [m^2] in the mixture's dtype, NaN without a
             value; of size 0 x 0 before the first average.
         by_component: tensors of the anchors [B, K, C] by name, sums over the observations of each component.
-        by_stream: tensors [B, C] by name of each stream as a whole, learnt from anchors (``posterior.memory``).
+        by_stream: tensors [B, C] by name of each stream as a whole, learnt from anchors (:meth:`initial`).
     """
 
     mean: Tensor
@@ -51,11 +55,26 @@ class UfMStarState:
     def initial(
         cls, streams: int, config: UfMStarConfig, dtype: torch.dtype, device: torch.device | str
     ) -> UfMStarState:
-        """The empty state of ``streams`` independent streams, without anchors."""
+        """The empty state of ``streams`` independent streams.
+
+        With ``config.anchors``: ``evidence`` [B, K, 3] and ``overall_evidence`` [B, 3], sums over anchors by component
+        and of the stream. With ``config.confidence``: ``confidence`` [B, S]. With ``config.posterior``, in float64:
+        ``posterior`` [B, S], the memory of a stream (``running``), and ``intervals`` [B, 4] (``conformal``).
+        """
         capacity = min(config.initial_capacity, config.max_components or config.initial_capacity)
         mixture = GaussianMixture.empty(streams, capacity, features=config.entries, dtype=dtype, device=device)
         counter = torch.zeros(streams, dtype=torch.int64, device=device)
         components: dict[str, Any] = mixture.tensors()
+        by_component, by_stream = dict[str, Tensor](), dict[str, Tensor]()
+        if config.anchors is not None:
+            by_component["evidence"] = torch.zeros(streams, capacity, SUMS, dtype=dtype, device=device)
+            by_stream["overall_evidence"] = torch.zeros(streams, SUMS, dtype=dtype, device=device)
+        if config.confidence is not None:
+            size = confidence.size(config.confidence)
+            by_stream["confidence"] = torch.zeros(streams, size, dtype=dtype, device=device)
+        if config.posterior is not None:
+            for name, size in (("posterior", running.SIZE), ("intervals", conformal.SIZE)):
+                by_stream[name] = torch.zeros(streams, size, dtype=torch.float64, device=device)
         return cls(
             **components,
             T_world_first=torch.eye(4, dtype=torch.float64, device=device).repeat(streams, 1, 1),
@@ -63,7 +82,24 @@ class UfMStarState:
             frames=counter,
             skipped=counter.clone(),
             smoothed=torch.zeros(streams, 0, 0, dtype=dtype, device=device),
+            by_component=by_component,
+            by_stream=by_stream,
         )
+
+    def for_frame(self, frame: FrameInput, config: UfMStarConfig) -> UfMStarState:
+        """The state for a frame: the empty one of its streams before the first frame.
+
+        Raises:
+            ValueError: the frame has another number of streams, or lies on another device.
+        """
+        streams, device = len(frame.depth), frame.depth.device
+        if len(self.mean) == 0:
+            return UfMStarState.initial(streams, config, self.mean.dtype, device)
+        if len(self.mean) != streams:
+            raise ValueError(f"depth has {streams} streams but the state holds {len(self.mean)}: call reset() first")
+        if self.mean.device != device:
+            raise ValueError(f"depth lies on {device} but the state on {self.mean.device}: move one with .to()")
+        return self
 
     @property
     def mixture(self) -> GaussianMixture:
@@ -118,6 +154,19 @@ class UfMStarState:
         R = self.T_world_first[:, :3, :3]
         if b and float(rotation_deviation(R).max()) > 1e-6:
             raise ValueError("T_world_first holds matrices that are not rigid")
+        self._require_evidence(config)
+
+    def _require_evidence(self, config: UfMStarConfig) -> None:
+        """Raise a ValueError unless a run could have led to the tensors of anchors, whose values are finite."""
+        tensors = self.tensors()
+        for name in ("evidence", "overall_evidence") if config.anchors is not None else ():
+            if bool((tensors[name][..., 0] < 0).any()) or bool((tensors[name].abs() > LARGEST).any()):
+                raise ValueError(f"{name} holds negative weights or values beyond {LARGEST:g}")
+        if config.confidence is not None:
+            confidence.require(tensors["confidence"], config.confidence)
+        if config.posterior is not None:
+            running.require(tensors["posterior"])
+            conformal.require(tensors["intervals"])
 
     def tensors(self) -> dict[str, Tensor]:
         """The tensors by name, without copying."""
@@ -145,3 +194,5 @@ class UfMStarState:
 
 # Names of the tensors without anchors, in order.
 NAMES = tuple(f.name for f in fields(UfMStarState) if f.name not in ("by_component", "by_stream"))
+# Names of the tensors that stay float64 when the module is converted.
+ALWAYS_FLOAT64 = ("T_world_first", "posterior", "intervals")

@@ -4,38 +4,27 @@ from __future__ import annotations
 
 import functools
 import warnings
-from dataclasses import replace
-from typing import NamedTuple, Protocol, runtime_checkable
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import CheckAnchors, check_anchor_values
-from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.frame import CheckKernel, check_values
-from ufmstar_torch.gaussians.state import UfMStarState
-from ufmstar_torch.kernels.host import on_host
 from ufmstar_torch.steps.merge import REFERENCE as MERGE_REFERENCE
 from ufmstar_torch.steps.merge import MergeKernels
 from ufmstar_torch.steps.sample import REFERENCE as SAMPLE_REFERENCE
 from ufmstar_torch.steps.sample import SampleKernels
-from ufmstar_torch.steps.step import Step, step
-from ufmstar_torch.steps.step_parts import REFERENCE, Kernels
+from ufmstar_torch.steps.step import REFERENCE, Kernels, Step, step
 
 _TRITON_DEVICES = ("cuda", "xpu")  # "cuda" is ROCm's name as well
 _LEAST_CAPABILITY = (8, 0)  # of an NVIDIA GPU that triton supports
 
 
-@runtime_checkable
-class LateStep(Protocol):
-    """A step that defers a part of a frame's work to the next frame."""
-
-    def settled(self, state: UfMStarState, config: UfMStarConfig, /) -> UfMStarState:
-        """Apply the deferred work to the state that the step returned last."""
-        ...
-
-
 def select_step(name: str, device_type: str) -> Step:
-    """The step for a device. The step of a GPU has a memory (``step_device``): use one instance for each state.
+    """The step for a device. The step of a GPU remembers a count of its last state: use one instance for each module.
 
     Args:
         name: one of
@@ -153,3 +142,35 @@ def _has_triton(device_type: str) -> bool:
         warnings.warn("triton needs compute capability 8.0; the slower torch reference serves", stacklevel=4)
         return False
     return True
+
+
+def moved(value: Any, device: torch.device | str) -> Any:
+    """The same value with its tensors on a device: a tensor, a tuple, or a dataclass with tensors in its fields."""
+    if isinstance(value, Tensor):
+        return value.to(device)
+    if isinstance(value, tuple):
+        return tuple(moved(part, device) for part in value)
+    if not is_dataclass(value) or isinstance(value, type):
+        return value
+    before = {f.name: getattr(value, f.name) for f in fields(value)}
+    after = {name: moved(part, device) for name, part in before.items()}
+    changed = any(after[name] is not part for name, part in before.items())
+    return replace(value, **after) if changed else value
+
+
+def on_host(kernel: Callable[..., Any]) -> Callable[..., Any]:
+    """Wrap a CPU kernel for tensors of any device: copy them, synchronise, return results on the first tensor's
+    device."""
+
+    def call(*arguments: Any) -> Any:
+        return moved(kernel(*moved(arguments, "cpu")), _first(arguments).device)
+
+    return call
+
+
+def _first(value: Any) -> Any:
+    """The first tensor in a value, or None."""
+    if isinstance(value, Tensor):
+        return value
+    parts = value if isinstance(value, tuple) else vars(value).values() if is_dataclass(value) else ()
+    return next((tensor for part in parts if (tensor := _first(part)) is not None), None)

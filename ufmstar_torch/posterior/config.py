@@ -38,6 +38,10 @@ class PosteriorConfig(Checked):
     tilt_sigma: ClassVar[float] = 0.2
     # rho [1/frame]: share of b's slopes that a frame forgets
     reversion: ClassVar[float] = 0.2
+    # n_1 [frames]: weight of slopes of 0 in the mean slopes
+    slope_weight: ClassVar[float] = 3.0
+    # l_1 [width]: distance from the evidence at which the slopes are half the frame's and half the mean
+    slope_reach: ClassVar[float] = 0.3
     # p_1 [1]: probability that b's constant lies beyond its prior before the first anchor
     misscaled: ClassVar[float] = 0.1
     # nu [1]: of the Student-t distributions of an anchor's residual and of f's difference across a link

@@ -31,9 +31,9 @@ Floats = NDArray[np.float64]
 LEVELS: Final = (0.5, 0.9, 0.99)
 # |z| of the normal distribution at the levels, and twice |z| times its density there: d level / d log |z|.
 NORMAL: Final = (0.6744897501960817, 1.6448536269514722, 2.5758293035489004)
-_SLOPE: Final = tuple(2 * z * math.exp(-z * z / 2) / math.sqrt(2 * math.pi) for z in NORMAL)
+_SLOPE: Final = np.array([2 * z * math.exp(-z * z / 2) / math.sqrt(2 * math.pi) for z in NORMAL])
 # Factor from the scores' quantiles to the pixels', fitted on tours (docs/measure_thresholds.py --fit).
-TRANSFER: Final = (1.03, 1.18, 1.11)
+TRANSFER: Final = (1.02, 1.15, 1.1)
 RATE: Final = 0.1  # step of the adaptation in frames with many scores
 PRIOR: Final = 3.0  # number of frames that the start counts for
 FEW: Final = 20.0  # number of scores of a frame at which its step is halved
@@ -41,6 +41,8 @@ LEAST_FRAMES: Final = 3  # frames with scores before intervals exist
 # Limits of t_L over its normal value.
 LEAST, LARGEST = 0.1, 10.0
 SIZE: Final = 1 + len(LEVELS)
+# As arrays: |z| at the levels of the normal distribution, the same at pixels, and the shares beyond the levels.
+_NORMAL, _AT_PIXELS, _BEYOND = np.array(NORMAL), np.multiply(NORMAL, TRANSFER), 1 - np.array(LEVELS)
 # Bounds of the classes of distance from evidence in which scores are weighted [image widths].
 DISTANCES: Final = (0.015, 0.05, 0.12, 0.25)
 # Largest weight of a score over the mean.
@@ -77,9 +79,9 @@ def updated(state: Floats, scores: Floats, weights: Floats) -> Floats:
     if not total > 0:
         return state
     frames, logs = state[0] + 1, state[1:]
-    above = ((scores[:, None] > np.array(NORMAL) * np.exp(logs)) * weights[:, None]).sum(0) / total
+    above = ((scores[:, None] > _NORMAL * np.exp(logs)) * weights[:, None]).sum(0) / total
     step = max(RATE, 1 / (frames + PRIOR)) * len(scores) / (len(scores) + FEW)
-    logs = logs + step * (above - (1 - np.array(LEVELS))) / np.array(_SLOPE)
+    logs = logs + step * (above - _BEYOND) / _SLOPE
     return np.concatenate([[frames], logs.clip(math.log(LEAST), math.log(LARGEST))])
 
 
@@ -108,8 +110,11 @@ def quantiles(state: Tensor) -> Tensor:
     Args:
         state: [B, 4] as in :func:`updated`.
     """
-    at_pixels = state[:, 1:].double().exp() * state.new_tensor(NORMAL) * state.new_tensor(TRANSFER)
-    return torch.where(state[:, :1] >= LEAST_FRAMES, at_pixels.cummax(1).values, torch.nan)
+    if state.device.type == "meta":
+        return state.new_empty(len(state), len(LEVELS))
+    values = state.cpu().numpy()
+    at_pixels = np.maximum.accumulate(np.exp(values[:, 1:]) * _AT_PIXELS, axis=1)
+    return torch.from_numpy(np.where(values[:, :1] >= LEAST_FRAMES, at_pixels, np.nan)).to(state.device)
 
 
 def normal_where_missing(quantiles: Tensor | None, variance: Tensor) -> Tensor:

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.frame import AnchorInput, FrameInput
-from ufmstar_torch.kernels.cpu.arrays import array
-from ufmstar_torch.kernels.cpu.threads import each
+from ufmstar_torch.kernels.cpu.calls import array, each
 from ufmstar_torch.posterior import conformal
 from ufmstar_torch.posterior.running import restarted
 

@@ -17,12 +17,13 @@ import torch
 from torch import Tensor
 from torch.special import ndtr, ndtri
 
-from ufmstar_torch.posterior.conformal import LEVELS, Floats, corrected, uncorrected
+from ufmstar_torch.posterior.conformal import corrected, uncorrected
+from ufmstar_torch.posterior.running import Floats
 
 # [m^2] of a component: a variance of 0 has no density.
 LEAST_VARIANCE = 1e-12
 # Least distance of F from 0 and 1 [1]: z stays finite in float64.
-_TAIL = 1e-15
+TAIL = 1e-15
 # Quantile of the variance of inliers over the image that limits it.
 _TYPICAL = 0.7
 # Least ratio of the variances of another surface and of the evidence's.
@@ -49,7 +50,7 @@ class DepthDistribution:
 
     def standard(self, depth: Tensor) -> Tensor:
         """z [B, ...] of a depth [B, ...] [m], float64, before the correction."""
-        return ndtri(_conditional(self, depth.double()).clamp(_TAIL, 1 - _TAIL))
+        return ndtri(_conditional(self, depth.double()).clamp(TAIL, 1 - TAIL))
 
     def below(self, depth: Tensor) -> Tensor:
         """Probability [B, ...] of a depth below ``depth`` [B, ...] [m], float64."""
@@ -71,7 +72,7 @@ class DepthDistribution:
         """x [B, ...] with F(x) = ``probability``, by bisection."""
         low = torch.zeros_like(probability)
         zero = self._sum(low)
-        target = (zero + probability * (1 - zero)).clamp(_TAIL, 1 - _TAIL)
+        target = (zero + probability * (1 - zero)).clamp(TAIL, 1 - TAIL)
         # The mixture's quantile is at most the largest of the components' quantiles.
         high = (self.mean + ndtri(target) * self.variance.double().sqrt()).amax(0).clamp_min(0)
         for _ in range(_BISECTIONS):
@@ -88,22 +89,6 @@ class DepthDistribution:
     def _quantiles_at(self, like: Tensor) -> Tensor:
         """[3, B, 1, ...] to broadcast over the pixels of ``like`` [B, ...]."""
         return self.quantiles.double().T.reshape(3, -1, *[1] * (like.dim() - 1))
-
-
-def score(error: Floats, p: Floats, moment: Floats, inlier: Floats) -> Floats:
-    """|z| [N] of held-out anchors.
-
-    Args:
-        error: [N] log of the depth over the posterior's.
-        p: [N] probability that the posterior's local correction does not hold.
-        moment, inlier: [N] second moment of the relative error, and the same if the local correction holds.
-    """
-    elsewhere = np.maximum((moment - (1 - p) * inlier) / np.maximum(p, 1e-12), inlier)
-    parts = (1 - p, p), (np.ones_like(p), np.ones_like(p)), (inlier, elsewhere)
-    weight, mean, variance = (torch.from_numpy(np.stack(part)[:, None]) for part in parts)
-    distribution = DepthDistribution(weight, mean, variance, torch.full((1, len(LEVELS)), torch.nan))
-    z: Floats = distribution.standard(torch.from_numpy(np.exp(error))[None])[0].abs().numpy()
-    return z
 
 
 def divided(variance: Floats, inlier: Floats, p: Floats) -> tuple[Floats, Floats]:

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.posterior.conformal import image_weights
-from ufmstar_torch.posterior.distribution import score
 from ufmstar_torch.posterior.field import Field, at, conditioned
+from ufmstar_torch.posterior.moments import score
 from ufmstar_torch.posterior.running import Floats, Running
 from ufmstar_torch.posterior.scene import (
     MOST_WRONG,
@@ -48,8 +48,9 @@ def learnt(
     ``away`` [R C]: distance of every node from evidence; ``of_surfaces``: sums from ``motion.surfaces``."""
     sums, scores = _of_discs(scene, weight, left_out, running, away)
     above, below = running.added(_of_neighbours(scene, left_out, running) | sums | of_surfaces)
-    first = [running.frames + 1, scene.grid.mean]
-    return np.concatenate([first, above, below, field.coefficients, field.covariance.ravel()]), scores
+    first, b = [running.frames + 1, scene.grid.mean], field.coefficients
+    slopes = running.with_slopes(b[1:])
+    return np.concatenate([first, above, below, slopes, b, field.covariance.ravel()]), scores
 
 
 def _of_neighbours(scene: Scene, left_out: LeftOut, running: Running) -> dict[str, tuple[float, float]]:
@@ -78,7 +79,7 @@ def _of_discs(
     mean, variance = at(field, node, x)
     away, b = away_from(scene, rest)[node], field.coefficients
     error, offset = scene.observed.value[held_out] - mean, mean - (x * b).sum(1)
-    believed = np.where(held_out, scene.believed(), 0.0)
+    believed = np.where(held_out, scene.believed, 0.0)
     area = (believed / np.maximum(scene.counted(believed), 1e-12))[held_out]
     unseen = away * running.ratios["unseen"]
     wide = elsewhere_variance(config, spread_around(scene, rest, b[0])[node], unseen)

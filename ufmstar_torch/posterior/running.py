@@ -1,4 +1,4 @@
-"""The posterior's memory of a stream: sums with a half-life, and the last frame's coefficients.
+"""The posterior's memory of a stream: sums with a half-life, the mean slopes, and the last frame's coefficients.
 
 Frames with anchors update these ratios:
 
@@ -18,6 +18,7 @@ Each ratio is the quotient of two sums that fade towards a prior, so that few an
 from __future__ import annotations
 
 import functools
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +30,7 @@ from ufmstar_torch.posterior.config import PosteriorConfig
 
 Floats = NDArray[np.float64]
 FEATURES = 4  # 1, log d - m_0, u and v from -1 to 1
+SLOPES = FEATURES - 1
 _MATRIX = FEATURES * FEATURES
 # Limits of stored values, beyond what any run reaches: of m_0, the log of the largest accepted depth
 # (``frame.DEPTH_RANGE``); of all values, which count anchors and frames or are squares of logs.
@@ -61,20 +63,20 @@ def ratios(config: PosteriorConfig) -> dict[str, Ratio]:
 
 
 RATIOS = len(ratios(PosteriorConfig()))
-SIZE = 2 + 2 * RATIOS + FEATURES + _MATRIX
+SIZE = 2 + 2 * RATIOS + SLOPES + FEATURES + _MATRIX
 
 
 def restarted(packed: Tensor, config: PosteriorConfig) -> Tensor:
-    """Memory [B, SIZE] with the initial coefficients: wrong poses can have corrupted them. The ratios depend on network
-    and scene and remain. Zeros before the first anchor."""
+    """Memory [B, SIZE] with the initial coefficients and slopes: wrong poses can have corrupted them. The ratios depend
+    on network and scene and remain. Zeros before the first anchor."""
     P = torch.diag(packed.new_tensor(config.prior_variance)).flatten()
-    start = torch.cat([packed.new_zeros(FEATURES), P]) * (packed[:, :1] > 0)
-    return torch.cat([packed[:, : -FEATURES - _MATRIX], start], 1)
+    start = torch.cat([packed.new_zeros(SLOPES + FEATURES), P]) * (packed[:, :1] > 0)
+    return torch.cat([packed[:, : -start.shape[1]], start], 1)
 
 
 def require(packed: Tensor) -> None:
     """Raise a ValueError if no anchors can have led to the memory [B, SIZE]."""
-    frames, mean, _, _, covariance = packed.split([1, 1, 2 * RATIOS, FEATURES, _MATRIX], 1)
+    frames, mean, _, _, covariance = packed.split([1, 1, 2 * RATIOS, SLOPES + FEATURES, _MATRIX], 1)
     matrix = covariance.reshape(-1, FEATURES, FEATURES)
     signed = 2 + list(ratios(PosteriorConfig())).index("centre")
     sums = torch.cat([packed[:, 2:signed], packed[:, signed + 1 : 2 + 2 * RATIOS]], 1)
@@ -98,6 +100,8 @@ class Running(NamedTuple):
         frames: number of frames with anchors.
         mean: m_0 of the last frame.
         above, below: [R] numerators and denominators of :func:`ratios`, in their order.
+        slopes: [3] mean of the slopes in the coefficients over the frames with anchors, with the half-life and with
+            ``slope_weight`` frames of 0.
         coefficients: [4] of the features in the last frame.
         covariance: [4, 4] of the coefficients.
         ratios: the ratios by name, within their limits; the prior's value where the denominator is 0.
@@ -108,6 +112,7 @@ class Running(NamedTuple):
     mean: float
     above: Floats
     below: Floats
+    slopes: Floats
     coefficients: Floats
     covariance: Floats
     ratios: dict[str, float]
@@ -117,12 +122,13 @@ class Running(NamedTuple):
         """Unpack [SIZE]; zeros are the start."""
         names, (value, weight, least, largest) = _priors(config)
         (above, below), rest = packed[2 : 2 + 2 * RATIOS].reshape(2, RATIOS), packed[2 + 2 * RATIOS :]
-        b, covariance = rest[:FEATURES], rest[FEATURES:].reshape(FEATURES, FEATURES)
+        slopes, b, covariance = np.split(rest, [SLOPES, SLOPES + FEATURES])
+        covariance = covariance.reshape(FEATURES, FEATURES)
         if packed[0] == 0:
             above, below, covariance = value * weight, weight, np.diag(config.prior_variance)
         values = np.where(below > 0, above / np.maximum(below, 1e-12), value).clip(least, largest)
         by_name = dict(zip(names, values.tolist(), strict=True))
-        return cls(config, packed[0], packed[1], above, below, b, covariance, by_name)
+        return cls(config, packed[0], packed[1], above, below, slopes, b, covariance, by_name)
 
     def added(self, sums: dict[str, tuple[float, float]]) -> tuple[Floats, Floats]:
         """Numerators and denominators [R] after a frame with the ``sums`` by name."""
@@ -140,10 +146,18 @@ class Running(NamedTuple):
         total = fade * self.above[k] + (1 - fade) * prior.weight * prior.value + above
         return float(min(max(total / n, prior.least), prior.largest))
 
+    def with_slopes(self, slopes: Floats) -> Floats:
+        """Mean slopes [3] after a frame with anchors whose coefficients have the ``slopes`` [3]."""
+        rate = math.log(2) / self.config.half_life
+        weight = math.expm1(-rate * (self.frames + 1)) / math.expm1(-rate)  # of the frames with anchors, 1 of the last
+        mean: Floats = self.slopes + (slopes - self.slopes) / (weight + self.config.slope_weight)
+        return mean
+
     def drifted(self, mean: float) -> Floats:
-        """Pack into [SIZE] after a frame without anchors whose m_0 is ``mean``."""
+        """Pack into [SIZE] after a frame without anchors whose m_0 is ``mean``. The mean slopes revert, too."""
         b, covariance = self.expected(mean)
-        return np.concatenate([[self.frames, mean], self.above, self.below, b, covariance.ravel()])
+        slopes = (1 - self.config.reversion) * self.slopes
+        return np.concatenate([[self.frames, mean], self.above, self.below, slopes, b, covariance.ravel()])
 
     def expected(self, mean: float) -> tuple[Floats, Floats]:
         """Predict coefficients [4] and covariance [4, 4] for a frame whose m_0 is ``mean``.

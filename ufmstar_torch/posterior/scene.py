@@ -11,23 +11,19 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch.special import ndtr
 
 from ufmstar_torch.posterior.cells import features, local_variance, ranges
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.field import Field, Observed, Prior, at, conditioned, distance
+from ufmstar_torch.posterior.moments import moments
+from ufmstar_torch.posterior.nodes import link, scale, spread
 from ufmstar_torch.posterior.running import Floats, Running
 
 # Largest number of nodes in a row and in a column (the field's window allows 31 in a row).
 SIDE = 28
 # Least divisor 1 - w v of a leave-one-out residual: it is 0 for a single anchor.
 LEAST_LEFT = 0.05
-# Least measured share, a divisor.
-LEAST_MEASURED = 0.05
-# Least variance of y whose distribution is computed.
-LEAST_VARIANCE = 1e-12
 # Largest probability that the local correction does not hold.
 MOST_WRONG = 0.5
 
@@ -77,13 +73,9 @@ class Grid(NamedTuple):
     @classmethod
     def of(cls, log_depth: Floats, rows: int, cols: int, config: PosteriorConfig) -> Grid:
         """The links between cells of mean ``log_depth`` [R C]."""
-        across, along = np.full((2, rows, cols), np.inf)
-        across[:, :-1] = config.jump * np.abs(np.diff(log_depth.reshape(rows, cols), axis=1))
-        along[:-1] = config.jump * np.abs(np.diff(log_depth.reshape(rows, cols), axis=0))
-        edges = across.ravel(), along.ravel()
-        right, down = (config.link_variance + config.edge_variance * x**2 for x in edges)
-        far = (1 / n + edge for n, edge in zip((cols, rows), edges, strict=True))
-        return cls(rows, cols, log_depth, float(log_depth.mean()), right, down, *far)
+        links = np.empty((4, rows, cols))
+        link(log_depth.reshape(rows, cols), config.jump, config.link_variance, config.edge_variance, *links)
+        return cls(rows, cols, log_depth, float(log_depth.mean()), *links.reshape(4, -1))
 
 
 class Scene(NamedTuple):
@@ -96,6 +88,8 @@ class Scene(NamedTuple):
         observed: the anchors.
         stated: [N] noise s^2/g^2 + alone/N.
         noise: [N] n: ``stated`` with roughness and blur^2.
+        believed: [N] weight of an anchor in the learnt means: 1/(1 + n/weak_sigma^2).
+        by_area: [N] ``believed`` over the number of anchors in the cell.
     """
 
     config: PosteriorConfig
@@ -104,16 +98,14 @@ class Scene(NamedTuple):
     observed: Observed
     stated: Floats
     noise: Floats
+    believed: Floats
+    by_area: Floats
 
     def counted(self, values: Floats) -> Floats:
         """[N] sums of ``values`` over the anchors of the same cell."""
         node = self.observed.node
         summed: Floats = np.bincount(node, values, len(self.grid.log_depth)).astype(np.float64)
         return summed[node]
-
-    def believed(self) -> Floats:
-        """[N] weight of an anchor in the learnt means: 1/(1 + n/weak_sigma^2)."""
-        return 1 / (1 + self.noise / self.config.weak_sigma**2)
 
 
 class LeftOut(NamedTuple):
@@ -147,7 +139,9 @@ def scene_of(
     stated = running.ratios["noise"] * anchors.variance / anchors.depth**2
     stated = stated + running.config.alone / max(len(stated), 1)
     noise = stated + running.ratios["roughness"] + (ranges(depth, valid, anchors.at_pixel) / 2) ** 2
-    return Scene(running.config, grid, _prior(grid, running), observed, stated, noise)
+    believed, count = 1 / (1 + noise / running.config.weak_sigma**2), np.bincount(observed.node)
+    by_area = believed / count[observed.node]
+    return Scene(running.config, grid, _prior(grid, running), observed, stated, noise, believed, by_area)
 
 
 def _prior(grid: Grid, running: Running) -> Prior:
@@ -186,34 +180,23 @@ def _with_weights(scene: Scene, weight: Floats) -> tuple[Field, LeftOut]:
 
 
 def spread_around(scene: Scene, used: NDArray[np.bool_], mean: float) -> Floats:
-    """[n] variance of y around every node, over the anchors of the mask ``used`` [N] and one virtual anchor of the
-    prior variance about ``mean``."""
-    y = scene.observed.value
-    weight, first, second = _around(scene, used, scene.config.radius, y, y**2)
-    middle = (first + mean) / (weight + 1)
-    moment = (second + mean**2 + scene.config.prior_sigma**2) / (weight + 1)
-    spread: Floats = np.maximum(moment - middle**2, 0)
-    return spread
+    """[n] variance of y around every node, over the anchors of the mask ``used`` [N], weighted ``by_area`` and by a
+    Gaussian window, and one virtual anchor of the prior variance about ``mean``."""
+    out, grid = np.empty(len(scene.grid.log_depth)), scene.grid
+    windows = (_window(count, scene.config.radius) for count in (grid.rows, grid.cols))
+    observed, prior = scene.observed, scene.config.prior_sigma**2
+    spread(observed.node, scene.by_area, used, observed.value, *windows, mean, prior, out)
+    return out
 
 
 def local_scale(scene: Scene, left_out: LeftOut, used: NDArray[np.bool_]) -> Floats:
     """[n] factor by which errors around every node exceed the field's prediction: the mean leave-one-out z^2 of the
-    anchors of the mask ``used`` [N] and of one virtual anchor with z^2 = 1."""
-    z2 = np.minimum(left_out.residual**2 / left_out.total, scene.config.clip)
-    weight, first = _around(scene, used, scene.config.near, z2)
-    scale: Floats = (first + 1) / (weight + 1)
-    return scale
-
-
-def _around(scene: Scene, used: NDArray[np.bool_], width: float, *values: Floats) -> Floats:
-    """[1 + k, n] sums of 1 and of the k values [N] over the anchors of the mask ``used`` [N], weighted by a Gaussian
-    window around every node, by ``believed``, and by 1/(anchors in the cell)."""
-    weight = np.where(used, scene.believed() / scene.counted(np.ones(len(scene.noise))), 0.0)
-    grid, terms = scene.grid, (weight, *(weight * x for x in values))
-    nodes = np.stack([np.bincount(scene.observed.node, x, grid.rows * grid.cols) for x in terms])
-    nodes = nodes.reshape(-1, grid.rows, grid.cols)
-    sums: Floats = (_window(grid.rows, width) @ nodes @ _window(grid.cols, width)).reshape(len(nodes), -1)
-    return sums
+    anchors of the mask ``used`` [N] and of one virtual anchor with z^2 = 1. Gaussian windows and weights as in
+    :func:`spread_around`."""
+    out, grid = np.empty(len(scene.grid.log_depth)), scene.grid
+    windows = (_window(count, scene.config.near) for count in (grid.rows, grid.cols))
+    scale(scene.observed.node, scene.by_area, used, *left_out, scene.config.clip, *windows, out)
+    return out
 
 
 @functools.lru_cache(maxsize=8)  # two widths; the sizes of the grid hardly change
@@ -228,6 +211,14 @@ def wrong_factor(config: PosteriorConfig, away: Floats, scale: Floats) -> Floats
     ``away`` [n] is the distance."""
     factor: Floats = scale ** np.maximum(1 - away / config.radius, 0)
     return factor
+
+
+def slopes_away(config: PosteriorConfig, x: Floats, away: Floats, slopes: Floats, mean: Floats) -> Floats:
+    """[n] change of y at nodes with features ``x`` [n, 4] and distances ``away`` [n] from evidence, where the ``mean``
+    slopes [3] of the stream replace those of the frame: what its anchors show is no evidence far from them."""
+    share = away**2 / (away**2 + config.slope_reach**2)
+    change: Floats = share * (x[:, 1:] @ (mean - slopes))
+    return change
 
 
 def unmeasured(config: PosteriorConfig, variance: float) -> float:
@@ -274,30 +265,15 @@ def at_pixels(
 
 
 def second_moments(
-    config: PosteriorConfig, variance: Floats, p: Floats, offset: Floats, wide: Floats, share: float = 0.0
+    config: PosteriorConfig, variance: Floats, p: Floats, offset: Floats, wide: Floats
 ) -> tuple[Floats, Floats]:  # fmt: skip
     """Variances over the squared depth: in total, and if the local correction holds. With probability ``p`` the local
-    correction ``offset`` does not hold, and y has the variance ``wide`` instead of ``variance``. The limit of errors
-    disappears with the ``share`` that is ``unmeasured``."""
-    inlier = moment_elsewhere(config, np.zeros_like(variance), np.minimum(variance, config.widest), share)
-    return (1 - p) * inlier + p * moment_elsewhere(config, offset, wide, share), inlier
-
-
-def moment_elsewhere(config: PosteriorConfig, offset: Floats, wide: Floats, share: float = 0.0) -> Floats:
-    """Second moment of the relative error if y is normal with the variance ``wide`` about the stated one less
-    ``offset``."""
-    limit = math.log(config.farthest) / max(1 - share, LEAST_MEASURED)
-    return _second_moment(wide, np.clip(offset, -limit, limit), limit)
-
-
-def _second_moment(variance: Floats, offset: Floats, limit: float) -> Floats:
-    """E[(e^n - 1)^2 | |n| <= ``limit``], n ~ N(-offset, variance)."""
-    sigma = np.sqrt(np.maximum(variance, LEAST_VARIANCE))
-    ends = torch.from_numpy(np.stack([offset - limit, offset + limit]) / sigma)
-    mass, first, second = (np.diff(ndtr(ends - k * torch.from_numpy(sigma)).numpy(), axis=0)[0] for k in range(3))
-    q = np.exp(-offset)
-    moment: Floats = q * q * np.exp(2 * variance) * second - 2 * q * np.exp(variance / 2) * first + mass
-    return np.maximum(moment / mass, 0)
+    correction ``offset`` does not hold, and y has the variance ``wide`` instead of ``variance``. All arguments are
+    [n]."""
+    limit = math.log(config.farthest)
+    total, inlier = np.empty((2, len(variance)))
+    moments(variance, p, offset, wide, limit, config.widest, total, inlier)
+    return total, inlier
 
 
 def away_from(scene: Scene, evidence: NDArray[np.bool_]) -> Floats:

@@ -5,8 +5,12 @@ At an anchor of depth g the network's error is y = log(g/d). Its model over the 
     y = b . (1, log d - m_0, u, v) + f.
 
 b's constant follows a random walk from frame to frame; its slopes revert to 0, so that without evidence the depth fades
-to the network's shape at the stream's scale. f is a Gaussian field on a grid whose links are weaker across edges of the
-predicted depth (``grid``, ``field``). An anchor of standard deviation s observes y with the variance
+to the network's shape at the stream's scale. At the distance a from evidence the slopes are those of the frame and the
+mean slopes of the stream (``running``), with the shares l^2/(a^2 + l^2) and a^2/(a^2 + l^2), l = ``slope_reach``: in a
+turn, anchors at one side of the image are no evidence of the network's shape at the other.
+
+f is a Gaussian field on a grid whose links are weaker across edges of the predicted depth (``grid``, ``field``). An
+anchor of standard deviation s observes y with the variance
 
     n = roughness + blur^2 + noise s^2/g^2 + alone/N.
 
@@ -38,8 +42,8 @@ Variance over the squared depth at a node, with share = min(1, distance/reach):
 - The ratios include the held-out anchors of this frame.
 
 Before the first anchor the network may be off by any factor. The squared share of the variance of b's constant in that
-before the first anchor is ``unmeasured``: with it p is raised towards ``misscaled``, w towards ``widest``, a_0 towards
-1, and the limit F disappears.
+before the first anchor is ``unmeasured``: with it p is raised towards ``misscaled``, w towards ``widest``, and a_0
+towards 1. At the start the standard deviation is .9 times the depth.
 
 The distance from evidence is geodesic, in image widths, and differences of log d lengthen it: on tours the variance of
 the error is proportional to it. ``learn`` estimates ``unseen``, ``wrong`` and the other ratios (``running``).
@@ -74,8 +78,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.frames.frame import AnchorInput, FrameInput
-from ufmstar_torch.kernels.cpu.arrays import array
-from ufmstar_torch.kernels.cpu.threads import each
+from ufmstar_torch.kernels.cpu.calls import array, each
 from ufmstar_torch.posterior.cells import cell_means, features, read
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.distribution import divided
@@ -95,9 +98,9 @@ from ufmstar_torch.posterior.scene import (
     inlier_factor,
     local_scale,
     misscaled,
-    moment_elsewhere,
     scene_of,
     second_moments,
+    slopes_away,
     spread_around,
     steepness,
     unmeasured,
@@ -213,13 +216,15 @@ def _of_stream(
     scale = local_scale(scene, left_out, all_anchors)
     p = np.minimum(updated.ratios["wrong"] * wrong_factor(config, away, scale), MOST_WRONG)
     p, wide = misscaled(config, share, p, wide)
-    variance, inlier = second_moments(config, scale * variance, p, offset, wide, share)
+    variance, inlier = second_moments(config, scale * variance, p, offset, wide)
     if anchors.motion is not None:
         tests = tests_at(anchors.motion, depth.shape[0], depth.shape[1], rows, cols)
         e = mean - c - in_image(x, b)
         P = probability(e, grid.log_depth, away / config.reach, tests, updated.ratios["between"], (rows, cols))
-        p, variance = 1 - (1 - p) * (1 - P), (1 - P) * variance + P * moment_elsewhere(config, e, wide, share)
+        one = np.ones_like(P)
+        p, variance = 1 - (1 - p) * (1 - P), (1 - P) * variance + P * second_moments(config, variance, one, e, wide)[0]
     inlier, p = divided(variance, inlier, p)
+    offset = offset + slopes_away(config, x, away, b[1:], updated.slopes)
     nodes = np.stack([grid.log_depth, offset, variance, inlier, p, away / config.reach], 1)
     depth, spread, inlier, p = read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
     return memory, depth, spread, p, inlier, updated, scores

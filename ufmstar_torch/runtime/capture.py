@@ -134,11 +134,8 @@ def _require_fixed(ufm: UfMStar, device_type: str) -> None:
         "max_components of at most initial_capacity, since a growing mixture changes its shape": (
             limit is None or slots < limit
         ),
-        "no anchors, overlap weights, neighbourhood or merging": (
-            config.anchors is not None
-            or config.overlap_weighted
-            or config.regression != "exact"
-            or config.merges_on(device_type)
+        "no anchors, overlap weights or merging": (
+            config.anchors is not None or config.overlap_weighted or config.merges_on(device_type)
         ),
         "disagreement='w2'": config.disagreement != "w2",
         "no features": bool(config.entries),

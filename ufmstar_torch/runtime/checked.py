@@ -17,6 +17,8 @@ from typing import Any, ClassVar, Self, get_args, get_type_hints
 
 import numpy as np
 
+from ufmstar_torch.files.limits import read_text
+
 
 def number(
     default: float | None,
@@ -97,7 +99,7 @@ class Checked:
         if not isinstance(path, str | Path):
             raise TypeError(f"path must be a file name or path, got {type(path).__name__}")
         try:
-            values = json.loads(Path(path).read_text(encoding="utf-8"))
+            values = json.loads(read_text(path))
         except (ValueError, RecursionError) as error:
             raise ValueError(f"{path} is not JSON: {error}") from error
         if not isinstance(values, dict):

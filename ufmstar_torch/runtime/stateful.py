@@ -1,19 +1,89 @@
-"""The base of modules with a state: buffers that move, save and load together."""
+"""The base of modules with a state: buffers that move, save and load together, used by one thread at a time."""
 
 from __future__ import annotations
 
+import inspect
 import json
+import threading
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Self
+from functools import lru_cache, wraps
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from ufmstar_torch.runtime.checked import Checked, flat
-from ufmstar_torch.runtime.one_caller import OneCaller, one_caller
+
+Class = TypeVar("Class")
+
+
+class OneCaller:
+    """The thread that is inside a method of its object, if any. Copies and pickles begin unused."""
+
+    def __init__(self) -> None:
+        self._lock, self._owner, self._depth, self._inside = threading.Lock(), 0, 0, ""
+
+    def __reduce__(self) -> tuple[type[OneCaller], tuple[()]]:
+        return OneCaller, ()
+
+    def enter(self, method: str) -> None:
+        """Begin a call; the same thread may nest calls. Raises RuntimeError: another thread is inside."""
+        me = threading.get_ident()
+        if self._owner != me:
+            if not self._lock.acquire(blocking=False):
+                raise RuntimeError(
+                    f"{method} was called by {_this_thread()} while {self._inside}: the state takes one thread at a "
+                    "time; create a module for each thread, or hold a lock around the calls"
+                )
+            self._owner, self._inside = me, f"{_this_thread()} is in {method}"
+        self._depth += 1
+
+    def leave(self) -> None:
+        """End a call."""
+        self._depth -= 1
+        if self._depth == 0:
+            self._owner = 0
+            self._lock.release()
+
+
+def one_caller(*names: str) -> Callable[[type[Class]], type[Class]]:
+    """Decorate a class, whose instances have an attribute ``_caller``, a :class:`OneCaller`: its methods and properties
+    ``names`` refuse a second thread."""
+
+    def decorate(owner: type[Class]) -> type[Class]:
+        for name in names:
+            member = inspect.getattr_static(owner, name)
+            is_property = isinstance(member, property)
+            guarded = _guarded(member.fget if is_property else member)
+            setattr(owner, name, property(guarded) if is_property else guarded)
+        return owner
+
+    return decorate
+
+
+def _guarded(method: Callable[..., Any]) -> Callable[..., Any]:
+    @wraps(method)
+    def called(self: Any, *args: Any, **kwargs: Any) -> Any:
+        self._caller.enter(f"{type(self).__name__}.{method.__name__}")
+        try:
+            return method(self, *args, **kwargs)
+        finally:
+            self._caller.leave()
+
+    guarded: Any = called
+    # torch.compile does not compile this method. torch.compiler.disable does the same, but imports the compiler (6 s).
+    frames = torch._C._dynamo.eval_frame
+    skip = frames._FrameAction.SKIP
+    function: Any = guarded
+    frames.set_code_exec_strategy(function.__code__, frames._FrameExecStrategy(skip, skip))
+    function._torchdynamo_disable = True
+    return guarded
+
+
+def _this_thread() -> str:
+    return f"thread {threading.current_thread().name!r}"
 
 
 @one_caller("_save_to_state_dict", "_load_from_state_dict", "_apply")
@@ -32,7 +102,7 @@ class StatefulModule(nn.Module):
     """
 
     STATE: tuple[str, ...]
-    ALWAYS_FLOAT64: tuple[str, ...] = ("T_world_first",)
+    ALWAYS_FLOAT64: tuple[str, ...] = ()
     config: Checked
 
     def __init__(self) -> None:
@@ -66,16 +136,8 @@ class StatefulModule(nn.Module):
         chosen[indices if indices.numel() else indices.long()] = True
         return chosen
 
-    def _settle(self) -> None:
-        """Write pending results into the buffers before they are saved, loaded, copied or moved."""
-
-    def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
-        self._settle()
-        super()._save_to_state_dict(destination, prefix, keep_vars)
-
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Applies ``.to()`` and similar conversions, with the exceptions in the class's docstring."""
-        self._settle()
         before = {name: getattr(self, name) for name in self.STATE}
         super()._apply(fn, recurse)
         for name, old in before.items():
@@ -109,7 +171,6 @@ class StatefulModule(nn.Module):
         Raises:
             ValueError: tensors that do not match each other, or invalid values.
         """
-        self._settle()
         try:
             saved = {
                 n: _fitting(n, state_dict[prefix + n], getattr(self, n)) for n in self.STATE if prefix + n in state_dict

@@ -25,7 +25,7 @@ _TOTAL = 3 * 7  # stages of a step, for two frames and an image average
 
 
 class _Stages:
-    """Reports the stages of a step (``ufmstar_torch.steps.step_parts.StepObserver``) to ``progress``, as in
+    """Reports the stages of a step (``ufmstar_torch.steps.step.StepObserver``) to ``progress``, as in
     :func:`warm_up`, with their ``total`` number."""
 
     def __init__(self, progress: Callable[[int, int], object] | None, total: int) -> None:

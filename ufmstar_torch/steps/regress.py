@@ -2,27 +2,40 @@
 
 Section "Uncertainty Regression". H is constant within a component, so the conditional mean is the average of m_k with
 weights w_k(x). A weak prior (pi_0, mu_0) dominates where all components have a low density.
+
+Not in the paper: pixels where M was not measured (``config.unmeasured``). A surface seen from one view has m = 0
+because nothing was compared. Far from all components, M is the prior's mean. In the paper both count as certain. The
+share of a pixel's M that rests on surfaces seen from different places,
+
+    s(x) = sum of w_k(x) (1 - exp(-n_k))  with the number of views n_k (``fuse``),
+
+is regressed as an additional feature. It is 0 for an image that shows nothing (``FrameInput.informative``). A pixel
+counts as measured where s is at least one half.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.gaussians.camera import unproject, unproject_at
-from ufmstar_torch.gaussians.fixed_order import total
+from ufmstar_torch.gaussians.camera import invert_rigid, unproject, unproject_at
+from ufmstar_torch.gaussians.fixed_order import apply, total
 from ufmstar_torch.gaussians.gaussian import cholesky3, inverse_lower3
 from ufmstar_torch.gaussians.mixture import GaussianMixture
+from ufmstar_torch.gaussians.state import UfMStarState
+from ufmstar_torch.runtime.stateful import full_precision
+from ufmstar_torch.steps.fuse import measured_share
 
 # Most points x components evaluated at a time: bounds the temporary memory to some 100 MB in float32. On CUDA it may
 # be a quarter of the free memory, if that is more. A pair takes _NUMBERS numbers: offset, distance, density,
 # temporaries.
 _CHUNK = 2**22
 _NUMBERS = 16
+HALF = 0.5  # the least share s of a measured pixel
 
 
 @dataclass(frozen=True)
@@ -232,3 +245,55 @@ def at_pixels(values: Tensor, pixels: Tensor | None) -> Tensor:
 def with_pixels(values: Tensor, pixels: Tensor | None, changed: Tensor) -> Tensor:
     """The map [B, H, W] with the values ``changed`` [B, n] at pixels [B, n]; None = at all pixels [B, H, W]."""
     return changed if pixels is None else values.flatten(1).scatter(1, pixels, changed).view(values.shape)
+
+
+def with_measured_share(mixture: GaussianMixture) -> GaussianMixture:
+    """The mixture [B, K] with an additional feature, the share 1 - exp(-n) to which a component is measured."""
+    share = measured_share(mixture.views).to(mixture.features.dtype)
+    return mixture.replace(features=torch.cat([mixture.features, share[..., None]], dim=-1))
+
+
+def set_unmeasured(
+    result: Regression, depth: Tensor | None, config: UfMStarConfig, informative: Tensor | None = None
+) -> tuple[Regression, Tensor]:
+    """Separate the share s from the regressed features, and set M where it was not measured.
+
+    Args:
+        result: of the mixture of :func:`with_measured_share`.
+        depth: of the same pixels [m]; None = points without a depth, for which "relative" acts as "nan".
+        config: of UfM*.
+        informative: [B] False for the streams whose image shows nothing; None = all True.
+
+    Returns:
+        The regression without the share, and s, NaN where not valid.
+    """
+    measured = result.features[..., -1]
+    if informative is not None:
+        measured = measured * informative.view(-1, *[1] * (measured.dim() - 1)).to(measured.dtype)
+    disagreement = result.disagreement
+    if config.unmeasured == "nan" or (config.unmeasured == "relative" and depth is None):
+        disagreement = torch.where(measured < HALF, torch.nan, disagreement)
+    elif config.unmeasured == "relative" and depth is not None:
+        share = (1 - measured).clamp_min(0)
+        disagreement = disagreement.add(share * depth * depth, alpha=config.unmeasured_relative**2)
+    return replace(result, disagreement=disagreement, features=result.features[..., :-1]), measured
+
+
+def query(state: UfMStarState, points: Tensor, frame: str, config: UfMStarConfig) -> Regression:
+    """See :meth:`ufmstar_torch.UfMStar.query`, of a state of B streams."""
+    if not isinstance(frame, str) or frame not in ("world", "first"):
+        raise ValueError(f"frame must be 'world' or 'first', got {frame!r}")
+    streams = len(state.weight)
+    if streams == 0:
+        raise ValueError("query needs a mixture: call the module on a frame first")
+    if points.dim() != 3 or points.shape[0] != streams or points.shape[2] != 3:
+        raise ValueError(f"points must be [{streams}, N, 3], got {tuple(points.shape)}")
+    with full_precision(points.device):
+        local = points.detach()
+        if frame == "world":
+            T = invert_rigid(state.T_world_first)
+            local = apply(T[:, None, :3, :3], local.double()) + T[:, None, :3, 3]
+        dtype = torch.float64 if points.dtype == torch.float64 else torch.float32
+        result = regress(with_measured_share(state.mixture), local.to(dtype), config)
+        result = set_unmeasured(result, None, config)[0]
+        return replace(result, features=result.features[..., : config.features])

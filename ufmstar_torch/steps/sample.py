@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.frames.arguments import require_number, require_whole
-from ufmstar_torch.frames.output import MeanUncertainty, SampleStatistics, StepOutput
+from ufmstar_torch.frames.output import MeanUncertainty, SampleStatistics, UncertaintyOutput
 from ufmstar_torch.gaussians.fixed_order import total
-from ufmstar_torch.steps import unmeasured
+from ufmstar_torch.steps.regress import HALF
 
 _MAPS = ("variance", "disagreement", "aleatoric", "epistemic", "anchored", "depth")
 
@@ -31,28 +31,23 @@ class SampleKernels(NamedTuple):
 
 
 def mean_uncertainty(
-    out: StepOutput,
-    maps: Mapping[str, Tensor | None],
-    depth: Tensor,
-    index: Tensor,
+    out: UncertaintyOutput,
     used: Tensor,
     statistics: Callable[[Tensor], SampleStatistics] | None = None,
 ) -> MeanUncertainty:
     """Averages of V, M, A, E and B over the sampled pixels.
 
     Args:
-        out: of the step on the sample [B, n].
-        maps: [B, n] the variance and its parts, by name; None = no statistics.
-        depth: [B, H, W] of the image [m].
-        index: [B, n] of the sampled pixels in the flattened image.
+        out: at the sampled pixels [B, n].
         used: [B, n] True for the pixels to average.
         statistics: an implementation of :func:`sample_statistics` for values without a graph.
     """
-    maps = {**maps, "depth": torch.gather(depth.flatten(1), 1, index)}
-    sampled = {name: torch.where(used, value, torch.nan) for name in _MAPS if (value := maps.get(name)) is not None}
-    values = torch.stack(list(sampled.values()))
+    maps = {**out.maps, "depth": out.depth, "variance": out.variance}
+    sampled = {name: value for name in _MAPS if (value := maps.get(name)) is not None}
+    values = torch.where(used, torch.stack(list(sampled.values())), torch.nan)
     each = sample_statistics(values) if statistics is None or values.requires_grad else statistics(values)
-    by_map = {name: SampleStatistics(*(value[i] for value in vars(each).values())) for i, name in enumerate(sampled)}
+    columns = zip(*(value.unbind() for value in vars(each).values()), strict=True)
+    by_map = dict(zip(sampled, (SampleStatistics(*column) for column in columns), strict=True))
     count, variance = used.sum(1), by_map["variance"]
     # finite population correction: a sample of all pixels has no error
     unsampled = 1 - count / out.statistics.valid_pixels.clamp_min(1)
@@ -64,7 +59,7 @@ def mean_uncertainty(
         anchored=by_map.get("anchored"),
         depth=by_map["depth"],
         standard_error=(variance.variance / variance.pixels * unsampled).sqrt(),
-        measured=((out.measured >= unmeasured.HALF) & used).sum(1) / count,
+        measured=((out.measured >= HALF) & used).sum(1) / count,
         statistics=out.statistics,
     )
 

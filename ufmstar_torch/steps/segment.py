@@ -16,15 +16,22 @@ from torch import Tensor
 from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.steps.segment_fusion import GAUSSIAN_WIDTH, Gaussian, append, fuse_segments, parts, reads_are_free
-from ufmstar_torch.steps.segment_input import SegmentInput
 from ufmstar_torch.steps.segment_scanline import Frame, Segments, scanlines
 
 
 @torch.no_grad()
-def segment(inputs: SegmentInput) -> tuple[GaussianMixture, Tensor]:
+def segment(
+    depth: Tensor, intrinsics: Tensor, limits: SPGFConfig, features: Tensor | None = None
+) -> tuple[GaussianMixture, Tensor]:
     """Fit Gaussians to the surfaces of B depth maps, in float64.
 
     Not differentiable. Does not synchronise with an accelerator: there, loops and tables have static bounds.
+
+    Args:
+        depth: [B, H, W] [m], float32 or float64; pixels outside (0, ``limits.depth_limit``] are ignored.
+        intrinsics: [B, 3, 3] [px], centre of the first pixel at (0, 0).
+        limits: thresholds for H x W (``SPGFConfig.scaled_to``).
+        features: [B, F, H, W], averaged over the pixels of each Gaussian, or None.
 
     Returns:
         The mixture [B, K] in the camera frame in order of emission: sample covariance (divisor N - 1; zeros for N = 1;
@@ -32,21 +39,25 @@ def segment(inputs: SegmentInput) -> tuple[GaussianMixture, Tensor]:
         largest number of Gaussians of any stream, at least 1; on an accelerator, :func:`max_gaussians`.
         Labels [B, H, W] int64: each pixel's slot, -1 = none.
     """
-    frame = Frame.of(inputs)
+    frame = Frame.of(depth, intrinsics, limits)
     segments = scanlines(frame)
-    return _output(frame, segments, *fuse_segments(frame, segments))
+    table, labels = _output(frame, segments, *fuse_segments(frame, segments))
+    return _mixture(table, labels, features, depth.dtype), labels
 
 
 def _output(
     frame: Frame, segments: Segments, emitted: Tensor, count: Tensor, member: Tensor
-) -> tuple[GaussianMixture, Tensor]:
-    """Prune the Gaussians, and assemble the mixture and the labels."""
-    inputs = frame.inputs
+) -> tuple[Gaussian, Tensor]:
+    """Prune the Gaussians: those that stay [B, K], and the labels [B, H, W]."""
     total = emitted.shape[1]
     g = parts(emitted)
     exists = torch.arange(total, device=count.device) < count[:, None]
-    retained = exists & _keeps(g.n[..., 0], g.merged[..., 0], inputs.config)
-    capacity = max(1, int(retained.sum(1).max())) if reads_are_free(count.device) else min(total, max_gaussians(inputs))
+    retained = exists & _keeps(g.n[..., 0], g.merged[..., 0], frame.limits)
+    capacity = (
+        max(1, int(retained.sum(1).max()))
+        if reads_are_free(count.device)
+        else min(total, max_gaussians(frame.limits, frame.height, frame.z.shape[1]))
+    )
     table = emitted.new_zeros(emitted.shape[0], capacity + 1, GAUSSIAN_WIDTH)
     append(table, torch.zeros_like(count), emitted, retained)
 
@@ -54,10 +65,10 @@ def _output(
     created = torch.where(exists, g.born[..., 0].to(torch.int64), total)
     slot = torch.where(retained, retained.cumsum(1) - 1, -1)
     slot_of = slot.new_zeros(slot.shape[0], total + 1).scatter(1, created, slot)
-    segment = segments.pixel.view(inputs.depth.shape)
+    segment = segments.pixel.view(len(count), frame.height, -1)
     gaussian = member.gather(2, segment.clamp_min(0)).flatten(1).clamp_min(0)
     labels = torch.where(segment < 0, -1, slot_of.gather(1, gaussian).view_as(segment))
-    return _mixture(parts(table[:, :capacity]), labels, inputs), labels
+    return parts(table[:, :capacity]), labels
 
 
 def _keeps(pixels: Tensor, merged: Tensor, limits: SPGFConfig) -> Tensor:
@@ -69,26 +80,22 @@ def _keeps(pixels: Tensor, merged: Tensor, limits: SPGFConfig) -> Tensor:
     return large | tall if limits.prune == "both" else large & tall
 
 
-def max_gaussians(inputs: SegmentInput) -> int:
-    """Most Gaussians of an image that survive pruning, by the least number of pixels of each."""
-    _, height, width = inputs.depth.shape
-    limits = inputs.config
+def max_gaussians(limits: SPGFConfig, height: int, width: int) -> int:
+    """Most Gaussians of an image of height x width that survive pruning, by the least number of pixels of each."""
     by_rows = limits.min_rows * (limits.sparse + 1)  # pixels of min_rows segments
     least = {"none": 1, "both": min(limits.min_pixels, by_rows), "either": max(limits.min_pixels, by_rows)}
     return max(1, height * width // least[limits.prune])
 
 
-def _mixture(g: Gaussian, labels: Tensor, inputs: SegmentInput) -> GaussianMixture:
+def _mixture(g: Gaussian, labels: Tensor, features: Tensor | None, dtype: torch.dtype) -> GaussianMixture:
     n = g.n[..., 0]
     covariance = torch.where(g.n > 1, g.scatter / (g.n - 1).clamp_min(1.0), 0)
     xx, xy, xz, yy, yz, zz = covariance.unbind(-1)
     full = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).unflatten(-1, (3, 3))
-    features = n.new_zeros(*n.shape, 0)
-    if inputs.features is not None:
-        features = _feature_means(inputs.features.to(n.dtype), labels, n)
-    empty = GaussianMixture.empty(*n.shape, dtype=inputs.depth.dtype, device=n.device)
-    fields = {"mean": g.mean, "covariance": full, "weight": n, "features": features}
-    return empty.replace(**{name: value.to(inputs.depth.dtype) for name, value in fields.items()})
+    means = n.new_zeros(*n.shape, 0) if features is None else _feature_means(features.to(n.dtype), labels, n)
+    empty = GaussianMixture.empty(*n.shape, dtype=dtype, device=n.device)
+    fields = {"mean": g.mean, "covariance": full, "weight": n, "features": means}
+    return empty.replace(**{name: value.to(dtype) for name, value in fields.items()})
 
 
 def _feature_means(features: Tensor, labels: Tensor, n: Tensor) -> Tensor:

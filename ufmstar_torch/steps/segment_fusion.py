@@ -10,7 +10,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ufmstar_torch.steps.segment_input import SegmentInput
 from ufmstar_torch.steps.segment_scanline import Frame, OpenSegment, Segments
 
 
@@ -44,8 +43,8 @@ def _lift(frame: Frame, segments: Segments) -> Tensor:
     mean_x, mean_z = s.x_left + s.dx / n, s.z_left + s.dz / n
     xx, xz, zz = s.dxx - s.dx * s.dx / n, s.dxz - s.dx * s.dz / n, s.dzz - s.dz * s.dz / n
     none = torch.zeros_like(s.n)
-    b, height, _ = frame.inputs.depth.shape
-    row = torch.arange(height, device=n.device).repeat(b).to(n)[:, None, None].expand_as(n)
+    height = frame.height
+    row = torch.arange(height, device=n.device).repeat(len(n) // height).to(n)[:, None, None].expand_as(n)
     return torch.cat(
         Gaussian(
             mean=torch.cat([mean_x, ry * mean_z, mean_z], -1),
@@ -75,9 +74,10 @@ def fuse_segments(frame: Frame, segments: Segments) -> tuple[Tensor, Tensor, Ten
         The emitted Gaussians [B, G, 25] in order, their number [B], and the index, in order of creation, of each
         segment's Gaussian [B, H, M].
     """
-    b, height, _ = frame.inputs.depth.shape
-    present = segments.count.view(b, height)
-    trips, wide, total = _trip_counts(frame.inputs, present)
+    height = frame.height
+    present = segments.count.view(-1, height)
+    b = len(present)
+    trips, wide, total = _trip_counts(frame, present)
     lifted = _lift(frame, segments).view(b, height, -1, GAUSSIAN_WIDTH)[:, :, :wide]
     slot = torch.arange(wide, device=present.device)
     nothing = present.new_zeros(b)
@@ -108,15 +108,14 @@ def reads_are_free(device: torch.device) -> bool:
     return device.type == "cpu"
 
 
-def _trip_counts(inputs: SegmentInput, present: Tensor) -> tuple[list[int], int, int]:
+def _trip_counts(frame: Frame, present: Tensor) -> tuple[list[int], int, int]:
     """Number of segments to visit in each row, its maximum, and the largest number of Gaussians of any stream.
 
     Read from the data on the CPU; static bounds elsewhere (:func:`reads_are_free`).
     """
-    height = inputs.depth.shape[1]
     if not reads_are_free(present.device):
-        most = inputs.segments_per_row
-        return [most] * height, most, most * height
+        most = frame.limits.segments_per_row(frame.z.shape[1])
+        return [most] * frame.height, most, most * frame.height
     trips = present.amax(0).tolist()
     return trips, max(1, *trips), max(1, int(present.sum(1).max()))
 
@@ -165,7 +164,7 @@ def _best_overlap(o: Gaussian, exists: Tensor, h: Gaussian) -> tuple[Tensor, Ten
 
 def _same_plane(o: Gaussian, h: Gaussian, frame: Frame) -> Tensor:
     """[B, 1] True where segment h continues the surface of Gaussian o."""
-    limits = frame.inputs.config
+    limits = frame.limits
     reach = frame.lengths2.gather(1, o.nearest[..., 0].to(torch.int64))
     (hx, _, hz), (ox, oy, oz) = h.l.unbind(-1), o.l.unbind(-1)
     dot = hx * ox + hz * oz

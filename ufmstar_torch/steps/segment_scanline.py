@@ -14,7 +14,6 @@ from torch import Tensor
 
 from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.gaussians.camera import focal_and_centre
-from ufmstar_torch.steps.segment_input import SegmentInput
 
 
 class OpenSegment(NamedTuple):
@@ -41,7 +40,8 @@ class OpenSegment(NamedTuple):
 class Frame:
     """The images as R = B H rows [R, W] in float64, 0 where a pixel is ignored."""
 
-    inputs: SegmentInput
+    limits: SPGFConfig  # for images of this size
+    height: int
     z: Tensor
     use: Tensor
     rx: Tensor  # [R, W] and [R, 1], the rays
@@ -51,38 +51,36 @@ class Frame:
     lengths2: Tensor  # [B, bins] [m^2]
 
     @classmethod
-    def of(cls, inputs: SegmentInput) -> Frame:
+    def of(cls, depth: Tensor, intrinsics: Tensor, limits: SPGFConfig) -> Frame:
         dtype = torch.float64
-        b, height, width = inputs.depth.shape
-        limits = inputs.config
-        z = inputs.depth.to(dtype)
+        b, height, width = depth.shape
+        z = depth.to(dtype)
         use = (z > 0) & (z <= limits.depth_limit)
         z = torch.where(use, z, 0)
-        K = inputs.intrinsics.to(dtype)
+        K = intrinsics.to(dtype)
         fx, fy, cx, cy = focal_and_centre(K)
         rx = (torch.arange(width, dtype=dtype, device=z.device) - cx[:, None]) / fx[:, None]
         ry = (torch.arange(height, dtype=dtype, device=z.device) - cy[:, None]) / fy[:, None]
-        lengths, edges = _depth_bins(inputs, 0.5 * torch.minimum(width / fx, height / fy))
+        lengths, edges = _depth_bins(limits, 0.5 * torch.minimum(width / fx, height / fy))
         # On an accelerator, NaN in the intrinsics is not rejected here (that would synchronise): clamp the index.
-        bins = torch.searchsorted(edges, z.reshape(b, -1)).clamp_max(inputs.depth_bins - 1)
+        bins = torch.searchsorted(edges, z.reshape(b, -1)).clamp_max(limits.depth_bins - 1)
         return cls(
-            inputs, z.reshape(-1, width), use.reshape(-1, width),
+            limits, height, z.reshape(-1, width), use.reshape(-1, width),
             rx.repeat_interleave(height, 0), ry.reshape(-1, 1), limits.slope(torch.minimum(fx, fy))[:, None],
             bins.reshape(-1, width), lengths * lengths,
         )  # fmt: skip
 
     def per_row(self, value: Tensor) -> Tensor:
         """[B, ...] to [R, ...]."""
-        return value.repeat_interleave(self.inputs.depth.shape[1], 0)
+        return value.repeat_interleave(self.height, 0)
 
 
-def _depth_bins(inputs: SegmentInput, s: Tensor) -> tuple[Tensor, Tensor]:
+def _depth_bins(limits: SPGFConfig, s: Tensor) -> tuple[Tensor, Tensor]:
     """Lengths and far edges [B, bins] of the depth bins [m]; edges may lie beyond max_depth."""
-    limits = inputs.config
     length = torch.full_like(s, limits.min_gaussian_length)
     edge = torch.zeros_like(s)
     lengths, edges = [], []
-    for _ in range(inputs.depth_bins):
+    for _ in range(limits.depth_bins):
         edge = edge + length
         lengths.append(length)
         edges.append(edge)
@@ -121,7 +119,7 @@ class _Column:
 
 
 def _columns(frame: Frame) -> Iterator[_Column]:
-    limits = frame.inputs.config
+    limits = frame.limits
     t = frame.per_row(frame.slope) * frame.z * frame.z
     maps = {
         "x": frame.rx * frame.z,
@@ -141,13 +139,13 @@ def scanlines(frame: Frame) -> Segments:
 
     ``queue`` [R, max_open, 15] holds the open segments, newest first; an empty entry has n = 0.
     """
-    limits = frame.inputs.config
+    limits = frame.limits
     rows, width = frame.z.shape
     y_factor = 1.0 + frame.ry * frame.ry
     queue = frame.z.new_zeros(rows, limits.max_open, len(OpenSegment._fields))
     started = frame.z.new_zeros(rows, 1)
     owner = torch.full_like(frame.bins, -1)
-    done = _Finished(frame.z, frame.inputs.segments_per_row, limits.sparse)
+    done = _Finished(frame.z, limits.segments_per_row(width), limits.sparse)
     for p in _columns(frame):
         fits = _fits(OpenSegment(*queue.unbind(-1)), p, limits)
         start = p.use & ~fits.any(-1, keepdim=True)

@@ -4,30 +4,70 @@ The mixture is stored in the frame of each stream's first camera. Poses are conv
 world coordinates never reach the float32 state, and components that a frame does not update never change.
 
 ``UfMStar`` calls a :class:`Step`; :func:`step` is the reference. Its kernels can be replaced individually
-(``step_parts``); another implementation of the whole step has the same signature.
+(:class:`Kernels`); another implementation of the whole step has the same signature.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from ufmstar_torch.anchors import learn as anchors
-from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.config import SPGFConfig, UfMStarConfig
 from ufmstar_torch.frames.frame import FrameInput
-from ufmstar_torch.frames.output import FrameStatistics, StepOutput
+from ufmstar_torch.frames.output import FrameStatistics, UncertaintyOutput
+from ufmstar_torch.gaussians import gaussian
 from ufmstar_torch.gaussians.camera import focal_and_centre, relative_pose
 from ufmstar_torch.gaussians.gaussian import pixel_footprint, storage_floor
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.gaussians.state import UfMStarState
-from ufmstar_torch.steps import fuse, regress, unmeasured
+from ufmstar_torch.steps import correspond, fuse, regress, segment
 from ufmstar_torch.steps.correspond import Correspondence
 from ufmstar_torch.steps.disagree import with_overlap_disagreement
-from ufmstar_torch.steps.segment_input import SegmentInput
-from ufmstar_torch.steps.step_parts import REFERENCE, Kernels, StepObserver
+from ufmstar_torch.steps.regress import Regression
+
+
+class StepObserver(Protocol):
+    """Receives the end of each stage of a step, to time it; it changes no result."""
+
+    def stage(self, name: str) -> None:
+        """Called at the end of a stage: check, segment, correspond, fuse, append, regress or average, in this order.
+
+        Work between two kernels belongs to the later stage. segment: SPGF and the floor of its covariances.
+        correspond: the transformation of the mixture into the camera frame, and the matching. fuse: the disagreement of
+        overlaps, the transformation of the segments into the first camera's frame, growth, and the fusion. append: the
+        new components, the transformation of the mixture into the camera frame, and the columns of anchors. regress:
+        the regression. average: the moving average, statistics and the new state. The caller of the step ends "check".
+        """
+        ...
+
+
+# C_i in the camera frame, and labels [B, H, W].
+SegmentKernel = Callable[[Tensor, Tensor, SPGFConfig, Tensor | None], tuple[GaussianMixture, Tensor]]
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """The replaceable parts of :func:`step`. Signatures as in ``REFERENCE``; all inputs are checked."""
+
+    spgf: SegmentKernel  # step 2, without a floor
+    floor_covariance: Callable[[Tensor, Tensor], Tensor]
+    correspond: Callable[[GaussianMixture, GaussianMixture, Tensor, tuple[int, int], UfMStarConfig], Correspondence]
+    fuse: Callable[..., GaussianMixture]
+    regress_image: Callable[..., Regression]
+
+
+REFERENCE = Kernels(
+    spgf=segment.segment,
+    floor_covariance=gaussian.floor_covariance,
+    correspond=correspond.correspond,
+    fuse=fuse.fuse,
+    regress_image=regress.regress_image,
+)
 
 
 class Step(Protocol):
@@ -42,7 +82,7 @@ class Step(Protocol):
         pixels: Tensor | None = None,
         smooth: bool = True,
         observer: StepObserver | None = None,
-    ) -> tuple[UfMStarState, StepOutput]: ...
+    ) -> tuple[UfMStarState, UncertaintyOutput]: ...
 
 
 def step(
@@ -55,7 +95,7 @@ def step(
     observer: StepObserver | None = None,
     kernels: Kernels = REFERENCE,
     grow: bool = True,
-) -> tuple[UfMStarState, StepOutput]:
+) -> tuple[UfMStarState, UncertaintyOutput]:
     """Segment, correspond, fuse, regress (section "Uncertainty from Motion*", steps 2 to 5).
 
     Args:
@@ -69,7 +109,8 @@ def step(
         grow: whether the mixture may get more slots; False: the caller has provided enough.
 
     Returns:
-        The new state and the output. For a stream with a faulty frame, the state is unchanged and the output is NaN.
+        The new state, and the output with the variance M, or M + B with anchors; without A and E. For a stream with a
+        faulty frame, the state is unchanged and the output is NaN.
     """
     stage = unobserved if observer is None else observer.stage
     fine = frame.fault == 0
@@ -78,87 +119,91 @@ def step(
     current_cam = _segment(frame, config, kernels, state.covariance.dtype)
     stage("segment")
 
-    mixture = state.mixture
-    R_cam, t_cam = relative_pose(first, frame.T_world_cam)
-    previous_cam = mixture.to(torch.float64).rigid(R_cam, t_cam)
+    to_camera, to_first = relative_pose(first, frame.T_world_cam), relative_pose(frame.T_world_cam, first)
+    previous_cam = state.mixture.to(torch.float64).rigid(*to_camera)
     pairs = kernels.correspond(previous_cam, current_cam, frame.intrinsics, frame.size, config)
     stage("correspond")
 
     if config.disagreement == "overlap":
         pairs = with_overlap_disagreement(pairs, previous_cam, current_cam)
-    matched = pairs.match.any(dim=2)
     # A Gaussian nearer than the near plane is not appended: it could never be matched.
     far_enough = current_cam.mean[..., 2] > config.near_plane
-    new = current_cam.valid & far_enough & ~matched
-    current_first = current_cam.rigid(*relative_pose(frame.T_world_cam, first))
-    needed, rounds = _room(mixture, pairs, new, config, grow)
-    mixture = mixture.grown(needed, config.max_components)
-    centre = relative_pose(frame.T_world_cam, first)[1]
-    member = torch.zeros_like(centre[:, 0]) if frame.member is None else frame.member
-    view = torch.cat([centre, member[:, None]], 1)
+    new = current_cam.valid & far_enough & ~pairs.match.any(2)
+    current_first, view = current_cam.rigid(*to_first), _view(frame, to_first[1])
+    needed, rounds = _room(state.mixture, pairs, new, config, grow)
+    mixture = state.mixture.grown(needed, config.max_components)
     mixture = kernels.fuse(mixture, current_first, pairs.padded(mixture.capacity), view, config, rounds=rounds)
     stage("fuse")
 
     sums, limit, gone = dict(state.by_component), config.max_components, torch.zeros_like(state.frames)
     if limit is not None and needed >= limit:
-        mixture, sums, _, gone = fuse.make_room(mixture, sums, mixture.components, new.sum(1), centre, limit)
-    mixture, dropped = fuse.append(mixture, current_first, new, view, config)
-    mixture_cam = mixture.to(torch.float64).rigid(R_cam, t_cam)
+        mixture, sums, _, gone = fuse.make_room(mixture, sums, mixture.components, new.sum(1), to_first[1], limit)
+    mixture, without_slot = fuse.append(mixture, current_first, new, view, config)
+    mixture_cam = mixture.to(torch.float64).rigid(*to_camera)
     learnt = None
     if config.anchors is not None:
         learnt = anchors.learn({**state.by_stream, **sums}, mixture_cam, frame, config, regress.distribute)
-        columns = learnt.beyond.to(mixture_cam.features.dtype)
-        mixture_cam = mixture_cam.replace(features=torch.cat([mixture_cam.features, columns], -1))
-    mixture_cam = unmeasured.before_regression(mixture_cam)
     stage("append")
 
-    result = kernels.regress_image(mixture_cam, frame.depth, frame.intrinsics, frame.valid, config, pixels)
-    at_pixels = regress.at_pixels(frame.depth, pixels)
-    result, measured = unmeasured.after_regression(result, at_pixels, config, frame.informative)
-    features, residual = result.features, None
-    if learnt is not None:
-        features, columns = features.split([features.shape[-1] - anchors.COLUMNS, anchors.COLUMNS], -1)
-        residual = learnt.residual(columns)
+    maps, residual = _regress(mixture_cam, frame, config, kernels, pixels, learnt)
     stage("regress")
 
+    smoothed = state.smoothed
+    if smooth and config.ema_alpha < 1.0:
+        smoothed, maps["disagreement"] = regress.moving_average(
+            smoothed, maps["disagreement"], frame.size, config.ema_alpha, pixels
+        )
     counts = {
         "components": mixture.components,
         "segments": current_cam.components,
-        "matched": matched.sum(1),
+        "matched": pairs.match.any(2).sum(1),
         "pairs": pairs.match.sum((1, 2)),
-        "new": new.sum(1) - dropped,
-        "dropped": gone + dropped + (current_cam.valid & ~far_enough).sum(1),
+        "new": new.sum(1) - without_slot,
+        "dropped": gone + without_slot + (current_cam.valid & ~far_enough).sum(1),
         "valid_pixels": frame.valid.sum((1, 2)),
-        "unmeasured": (measured < unmeasured.HALF).flatten(1).sum(1),
+        "unmeasured": (maps["measured"] < regress.HALF).flatten(1).sum(1),
         "single_view": (mixture.valid & (mixture.views == 0)).sum(1),
     }
-    disagreement, smoothed = result.disagreement, state.smoothed
-    if smooth and config.ema_alpha < 1.0:
-        smoothed, disagreement = regress.moving_average(smoothed, disagreement, frame.size, config.ema_alpha, pixels)
     of_anchors = {} if learnt is None else learnt.tensors()
     updated = state.with_tensors({
         **mixture.tensors(), **sums, **of_anchors, "T_world_first": first, "started": state.started | fine,
         "frames": state.frames + fine, "skipped": state.skipped + ~fine, "smoothed": smoothed,
     })  # fmt: skip
-    statistics = frame_statistics(frame, counts, learnt)
-    out = StepOutput(disagreement, features, measured, residual, current_cam, statistics)
+    out = step_output(frame, maps, residual, pixels, current_cam, counts, learnt)
     stage("average")
     return updated, out
 
 
-def frame_statistics(
-    frame: FrameInput, counts: Mapping[str, Tensor], learnt: anchors.Learnt | None = None
-) -> FrameStatistics:
-    """The statistics of a frame: ``counts`` from the step, the others from the check of the frame and its anchors."""
-    of_anchors: dict[str, Any] = {} if learnt is None else anchors.counts(frame.anchors, learnt.used)
-    return FrameStatistics(
-        **counts,
-        **of_anchors,
-        beyond=frame.beyond,
-        out_of_range=frame.out_of_range,
-        fault=frame.fault,
-        rotation_deviation=frame.rotation_deviation,
-    )
+def step_output(
+    frame: FrameInput,
+    maps: dict[str, Tensor],
+    residual: Tensor | None,
+    pixels: Tensor | None,
+    current_cam: GaussianMixture,
+    counts: Mapping[str, Tensor],
+    learnt: anchors.Learnt | None = None,
+) -> UncertaintyOutput:
+    """The output of a step from its maps, and from the check of the frame and its anchors.
+
+    Args:
+        frame: of B streams.
+        maps: "disagreement", "measured" and "features" of every pixel, or at ``pixels``.
+        residual: [..., 2] the relative error r and its excess e that anchors let expect; None without anchors.
+        pixels: [B, n] indices into the flattened image, or None.
+        current_cam: C_i.
+        counts: of the step, by name.
+        learnt: from the anchors; None without.
+    """
+    depth, variance = regress.at_pixels(frame.depth, pixels), maps["disagreement"]
+    if residual is not None:
+        maps["bias"], excess = residual.unbind(-1)
+        contradiction = None if frame.anchors is None else frame.anchors.contradiction
+        maps["anchored"], variance = anchors.anchored_term(depth, excess, variance, contradiction)
+    checked = {name: getattr(frame, name) for name in ("beyond", "out_of_range", "fault", "rotation_deviation")}
+    of_anchors = {} if learnt is None else anchors.counts(frame.anchors, learnt.used)
+    statistics = FrameStatistics({**counts, **checked, **of_anchors})
+    valid = regress.at_pixels(frame.valid, pixels)
+    return UncertaintyOutput(depth, variance, valid, maps, statistics, current_cam=current_cam)
 
 
 def unobserved(name: str) -> None:
@@ -171,7 +216,8 @@ def _segment(frame: FrameInput, config: UfMStarConfig, kernels: Kernels, stored:
     SPGF's raw moments have no floor. Eigenvalues are raised to the variance across one pixel at that depth, (z/f)^2/12,
     and to the least value that survives rounding to the mixture's dtype ``stored``, as in the fusion.
     """
-    mixture = kernels.spgf(SegmentInput.of_frame(frame, config))[0].to(torch.float64)
+    limits = config.segment.scaled_to(*frame.size)
+    mixture = kernels.spgf(frame.informative_depth, frame.intrinsics, limits, frame.features)[0].to(torch.float64)
     fx, fy, _, _ = focal_and_centre(frame.intrinsics)
     # Gaussians nearer than the near plane are never matched; clamping z keeps their floor above zero.
     z = mixture.mean[..., 2].clamp_min(config.near_plane)
@@ -179,6 +225,31 @@ def _segment(frame: FrameInput, config: UfMStarConfig, kernels: Kernels, stored:
     floor = torch.maximum(floor, storage_floor(mixture.covariance, stored))
     floor = torch.where(mixture.valid, floor, torch.zeros_like(floor))  # an empty slot holds zeros
     return mixture.replace(covariance=kernels.floor_covariance(mixture.covariance, floor))
+
+
+def _view(frame: FrameInput, centre: Tensor) -> Tensor:
+    """[B, 4] the camera's centre [B, 3] in the first camera's frame [m], and the index of the network."""
+    member = torch.zeros_like(centre[:, 0]) if frame.member is None else frame.member
+    return torch.cat([centre, member[:, None]], 1)
+
+
+def _regress(
+    mixture_cam: GaussianMixture, frame: FrameInput, config: UfMStarConfig, kernels: Kernels, pixels: Tensor | None,
+    learnt: anchors.Learnt | None,
+) -> tuple[dict[str, Tensor], Tensor | None]:  # fmt: skip
+    """Step 5: the maps of :func:`step_output`, and the residual that anchors let expect, which is regressed with H."""
+    if learnt is not None:
+        columns = learnt.beyond.to(mixture_cam.features.dtype)
+        mixture_cam = mixture_cam.replace(features=torch.cat([mixture_cam.features, columns], -1))
+    mixture_cam = regress.with_measured_share(mixture_cam)
+    result = kernels.regress_image(mixture_cam, frame.depth, frame.intrinsics, frame.valid, config, pixels)
+    depth = regress.at_pixels(frame.depth, pixels)
+    result, measured = regress.set_unmeasured(result, depth, config, frame.informative)
+    features, residual = result.features, None
+    if learnt is not None:
+        features, columns = features.split([features.shape[-1] - anchors.COLUMNS, anchors.COLUMNS], -1)
+        residual = learnt.residual(columns)
+    return {"disagreement": result.disagreement, "measured": measured, "features": features}, residual
 
 
 def _room(

@@ -7,16 +7,15 @@ of V (``posterior.recalibrate``), the posterior (``posterior.update``) and mergi
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 from torch import Tensor
 
 from ufmstar_torch.anchors.confidence import after_frame as learn_confidence
-from ufmstar_torch.anchors.learn import anchored_term
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.frame import FrameInput
-from ufmstar_torch.frames.output import StepOutput
+from ufmstar_torch.frames.output import FrameStatistics, UncertaintyOutput
 from ufmstar_torch.gaussians.state import UfMStarState
 from ufmstar_torch.posterior.conformal import normal_where_missing
 from ufmstar_torch.posterior.correct import correct
@@ -42,46 +41,39 @@ def require_map(mapped: VarianceMap | None, config: UfMStarConfig) -> VarianceMa
     return mapped
 
 
-class NetworkVariances(NamedTuple):
-    """A and E at some pixels, of equal shape [m^2]; None = not predicted, or not added."""
-
-    aleatoric: Tensor | None
-    epistemic: Tensor | None
-
-
-def network_variances(frame: FrameInput, config: UfMStarConfig) -> NetworkVariances:
-    """A and E of a frame [B, H, W]."""
-    return NetworkVariances(
-        frame.aleatoric if config.add_aleatoric else None, frame.epistemic if config.add_epistemic else None
-    )
+def network_variances(frame: FrameInput, config: UfMStarConfig) -> tuple[Tensor | None, Tensor | None]:
+    """A and E of a frame [B, H, W] [m^2]; None = not predicted, or not added."""
+    A, E = frame.aleatoric, frame.epistemic
+    return A if config.add_aleatoric else None, E if config.add_epistemic else None
 
 
-def network_variances_at(
+def network_maps(
     frame: FrameInput, features: Tensor, config: UfMStarConfig, pixels: Tensor | None
-) -> NetworkVariances:
-    """A and E [B, H, W], or [B, n] at ``pixels``, whose regressed features are [..., F].
+) -> dict[str, Tensor]:
+    """A and E by name, as far as they are predicted and added: [B, H, W], or [B, n] at ``pixels``, whose regressed
+    features are [..., F].
 
     With ``config.variances_in_h`` the last three features are the mixture's A, E and weight share s; each of A and E is
     then its mean over the mixture plus (1 - s) times the pixel's own.
     """
-    values = [None if value is None else at_pixels(value, pixels) for value in network_variances(frame, config)]
+    pairs = zip(("aleatoric", "epistemic"), network_variances(frame, config), strict=True)
+    maps = {name: at_pixels(value, pixels) for name, value in pairs if value is not None}
     if config.variances_in_h:
         *means, explained = features[..., -3:].unbind(-1)
-        pairs = zip(values, means, strict=True)
-        values = [None if value is None else mean + (1 - explained) * value for value, mean in pairs]
-    return NetworkVariances(*values)
+        averaged = dict(zip(("aleatoric", "epistemic"), means, strict=True))
+        maps = {name: averaged[name] + (1 - explained) * value for name, value in maps.items()}
+    return maps
 
 
 def total_variance(
-    disagreement: Tensor, frame: FrameInput, out: StepOutput, config: UfMStarConfig, mapped: VarianceMap | None,
-    pixels: Tensor | None, factor: Tensor | None = None,
+    disagreement: Tensor, network: Mapping[str, Tensor], frame: FrameInput, config: UfMStarConfig,
+    mapped: VarianceMap | None, pixels: Tensor | None, factor: Tensor | None = None,
 ) -> Tensor:  # fmt: skip
-    """V of M, or of M + B, [m^2]: plus A and E, at least the floor, times ``factor``, mapped; NaN stays NaN. Gradients
-    flow to A and E. The arguments are those of :func:`corrected`."""
+    """V of M, or of M + B, [m^2]: plus A and E of ``network``, at least the floor, times ``factor``, mapped; NaN stays
+    NaN. Gradients flow to A and E. The other arguments are those of :func:`corrected`."""
     variance = disagreement
-    for value in network_variances_at(frame, out.features, config, pixels):
-        if value is not None:
-            variance = variance + value
+    for value in network.values():
+        variance = variance + value
     variance = variance.clamp_min(config.variance_floor) if config.variance_floor else variance
     if factor is not None:
         variance = variance * factor.to(variance.dtype)
@@ -91,31 +83,11 @@ def total_variance(
     return variance if mapped is None else mapped(variance)
 
 
-class Corrections(NamedTuple):
-    """The corrections of a frame.
-
-    Attributes:
-        state: after the frame.
-        disagreement: M + B at the pixels [m^2].
-        factor: h(c) at the pixels (``anchors.confidence``); None = 1.
-        maps: the maps of anchors and posterior by name (``output.MAPS``).
-        quantiles: [B, 3] of intervals, or None.
-        counts: further statistics by name.
-    """
-
-    state: UfMStarState
-    disagreement: Tensor
-    factor: Tensor | None
-    maps: dict[str, Tensor]
-    quantiles: Tensor | None
-    counts: dict[str, Tensor]
-
-
 def corrected(
-    state: UfMStarState, frame: FrameInput, out: StepOutput, config: UfMStarConfig, mapped: VarianceMap | None,
+    state: UfMStarState, frame: FrameInput, out: UncertaintyOutput, config: UfMStarConfig, mapped: VarianceMap | None,
     pixels: Tensor | None, merging: merge.MergeKernels | None = None,
-) -> Corrections:  # fmt: skip
-    """The corrections after a step.
+) -> tuple[UfMStarState, UncertaintyOutput, Tensor | None]:  # fmt: skip
+    """The corrections after a step, but for V itself, whose gradients are the caller's.
 
     Args:
         state, out: of the step.
@@ -124,21 +96,21 @@ def corrected(
         mapped: map of V, applied last, or None.
         pixels: [B, n] indices into the flattened image, or None = every pixel, which the posterior needs.
         merging: implementation of each part of merging; None = the reference.
+
+    Returns:
+        The state after the frame; the output, whose ``maps`` have the posterior's "depth" and "variance", too; and h(c)
+        at the pixels (``anchors.confidence``), None = 1.
     """
-    M, factor, quantiles = out.disagreement, None, None
-    maps, counts = dict[str, Tensor](), dict[str, Tensor]()
-    M_and_B = M
-    if out.residual is not None:
-        maps["bias"], excess = out.residual.unbind(-1)
-        contradiction = None if frame.anchors is None else frame.anchors.contradiction
-        maps["anchored"], M_and_B = anchored_term(at_pixels(frame.depth, pixels), excess, M, contradiction)
+    M, factor, quantiles = out.maps["disagreement"], None, None
+    network = network_maps(frame, out.maps["features"], config, pixels)
+    maps, counts = dict(out.maps), dict[str, Tensor]()
     if config.confidence is not None and frame.confidence is not None:
-        V = total_variance(M_and_B, frame, out, config, mapped, pixels) if pixels is None else None
+        V = total_variance(out.variance, network, frame, config, mapped, pixels) if pixels is None else None
         before = state.by_stream["confidence"]
         after, factor, counts["confidence"] = learn_confidence(before, frame, V, config.confidence)
         factor, state = at_pixels(factor, pixels), state.with_tensors({"confidence": after})
     if config.posterior is not None and pixels is None:
-        claimed = total_variance(M, frame, out, config, mapped, pixels, factor).detach()
+        claimed = total_variance(M, network, frame, config, mapped, pixels, factor).detach()
         learnt, posterior, of_posterior = correct(state.by_stream, frame, claimed, config)
         quantiles, state = posterior.pop("quantiles"), state.with_tensors(learnt)
         maps, counts = maps | posterior, counts | of_posterior
@@ -147,4 +119,8 @@ def corrected(
         counts |= merged
     if isinstance(mapped, Recalibration):
         quantiles = normal_where_missing(quantiles, M)
-    return Corrections(state, M_and_B, factor, maps, quantiles, counts)
+    return (
+        state,
+        replace(out, maps=maps, quantiles=quantiles, statistics=FrameStatistics({**out.statistics.counts, **counts})),
+        factor,
+    )

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.anchors.kernels.cholesky import factored, inverted, substituted
-from ufmstar_torch.kernels.compile_cpu import reordered
+from ufmstar_torch.kernels.compile_cpu import empty, reordered
 
 # Parameters of a pose's error: a rotation about the camera's axes [rad] and a shift along the world's [m].
 POSE = 6
@@ -98,7 +98,11 @@ def _adjust(
     by_poses,
 ):  # fmt: skip
     views, size = len(poses), len(b)
-    rotation, translation, to_view = np.empty((views - 1, 3, 3)), np.empty((views - 1, 3)), np.empty((views, 3, 3))
+    rotation, translation, to_view = (
+        empty((views - 1, 3, 3), np.float64),
+        empty((views - 1, 3), np.float64),
+        empty((views, 3, 3), np.float64),
+    )
     for step in range(steps):
         if step > 0:
             for k in range(views):
@@ -194,7 +198,7 @@ def _equations(ray, precision, rotation, translation, to_view, rho, prior, stude
     views = precision.shape[1]
     last = POSE * views
     # Derivatives of u and v (rows) by the newest pose and by view k's.
-    J, J_k, weighted = np.empty((2, POSE)), np.empty((2, POSE)), np.empty(h.shape)
+    J, J_k, weighted = empty((2, POSE), np.float64), empty((2, POSE), np.float64), empty(h.shape, np.float64)
     for n in range(len(ray)):
         x, y = ray[n, -1, 0], ray[n, -1, 1]
         row = h[n]

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.kernels.compile_cpu import reordered, reordered_leaf
+from ufmstar_torch.kernels.compile_cpu import empty, reordered, reordered_leaf
 
 # [px] Side of the compared windows, and offset of their first pixel from the centre.
 SIDE, FIRST = 8, -3.5
@@ -175,12 +175,12 @@ def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, con
     start, first_low, first_high, sigmas, least_score, least_rival, match = search
     height, width = image.shape
     flat = image.reshape(image.size)
-    corner, share = np.empty(WIDE * WIDE, np.uint32), np.empty((2, WIDE * WIDE), np.float32)
-    template, patch = np.empty(WIDE * WIDE, np.float32), np.empty(COUNT, np.float32)
-    along_u, along_v = np.empty(COUNT, np.float32), np.empty(COUNT, np.float32)
-    warp = np.empty(4)
-    rows, windows = np.empty((2, SIDE + 1), np.uint64), np.empty((LONGEST + 1, SIDE), np.uint64)
-    scores, best, out = np.empty(LONGEST + 1, np.float32), np.empty(4), np.empty(8)
+    corner, share = empty(WIDE * WIDE, np.uint32), empty((2, WIDE * WIDE), np.float32)
+    template, patch = empty(WIDE * WIDE, np.float32), empty(COUNT, np.float32)
+    along_u, along_v = empty(COUNT, np.float32), empty(COUNT, np.float32)
+    warp = empty(4, np.float64)
+    rows, windows = empty((2, SIDE + 1), np.uint64), empty((LONGEST + 1, SIDE), np.uint64)
+    scores, best, out = empty(LONGEST + 1, np.float32), empty(4, np.float64), empty(8, np.float64)
     for n in range(len(pixel)):
         u, v, weight = pixel[n, 0], pixel[n, 1], 0.0
         for k in range(len(keys)):

@@ -17,7 +17,7 @@ from ufmstar_torch.anchors.kernels.dense import (
     zncc,
 )
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
-from ufmstar_torch.kernels.compile_cpu import reordered
+from ufmstar_torch.kernels.compile_cpu import empty, reordered
 
 # Least ZNCC of a landmark's patch with an image that shows it.
 SHOWN = 0.8
@@ -33,9 +33,9 @@ def patches(image: NDArray[np.uint8], pixel: NDArray[np.float64]) -> NDArray[np.
 @reordered
 def _patches(image, pixel, out):
     height, width = image.shape
-    flat, template = image.reshape(image.size), np.empty(WIDE * WIDE, np.float32)
-    corner, share = np.empty(WIDE * WIDE, np.uint32), np.empty((2, WIDE * WIDE), np.float32)
-    along_u, along_v = np.empty(COUNT, np.float32), np.empty(COUNT, np.float32)
+    flat, template = image.reshape(image.size), empty(WIDE * WIDE, np.float32)
+    corner, share = empty(WIDE * WIDE, np.uint32), empty((2, WIDE * WIDE), np.float32)
+    along_u, along_v = empty(COUNT, np.float32), empty(COUNT, np.float32)
     for n in range(len(pixel)):
         if sampled(flat, width, height, pixel[n, 0], pixel[n, 1], 1.0, 0.0, 0.0, 1.0, corner, share, template):
             normalised(template, out[n], along_u, along_v)
@@ -78,10 +78,15 @@ def sight(
 @reordered
 def _sight(image, point, pose, sigma, patch, used, P, centre, K_inverse, pixel, depth, spread, shown):
     height, width = image.shape
-    flat, template = image.reshape(image.size), np.empty(WIDE * WIDE, np.float32)
-    corner, share = np.empty(WIDE * WIDE, np.uint32), np.empty((2, WIDE * WIDE), np.float32)
-    window = np.empty(COUNT, np.float32)
-    p, error, rotated, homography = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    flat, template = image.reshape(image.size), empty(WIDE * WIDE, np.float32)
+    corner, share = empty(WIDE * WIDE, np.uint32), empty((2, WIDE * WIDE), np.float32)
+    window = empty(COUNT, np.float32)
+    p, error, rotated, homography = (
+        empty(3, np.float64),
+        empty(3, np.float64),
+        empty((3, 3), np.float64),
+        empty((3, 3), np.float64),
+    )
     for n in np.flatnonzero(used):
         for i in range(3):
             p[i] = 0.0

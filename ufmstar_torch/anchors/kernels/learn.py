@@ -20,13 +20,13 @@ from ufmstar_torch.anchors.kernels.neighbours import grid, supported
 from ufmstar_torch.anchors.learn import Learnt
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.frame import AnchorInput, FrameInput
-from ufmstar_torch.kernels.compile_cpu import kernel, leaf, part
-from ufmstar_torch.kernels.cpu.arrays import array
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, part
+from ufmstar_torch.kernels.cpu.calls import array, each
 from ufmstar_torch.kernels.cpu.regress import Seen, View
 from ufmstar_torch.kernels.cpu.regress_cull import FIELDS, cull
 from ufmstar_torch.kernels.cpu.regress_vectors import TERMS, add_shares
 from ufmstar_torch.kernels.cpu.rigid import padded
-from ufmstar_torch.kernels.cpu.threads import each
+from ufmstar_torch.kernels.cpu.sample import folded
 
 _PER_CELL = 16  # mean number of anchors in a cell of the search for components
 _NEGLIGIBLE = 1e-30  # smaller means become 0, before single precision loses them
@@ -139,15 +139,20 @@ def _learn(
     width, memory, shrinkage, component, overall, used, beyond, stream,
 ):  # fmt: skip
     """One stream of N anchors and K components; only the components of ``view`` can explain a point."""
-    chosen = np.empty(valid.size, np.bool_)
-    rows, sums = np.empty((valid.size, 3)), np.zeros((component.shape[0], 3))
+    chosen = empty(valid.size, np.bool_)
+    rows, column = empty((valid.size, 3), np.float64), empty(valid.size, np.float64)
+    sums = empty((component.shape[0], 3), np.float64)
+    for k in range(component.shape[0]):
+        sums[k, 0] = sums[k, 1] = sums[k, 2] = 0.0
     supported(pixel, predicted, depth, variance, valid, chosen)
     used[0] = _rows(predicted, depth, variance, network_variance, chosen, rows)
     if valid.size > 0:
         _distribute(index, predicted, chosen, rows, K, width, view, sums)
     fade = memory if used[0] > 0 else 1.0
     for c in range(3):  # rounded to the state's dtype
-        overall[c] = fade * overall_before[c] + _folded(rows[:, c])
+        for i in range(valid.size):
+            column[i] = rows[i, c]
+        overall[c] = fade * overall_before[c] + folded(column)
     for c in range(2):
         stream[c] = np.float64(overall[c + 1]) / (np.float64(overall[0]) + shrinkage)
     for k in range(component.shape[0]):
@@ -161,22 +166,23 @@ def _learn(
     last = features.shape[1] - 1
     for k in range(features.shape[0]):
         features[k, last - 2], features[k, last - 1] = beyond[k, 0], beyond[k, 1]
-    for i in range(view[0].size):
-        k = view[0][i]
-        view[3][i, TERMS - 1], view[3][i, TERMS - 2] = beyond[k, 0], beyond[k, 1]
+    for i in range(view.slot.size):
+        k = view.slot[i]
+        view.terms[i, TERMS - 1], view.terms[i, TERMS - 2] = beyond[k, 0], beyond[k, 1]
 
 
 @part
 def _rows(predicted, depth, variance, network_variance, supported, rows):
     """Write w (1, r, e) [N, 3] of the anchors, 0 where not supported; return how many are used."""
     n = supported.size
-    squares, used, others = np.zeros(n), 0, -1
+    squares, terms, used, others = empty(n, np.float64), empty(n, np.float64), 0, -1
     for i in range(n):
+        squares[i] = terms[i] = 0.0
         if supported[i]:
             others += 1
             r = depth[i] / predicted[i] - 1
-            squares[i] = r * r
-    total = _folded(squares)
+            squares[i] = terms[i] = r * r
+    total = folded(terms)
     others = max(others, 0)
     for i in range(n):
         rows[i, 0] = rows[i, 1] = rows[i, 2] = 0.0
@@ -195,45 +201,29 @@ def _rows(predicted, depth, variance, network_variance, supported, rows):
 
 
 @part
-def _folded(values):
-    """The sum in the order of ``fixed_order.total``: of two halves, for a length rounded up to a power of two."""
-    n = values.size
-    if n == 0:
-        return 0.0
-    values = values.copy()
-    while n > 1:
-        half = 1
-        while 2 * half < n:
-            half *= 2
-        for i in range(half, n):
-            values[i - half] += values[i]
-        n = half
-    return values[0]
-
-
-@part
 def _distribute(index, predicted, chosen, rows, K, width, view, sums):
     """Add the rows [N, 3] of the chosen anchors to the components [K, 3] in proportion to their densities there.
 
     Components are culled for a cell of anchors as the regression culls them for a tile.
     """
     visible, fields, packed, _, settings = view
-    points, pixel = np.empty((chosen.size, 3)), np.empty((chosen.size, 2))
+    points, pixel = empty((chosen.size, 3), np.float64), empty((chosen.size, 2), np.float64)
     for i in range(chosen.size):
         u, v, z = np.float64(index[i] % width), np.float64(index[i] // width), predicted[i]
         pixel[i, 0], pixel[i, 1] = u, v
         points[i, 0], points[i, 1], points[i, 2] = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z
     start, order = grid(pixel, chosen, _PER_CELL)[4:]
     capacity = packed.shape[1]
-    retained, work = np.empty(visible.size, np.int64), np.empty(8 + capacity, packed.dtype)
-    near, density, added = np.empty((FIELDS, capacity)), np.empty(capacity), np.empty((3, capacity))
-    point, row = np.empty(3), np.empty(4)
-    row[3] = settings[0]
+    retained, work = empty(visible.size, np.int64), empty(8 + capacity, packed.dtype)
+    near, added = empty((FIELDS, capacity), np.float64), empty((3, capacity), np.float64)
+    density = empty(capacity, np.float64)
+    point, row = empty(3, np.float64), empty(4, np.float64)
+    row[3] = settings.prior_weight
     for cell in range(start.size - 1):
         if start[cell] == start[cell + 1]:
             continue
         box = _box(points, order, start[cell], start[cell + 1])
-        count = cull(packed, visible.size, settings[4], box, settings, work, retained)
+        count = cull(packed, visible.size, settings.among, box, settings, work, retained)
         n = padded(count)
         for i in range(count):
             for field in range(FIELDS):

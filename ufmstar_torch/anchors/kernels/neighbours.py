@@ -17,7 +17,7 @@ from ufmstar_torch.anchors.evidence import (
     SUPPORT,
     TIE,
 )
-from ufmstar_torch.kernels.compile_cpu import leaf, part
+from ufmstar_torch.kernels.compile_cpu import empty, leaf, part
 
 _PER_CELL = 3  # mean number of anchors in a cell
 
@@ -26,19 +26,23 @@ _PER_CELL = 3  # mean number of anchors in a cell
 def grid(pixel, chosen, mean_count):
     """Sort the chosen ones of N pixels [N, 2] into cells of about ``mean_count`` each: the grid's first corner and cell
     side [px], columns and rows, the start of each cell in the order [cells + 1], and the order."""
-    low, high, count = np.full(2, np.inf), np.full(2, -np.inf), 0
+    low, high, count = empty(2, np.float64), empty(2, np.float64), 0
+    low[0] = low[1] = np.inf
+    high[0] = high[1] = -np.inf
     for i in range(chosen.size):
         if chosen[i]:
             count += 1
             for j in range(2):
                 low[j], high[j] = min(low[j], pixel[i, j]), max(high[j], pixel[i, j])
     if count == 0:
-        low[:], high[:] = 0.0, 0.0
+        low[0] = low[1] = high[0] = high[1] = 0.0
     wide, tall, share = high[0] - low[0], high[1] - low[1], mean_count / max(count, 1)
     # The second term limits the number of cells to about that of anchors where they lie on a line.
     side = max(math.sqrt(wide * tall * share), max(wide, tall) * share, 1e-6)
     columns, rows = int(wide / side) + 1, int(tall / side) + 1
-    cell, start = np.empty(chosen.size, np.int64), np.zeros(columns * rows + 1, np.int64)
+    cell, start = empty(chosen.size, np.int64), empty(columns * rows + 1, np.int64)
+    for c in range(start.size):
+        start[c] = 0
     for i in range(chosen.size):
         if chosen[i]:
             column = min(int((pixel[i, 0] - low[0]) / side), columns - 1)
@@ -46,7 +50,9 @@ def grid(pixel, chosen, mean_count):
             start[cell[i] + 1] += 1
     for c in range(columns * rows):
         start[c + 1] += start[c]
-    next_free, order = start.copy(), np.empty(count, np.int64)
+    next_free, order = empty(start.size, np.int64), empty(count, np.int64)
+    for c in range(start.size):
+        next_free[c] = start[c]
     for i in range(chosen.size):
         if chosen[i]:
             order[next_free[cell[i]]] = i
@@ -66,17 +72,19 @@ def supported(pixel, predicted, depth, variance, valid, out):
         return
     count = min(NEIGHBOURS, n - 1)
     # In the order of the grid: pixel, tie-breaker, log g/d, and the variance of log g.
-    u, v, tie, ratio, noise = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    u, v, tie = empty(n, np.float64), empty(n, np.float64), empty(n, np.float64)
+    ratio, noise = empty(n, np.float64), empty(n, np.float64)
     for i in range(n):
         a = order[i]
         u[i], v[i], tie[i] = pixel[a, 0], pixel[a, 1], TIE * a
         ratio[i], noise[i] = math.log(depth[a] / predicted[a]), variance[a] / (depth[a] * depth[a])
-    neighbour, gap, distance = np.empty((n, count), np.int64), np.empty(n * count), np.empty(count)
+    neighbour, distance = empty((n, count), np.int64), empty(count, np.float64)
+    gap, reordered_gap = empty(n * count, np.float64), empty(n * count, np.float64)
     for i in range(n):
         _nearest(cells, u, v, tie, i, distance, neighbour[i])
         for j in range(count):
-            gap[i * count + j] = abs(ratio[i] - ratio[neighbour[i, j]])
-    sigma = _lower_quartile(gap.copy(), gap.size) / LOWER_QUARTILE
+            gap[i * count + j] = reordered_gap[i * count + j] = abs(ratio[i] - ratio[neighbour[i, j]])
+    sigma = _lower_quartile(reordered_gap, gap.size) / LOWER_QUARTILE
     for i in range(n):
         support = 0
         for j in range(count):

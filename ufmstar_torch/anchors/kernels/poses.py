@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ufmstar_torch.anchors.kernels.cholesky import factored, inverted
 from ufmstar_torch.anchors.kernels.dense import Views
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
-from ufmstar_torch.kernels.compile_cpu import reordered
+from ufmstar_torch.kernels.compile_cpu import empty, leaf, reordered
 
 # Rounds of Student-t weights, and their degrees of freedom.
 ROUNDS, STUDENT = 3, 4.0
@@ -57,9 +57,9 @@ def linearised(
 @reordered
 def _linearised(pixel, rho, along, slope, H, b, K, K_inverse, on_line, across):
     fx, fy = K[0, 0], K[1, 1]
-    change = np.empty((2, EACH))
+    change, R, t = empty((2, EACH), np.float64), empty((3, 3), np.float64), empty(3, np.float64)
     for k in range(len(H)):
-        R, t = K_inverse @ H[k] @ K, K_inverse @ b[k]
+        _rotated(H[k], b[k], K, K_inverse, R, t)
         for n in range(len(pixel)):
             x, y = (pixel[n, 0] - K[0, 2]) / fx, (pixel[n, 1] - K[1, 2]) / fy
             z = R[2, 0] * x + R[2, 1] * y + R[2, 2] + rho[n] * t[2]
@@ -84,6 +84,20 @@ def _linearised(pixel, rho, along, slope, H, b, K, K_inverse, on_line, across):
             for c in range(EACH):
                 across[n, k, c] = eu * change[1, c] - ev * change[0, c]
                 on_line[n, k, c] = eu * change[0, c] + ev * change[1, c] + slope[n, k] * across[n, k, c]
+
+
+@leaf
+def _rotated(H, b, K, K_inverse, R, t):
+    """Write R = K^-1 H K and t = K^-1 b; K and its inverse have the last row (0, 0, 1)."""
+    for i in range(3):
+        t[i] = K_inverse[i, 0] * b[0] + K_inverse[i, 1] * b[1] + K_inverse[i, 2] * b[2]
+        x, y, z = (
+            K_inverse[i, 0] * H[0, 0] + K_inverse[i, 1] * H[1, 0] + K_inverse[i, 2] * H[2, 0],
+            K_inverse[i, 0] * H[0, 1] + K_inverse[i, 1] * H[1, 1] + K_inverse[i, 2] * H[2, 1],
+            K_inverse[i, 0] * H[0, 2] + K_inverse[i, 1] * H[1, 2] + K_inverse[i, 2] * H[2, 2],
+        )
+        R[i, 0], R[i, 1] = x * K[0, 0], x * K[0, 1] + y * K[1, 1]
+        R[i, 2] = x * K[0, 2] + y * K[1, 2] + z
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,22 +162,36 @@ def _solved(
     precision, right_side, error, covariance, mean_change, rho, residual, across_residual,
 ):  # fmt: skip
     count, views, _ = change.shape
-    mean, view_error = np.zeros(count), np.empty(EACH)
+    size = len(error)
+    mean, total, view_error = empty(count, np.float64), empty(count, np.float64), empty(EACH, np.float64)
+    A, r, by_view = empty((size, size), np.float64), empty(size, np.float64), empty((EACH, EACH), np.float64)
+    weighted = empty((count, size), np.float64)
     for iteration in range(ROUNDS):
-        A, r = precision.copy(), right_side.copy()
+        for i in range(size):
+            r[i] = right_side[i]
+            for j in range(size):
+                A[i, j] = precision[i, j]
         student = 0.0 if iteration == 0 else STUDENT
         _equations(
             *(change, value, weight, residual, across_change, across, across_weight, across_residual, student),
-            *(A, r, mean_change, mean),
+            *(A, r, mean_change, mean, total, by_view, weighted),
         )
         if not factored(A):
-            covariance[:] = np.nan
+            covariance[0, 0] = np.nan
             return
         inverted(A, covariance)
-        error[:] = covariance @ r
-        rho[:] = mean - mean_change @ error
+        for i in range(size):
+            error[i] = 0.0
+            for j in range(size):
+                error[i] += covariance[i, j] * r[j]
+        for n in range(count):
+            change_of_mean = 0.0
+            for i in range(size):
+                change_of_mean += mean_change[n, i] * error[i]
+            rho[n] = mean[n] - change_of_mean
         for k in range(views):
-            view_error[:POSE], view_error[POSE:] = error[POSE * k : POSE * (k + 1)], error[POSE * views :]
+            for c in range(EACH):
+                view_error[c] = error[POSE * (k if c < POSE else views - 1) + c]
             for n in range(count):
                 e, e_across = value[n, k] - rho[n], across[n, k]
                 for c in range(EACH):
@@ -175,17 +203,21 @@ def _solved(
 @reordered
 def _equations(
     change, value, weight, residual, across_change, across, across_weight, across_residual, student,
-    A, r, mean_change, mean,
+    A, r, mean_change, mean, total, by_view, weighted,
 ):  # fmt: skip
     """Add the pixels to the normal equations A d = r, and write the precision-weighted means over the views.
-    ``student`` = 0: weights without Student's t."""
+    ``student`` = 0: weights without Student's t. ``total``, ``by_view`` and ``weighted`` are buffers."""
     count, views, _ = change.shape
-    total, by_view = np.zeros(count), np.zeros((EACH, EACH))
-    mean[:] = 0
-    mean_change[:] = 0
+    size = len(r)
+    for n in range(count):
+        mean[n] = total[n] = 0.0
+        for i in range(size):
+            mean_change[n, i] = 0.0
     for k in range(views):
         first, camera = POSE * k, POSE * (views - 1)  # added to c: its index among the errors
-        by_view[:] = 0
+        for c in range(EACH):
+            for d in range(EACH):
+                by_view[c, d] = 0.0
         for n in range(count):
             w, a = weight[n, k], across_weight[n, k]
             if w == 0 and a == 0:
@@ -205,10 +237,22 @@ def _equations(
         for c in range(EACH):
             for d in range(c + 1):
                 A[c + (first if c < POSE else camera), d + (first if d < POSE else camera)] += by_view[c, d]
-    weighted = mean_change.copy()
     for n in range(count):
-        if total[n] > 0:
-            mean[n] /= total[n]
-            mean_change[n] /= total[n]
-    A -= weighted.T @ mean_change
-    r -= weighted.T @ mean
+        over = 1 / total[n] if total[n] > 0 else 0.0
+        mean[n] *= over
+        for i in range(size):
+            weighted[n, i] = mean_change[n, i]
+            mean_change[n, i] *= over
+            r[i] -= weighted[n, i] * mean[n]
+    whole = count - count % 4
+    for n in range(0, whole, 4):  # four pixels at a time: A is read and written once for them
+        for i in range(size):
+            one, two, three, four = weighted[n, i], weighted[n + 1, i], weighted[n + 2, i], weighted[n + 3, i]
+            for j in range(i + 1):
+                A[i, j] -= (one * mean_change[n, j] + two * mean_change[n + 1, j]) + (
+                    three * mean_change[n + 2, j] + four * mean_change[n + 3, j]
+                )
+    for n in range(whole, count):
+        for i in range(size):
+            for j in range(i + 1):
+                A[i, j] -= weighted[n, i] * mean_change[n, j]

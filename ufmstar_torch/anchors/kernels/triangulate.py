@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
-from ufmstar_torch.kernels.compile_cpu import kernel, part
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, part
 
 # From the rays' nearest point the reprojection error converges quadratically; three steps reach rounding on all but the
 # worst geometry, which the tests of parallax refuse anyway.
@@ -78,7 +78,11 @@ def _tracks(pixel, seen, to_image, to_ray, centre, damping, steps, point, covari
     """Pixels [N, W, 2] are counted from the principal point. ``to_image`` [W, 3, 3] takes an offset from a camera to
     (u z, v z, z) in its image, ``to_ray`` [W, 3, 3] a pixel (u, v, 1) to the direction of its ray."""
     views = seen.shape[1]
-    obs, work, inverse = np.empty((views, 3 * _LANES)), np.empty(14 * _LANES), np.empty((3, 3))
+    obs, work, inverse = (
+        empty((views, 3 * _LANES), np.float64),
+        empty(14 * _LANES, np.float64),
+        empty((3, 3), np.float64),
+    )
     for first in range(0, seen.shape[0], _LANES):
         count = min(_LANES, seen.shape[0] - first)
         for w in range(views):

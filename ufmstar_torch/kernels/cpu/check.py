@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ufmstar_torch.frames.frame import DEPTH_RANGE, FARTHEST, FOCAL_RANGE, LARGEST, FrameInput
 from ufmstar_torch.gaussians.camera import POLAR_STEPS
-from ufmstar_torch.kernels.cpu.arrays import array
+from ufmstar_torch.kernels.cpu.calls import array
 
 _Matrix = list[list[float]]
 _EYE3, _EYE4 = np.eye(3).tolist(), np.eye(4).tolist()

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
-from ufmstar_torch.steps.views import COMPLETE, LEAST
+from ufmstar_torch.kernels.compile_cpu import leaf
+from ufmstar_torch.steps.fuse import COMPLETE, LEAST
 
 _SWEEPS = 12  # an upper bound: the loops end when a sweep no longer rotates
 _NEGLIGIBLE = 16 * np.finfo(np.float64).eps
@@ -150,21 +150,9 @@ def floor_covariance(S, floor, work):
             S[j, i] = value
 
 
-@kernel
-def lift(mean, covariance, weight, near, focal, widening, epsilon):
-    """Lift the covariances of the occupied slots, which are the first ones, to the floor of a segment (``step``), in
-    place: the variance across one pixel, and ``epsilon`` times the trace for storage."""
-    work = empty(WORK, np.float64)
-    for n in range(weight.size):
-        if not weight[n] > 0:
-            break
-        S, across = covariance[n], max(mean[n, 2], near) / focal
-        floor_covariance(S, max(across * across * widening, epsilon * (S[0, 0] + S[1, 1] + S[2, 2])), work)
-
-
 @leaf
 def view_weight(mean, reference, view, baseline, near):
-    """w of a comparison of a component with a new view (``steps.views``); ``baseline`` 0 = the paper's 1."""
+    """w of a comparison of a component with a new view (``steps.fuse``); ``baseline`` 0 = the paper's 1."""
     if baseline == 0 or reference[3] != view[3]:
         return 1.0
     moved = reach = 0.0

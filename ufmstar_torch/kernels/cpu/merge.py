@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.kernels.compile_cpu import kernel, leaf
-from ufmstar_torch.kernels.cpu.arrays import array
+from ufmstar_torch.kernels.cpu.calls import array
 
 _FIRST_PAIRS = 8  # room for pairs per component, at first
 

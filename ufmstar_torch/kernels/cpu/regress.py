@@ -16,19 +16,15 @@ from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels.compile_cpu import contracted, kernel
-from ufmstar_torch.kernels.cpu.arrays import array
-from ufmstar_torch.kernels.cpu.regress_cull import in_view
+from ufmstar_torch.kernels.cpu.calls import array, each, shares_of_stream
+from ufmstar_torch.kernels.cpu.regress_cull import View, in_view
 from ufmstar_torch.kernels.cpu.regress_near import near
 from ufmstar_torch.kernels.cpu.regress_tiles import exact, exact_at
-from ufmstar_torch.kernels.cpu.threads import each, shares_of_stream
-from ufmstar_torch.steps.regress import Regression
-from ufmstar_torch.steps.unmeasured import HALF
+from ufmstar_torch.steps.regress import HALF, Regression
 
 # Share of the denominator that culling may leave out: about the rounding of a sum in the dtype, so that culling is no
 # coarser than the arithmetic itself.
 EPSILON = {torch.float32: 1e-6, torch.float64: 1e-14}
-
-View = tuple[Any, ...]  # what `in_view` returns
 
 
 class Seen(NamedTuple):
@@ -100,7 +96,7 @@ def regress_maps(
 def fill_and_smooth(
     disagreement: Tensor, measured: Tensor, depth: Tensor, memory: Tensor, config: UfMStarConfig, alpha: float
 ) -> tuple[Tensor, Tensor, list[int]]:
-    """``steps.unmeasured.after_regression`` and ``steps.regress.smooth`` in one pass.
+    """``steps.regress.set_unmeasured`` and ``steps.regress.smooth`` in one pass.
 
     Args:
         disagreement, measured, depth: at the pixels that are regressed, [B, H, W] or [B, n]; one dtype.

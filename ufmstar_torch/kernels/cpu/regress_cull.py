@@ -22,8 +22,10 @@ own rounding. tests/test_regress.py checks the bound.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
 from ufmstar_torch.kernels.cpu.regress_vectors import TERMS, bounds
@@ -38,20 +40,51 @@ _SCALE = math.sqrt(0.5 * _LOG2_E)
 WHITENED, PEAK = 7, 6
 
 
+class Settings(NamedTuple):
+    """Settings of the sum over the components in view.
+
+    Attributes:
+        prior_weight, prior_mean: of the prior.
+        epsilon: share of the denominator that culling may leave out.
+        least: log2 of the least threshold.
+        among: number of all components, of which the view has some.
+    """
+
+    prior_weight: float
+    prior_mean: float
+    epsilon: float
+    least: float
+    among: int
+
+
+class View(NamedTuple):
+    """The components that can matter in an image.
+
+    Attributes:
+        slot: [n] of the components in the mixture.
+        fields: [n, 10] mean, whitening and log2 of the peak.
+        packed: [10, n and more] the same by field, in the depth's dtype.
+        terms: [n, TERMS] of the sum, in the depth's dtype.
+        settings: of the sum.
+    """
+
+    slot: NDArray[np.int64]
+    fields: NDArray[np.float64]
+    packed: NDArray[np.floating]
+    terms: NDArray[np.floating]
+    settings: Settings
+
+
 @kernel
 def in_view(components, m, features, K, depth, farthest, prior_weight, prior_mean, epsilon):
-    """The components that can matter in an image, as :func:`exact` takes them.
+    """The components that can matter in an image, a :class:`View`.
 
     Args:
         components: in the camera's frame by field [13, n and more] (``rigid``).
         m, features: of the n components [n], [n, F].
         depth: [H, W], not positive where invalid.
         farthest: the largest depth.
-
-    Returns:
-        Indices [n], fields [n, 10], the same in the dtype of ``depth`` and by field [10, n and more], the terms of the
-        sum [n, TERMS], and the settings: prior weight and mean, epsilon, log2 of the least threshold, and the number of
-        all components.
+        prior_weight, prior_mean, epsilon: see :class:`Settings`.
     """
     height, width = depth.shape
     n = m.size
@@ -69,7 +102,7 @@ def in_view(components, m, features, K, depth, farthest, prior_weight, prior_mea
     left, top = (0 - K[0, 2]) / K[0, 0] * z, (0 - K[1, 2]) / K[1, 1] * z
     right, bottom = (width - 1 - K[0, 2]) / K[0, 0] * z, (height - 1 - K[1, 2]) / K[1, 1] * z
     box = min(left, 0.0), min(top, 0.0), 0.0, max(right, 0.0), max(bottom, 0.0), z
-    settings = prior_weight, prior_mean, epsilon, math.log2(_PRIOR * prior_weight), n
+    settings = Settings(prior_weight, prior_mean, epsilon, math.log2(_PRIOR * prior_weight), n)
     work = empty(8 + packed.shape[1], depth.dtype)
     # Blocks divide their threshold by n. A larger divisor makes this one lower in spite of rounding of the boxes.
     chosen = cull(packed, n, n + n // 64 + 1, box, settings, work, index)
@@ -77,7 +110,7 @@ def in_view(components, m, features, K, depth, farthest, prior_weight, prior_mea
     _terms(components, whitened, index, m, features, fields, constants)
     packed = empty((FIELDS, padded(chosen)), depth.dtype)
     _pack(components, whitened, index, chosen, packed)
-    return index[:chosen], fields, packed, constants, settings
+    return View(index[:chosen], fields, packed, constants, settings)
 
 
 @leaf
@@ -151,15 +184,14 @@ def cull(packed, n, level, box, settings, work, retained):
     and one for each component.
     """
     real = packed.dtype.type
-    epsilon, least = settings[2], settings[3]
     slack = 16 * (2.0**-23 if packed.itemsize == 4 else 2.0**-52)
     for i in range(3):
         centre, half = 0.5 * (box[i] + box[3 + i]), 0.5 * (box[3 + i] - box[i])
         work[i], work[3 + i] = centre, half + slack * (half + abs(centre))
-    work[6], work[7] = slack, least
+    work[6], work[7] = slack, settings.least
     upper = work[8:]
     bounds(packed, packed.shape[1], padded(n), work, upper)
-    threshold = work[7] + real(_limit(epsilon, level))
+    threshold = work[7] + real(_limit(settings.epsilon, level))
     count = 0
     for j in range(n):
         retained[count] = j

@@ -12,7 +12,10 @@ For a subset of the pixels, up to 64 pixels of a block form a tile.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from ufmstar_torch.kernels.compile_cpu import contracted, empty, kernel, leaf, part
 from ufmstar_torch.kernels.cpu.regress_cull import FIELDS, cull, pad
@@ -25,6 +28,63 @@ _BLOCK = TILE * _SIDE  # pixels
 _EVIDENCE, _TOTAL, _LAST = range(3)  # rows of a tile's sums and averages, as `mix` writes them, then further features
 
 
+class Tiles(NamedTuple):
+    """Scratch of the tiles of a block.
+
+    Attributes:
+        grid: [2, 64] rays of the pixels less the ray through the middle.
+        z: [64] depths of one tile.
+        points: [16, 192] points of each tile, from its origin.
+        boxes: [16, 9] box (low, high) and origin of each tile.
+        seen: [16] whether a tile has a pixel.
+        holes: [16, 64] NaN at the holes of each tile, else 0 (:func:`place_points`).
+        work: [10] the box of one tile, and the ray through its middle.
+    """
+
+    grid: NDArray[np.floating]
+    z: NDArray[np.floating]
+    points: NDArray[np.floating]
+    boxes: NDArray[np.float64]
+    seen: NDArray[np.bool_]
+    holes: NDArray[np.floating]
+    work: NDArray[np.floating]
+
+
+class Lists(NamedTuple):
+    """Scratch of the components that a block and a tile keep.
+
+    Attributes:
+        near: [10, n] fields of the block's.
+        work: [n + 8] of :func:`cull`.
+        in_block, in_tile: [n] indices.
+    """
+
+    near: NDArray[np.floating]
+    work: NDArray[np.floating]
+    in_block: NDArray[np.int64]
+    in_tile: NDArray[np.int64]
+
+
+class Sums(NamedTuple):
+    """Scratch of the sums at a tile.
+
+    Attributes:
+        start: [6] initial values of the sums, and the shifts.
+        offsets: [n, 3] whitened offsets of the origin from the components.
+        densities: [n, 64] of the components, for further features.
+        averages: [5, 64] evidence, M, and up to three features.
+        others: [F, 64] averages of further features.
+        values: [n] of one of them.
+    """
+
+    start: NDArray[np.floating]
+    offsets: NDArray[np.floating]
+    densities: NDArray[np.floating]
+    averages: NDArray[np.floating]
+    others: NDArray[np.floating]
+    values: NDArray[np.floating]
+
+
 @kernel
 def exact(depth, K, view, features, shift, out, out_f, first, shares):
     """Regress every ``shares``-th block of one stream, from block ``first`` on.
@@ -34,7 +94,7 @@ def exact(depth, K, view, features, shift, out, out_f, first, shares):
     before the last, of three or more.
     """
     tiles, lists, sums = _scratch(view, out_f.shape[0], shift)
-    grid = tiles[0]
+    grid = tiles.grid
     for i in range(PIXELS):
         grid[0, i] = (i % TILE - 0.5 * (TILE - 1)) / K[0, 0]
         grid[1, i] = (i // TILE - 0.5 * (TILE - 1)) / K[1, 1]
@@ -54,32 +114,21 @@ def exact_at(depth, K, pixels, view, features, shift, out, out_f):
 
 @part
 def _scratch(view, features, shift):
-    """Memory for the work on one block, of the n components in view, in the dtype of the maps.
-
-    Returns:
-        Scratch of tiles: rays of the pixels less the ray through the middle [2, 64], depths of one tile [64], points
-        [16, 192], boxes and origins [16, 9] in float64, the mask of tiles with a pixel, the holes of
-        :func:`place_points` [16, 64], and its box [10]. Scratch of lists of components: their fields, work of
-        :func:`cull`, and two lists. Scratch of sums at a tile: initial values [6], offsets and densities of components,
-        the sums [5, 64], averages of the other features, and values of one of them.
-    """
-    n, dtype, others = view[2].shape[1], view[2].dtype, features - _mixed(features)  # n is padded
-    tiles = (
+    """Memory for the work on one block, of the n components in view, in the dtype of the maps."""
+    n, dtype, others = view.packed.shape[1], view.packed.dtype, features - _mixed(features)  # n is padded
+    tiles = Tiles(
         empty((2, PIXELS), dtype), empty(PIXELS, dtype), empty((_TILES, 3 * PIXELS), dtype),
         empty((_TILES, 9), np.float64), empty(_TILES, np.bool_), empty((_TILES, PIXELS), dtype), empty(10, dtype),
     )  # fmt: skip
-    lists = empty((FIELDS, n), dtype), empty(n + 8, dtype), empty(n, np.int64), empty(n, np.int64)
-    start = empty(6, dtype)
-    start[_EVIDENCE], start[_TOTAL], start[_LAST], start[3] = view[4][0], view[4][0] * view[4][1], 0, TINY
+    lists = Lists(empty((FIELDS, n), dtype), empty(n + 8, dtype), empty(n, np.int64), empty(n, np.int64))
+    start, prior = empty(6, dtype), view.settings.prior_weight
+    start[_EVIDENCE], start[_TOTAL], start[_LAST], start[3] = prior, prior * view.settings.prior_mean, 0, TINY
     start[4], start[5] = shift[1], shift[0]
-    densities = empty((n if others > 0 else 0, PIXELS), dtype)
-    return (
-        tiles, lists,
-        (
-            start, empty((n, 3), dtype), densities, empty((5, PIXELS), dtype),
-            empty((others, PIXELS), dtype), empty(n, dtype),
-        ),
+    sums = Sums(
+        start, empty((n, 3), dtype), empty((n if others > 0 else 0, PIXELS), dtype), empty((5, PIXELS), dtype),
+        empty((others, PIXELS), dtype), empty(n, dtype),
     )  # fmt: skip
+    return tiles, lists, sums
 
 
 @leaf
@@ -91,7 +140,7 @@ def _mixed(features):
 @leaf
 def _blocks(depth, K, view, features, tiles, lists, sums, out, out_f, first, shares):
     """Regress every ``shares``-th block of an image, from block ``first`` on."""
-    z, boxes, seen, (near, work, in_block, in_tile), packed = tiles[1], tiles[3], tiles[4], lists, view[2]
+    seen, (near, work, in_block, in_tile), packed = tiles.seen, lists, view.packed
     rows, columns = (depth.shape[0] + _BLOCK - 1) // _BLOCK, (depth.shape[1] + _BLOCK - 1) // _BLOCK
     half = 0.5 * (TILE - 1)
     for block in range(first, rows * columns, shares):
@@ -101,19 +150,21 @@ def _blocks(depth, K, view, features, tiles, lists, sums, out, out_f, first, sha
             v, u = v0 + tile // _SIDE * TILE, u0 + tile % _SIDE * TILE
             seen[tile] = v < depth.shape[0] and u < depth.shape[1]
             if seen[tile]:
-                _depths(depth, v, u, z)
+                _depths(depth, v, u, tiles.z)
                 seen[tile] = _placed((u + half - K[0, 2]) / K[0, 0], (v + half - K[1, 2]) / K[1, 1], tiles, tile)
             any_seen |= seen[tile]
         if not any_seen:
             continue
-        count = cull(packed, view[0].size, view[4][4], _union(boxes, seen), view[4], work, in_block)
+        count = cull(
+            packed, view.slot.size, view.settings.among, _union(tiles.boxes, seen), view.settings, work, in_block
+        )
         for i in range(FIELDS):
             for j in range(count):
                 near[i, j] = packed[i, in_block[j]]
         pad(near, count)
         for tile in range(_TILES):
             if seen[tile]:
-                chosen = cull(near, count, count, _box(boxes, tile), view[4], work, in_tile)
+                chosen = cull(near, count, count, _box(tiles.boxes, tile), view.settings, work, in_tile)
                 for j in range(chosen):
                     in_tile[j] = in_block[in_tile[j]]
                 _average(PIXELS, tiles, tile, in_tile, chosen, view, features, sums)
@@ -146,7 +197,7 @@ def _block(pixel, width, columns):
 def _at_pixels(depth, K, pixels, begin, order, view, features, tiles, lists, sums, out, out_f):
     """Regress the blocks of an image at some pixels, up to 64 at a time; ``begin`` and ``order`` are those of
     :func:`_by_block`."""
-    grid, z, retained, averages, others, last = tiles[0], tiles[1], lists[2], sums[3], sums[4], out_f.shape[0] - 1
+    grid, z, retained, others, last = tiles.grid, tiles.z, lists.in_block, sums.others, out_f.shape[0] - 1
     columns = (depth.shape[1] + _BLOCK - 1) // _BLOCK
     for block in range(begin.size - 2):
         v0, u0 = block // columns * _BLOCK + 0.5 * (_BLOCK - 1), block % columns * _BLOCK + 0.5 * (_BLOCK - 1)
@@ -161,15 +212,16 @@ def _at_pixels(depth, K, pixels, begin, order, view, features, tiles, lists, sum
                 grid[0, i], grid[1, i], z[i] = grid[0, count - 1], grid[1, count - 1], z[count - 1]
             if not _placed((u0 - K[0, 2]) / K[0, 0], (v0 - K[1, 2]) / K[1, 1], tiles, 0):
                 continue
-            chosen = cull(view[2], view[0].size, view[4][4], _box(tiles[3], 0), view[4], lists[1], retained)
+            box, settings = _box(tiles.boxes, 0), view.settings
+            chosen = cull(view.packed, view.slot.size, settings.among, box, settings, lists.work, retained)
             filled = (count + LANES - 1) // LANES * LANES
             _average(filled, tiles, 0, retained, chosen, view, features, sums)
             for i in range(count):
-                out[order[low + i]] = averages[_TOTAL, i]
+                out[order[low + i]] = sums.averages[_TOTAL, i]
                 for g in range(others.shape[0]):
                     out_f[g, order[low + i]] = others[g, i]
                 for g in range(others.shape[0], last + 1):
-                    out_f[g, order[low + i]] = averages[_LAST + last - g, i]
+                    out_f[g, order[low + i]] = sums.averages[_LAST + last - g, i]
 
 
 @leaf
@@ -191,13 +243,13 @@ def _placed(x, y, tiles, tile):
 
     ``x`` and ``y`` are the ray through the tile's middle, at z = 1.
     """
-    grid, z, points, boxes, _, hole, work = tiles
+    work = tiles.work
     work[7], work[8] = x, y
-    place_points(z, grid, work[7:], points[tile], hole[tile], work)
+    place_points(tiles.z, tiles.grid, work[7:], tiles.points[tile], tiles.holes[tile], work)
     least = np.float64(work[6])
     if not least < np.inf:
         return False
-    box = boxes[tile]
+    box = tiles.boxes[tile]
     box[6], box[7], box[8] = x * least, y * least, least
     for i in range(6):
         box[i] = box[6 + i % 3] + work[i]
@@ -225,19 +277,18 @@ def _union(boxes, seen):
 @leaf
 def _average(points_used, tiles, tile, chosen, count, view, features, sums):
     """As :func:`mix` at the first ``points_used`` points of a tile, with averages of the other features."""
-    points, boxes, hole = tiles[2], tiles[3], tiles[5]
-    start, offsets, densities, averages, others, values = sums
-    index, fields, _, terms, _ = view
-    _offsets(fields, chosen, count, boxes[tile], offsets)
+    offsets, densities, averages, others, values = sums.offsets, sums.densities, sums.averages, sums.others, sums.values
+    points, hole = tiles.points[tile], tiles.holes[tile]
+    _offsets(view.fields, chosen, count, tiles.boxes[tile], offsets)
     outputs = averages, densities, others.shape[0] > 0
     if features.shape[1] < 3:
-        mix(terms, chosen, offsets, count, points[tile], points_used, start, hole[tile], *outputs)
+        mix(view.terms, chosen, offsets, count, points, points_used, sums.start, hole, *outputs)
     else:
-        mix_three(terms, chosen, offsets, count, points[tile], points_used, start, hole[tile], *outputs)
+        mix_three(view.terms, chosen, offsets, count, points, points_used, sums.start, hole, *outputs)
     for g in range(others.shape[0]):
         for j in range(count):
-            values[j] = features[index[chosen[j]], g]
-        mix_more(values, count, densities, averages, hole[tile], others[g])
+            values[j] = features[view.slot[chosen[j]], g]
+        mix_more(values, count, densities, averages, hole, others[g])
 
 
 @contracted
@@ -255,7 +306,7 @@ def _offsets(fields, chosen, count, box, offsets):
 @leaf
 def _write(sums, v0, u0, out, out_f):
     """Copy the averages at a tile to the maps."""
-    averages, others, last = sums[3], sums[4], out_f.shape[0] - 1
+    averages, others, last = sums.averages, sums.others, out_f.shape[0] - 1
     _copy(averages[_TOTAL], v0, u0, out)
     for g in range(out_f.shape[0]):
         _copy(others[g] if g < others.shape[0] else averages[_LAST + last - g], v0, u0, out_f[g])

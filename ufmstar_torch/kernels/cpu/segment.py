@@ -17,11 +17,9 @@ from torch import Tensor
 
 from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.gaussians.mixture import GaussianMixture
-from ufmstar_torch.kernels.cpu.arrays import array
+from ufmstar_torch.kernels.cpu.calls import array, each, shares_of_stream
 from ufmstar_torch.kernels.cpu.segment_image import join_rows, write_gaussians, write_labels
 from ufmstar_torch.kernels.cpu.segment_rows import SEGMENT, SEGMENT_INT, scan_rows
-from ufmstar_torch.kernels.cpu.threads import each, shares_of_stream
-from ufmstar_torch.steps.segment_input import SegmentInput
 
 _LIGHTER = 4  # a pixel takes a fraction of its regression's time: fewer threads pay off
 _PRUNE = {"none": 0, "both": 1, "either": 2}
@@ -47,26 +45,30 @@ class _Limits(NamedTuple):
     min_rows: int
 
 
-def segment(inputs: SegmentInput) -> tuple[GaussianMixture, Tensor]:
+def segment(
+    depth: Tensor, intrinsics: Tensor, limits: SPGFConfig, features: Tensor | None = None
+) -> tuple[GaussianMixture, Tensor]:
     """As :func:`ufmstar_torch.steps.segment.segment`, for CPU tensors, float64 inside."""
-    mixture, labels = gaussians(inputs)
+    mixture, labels = gaussians(depth, intrinsics, limits, features)
     return mixture, labels()
 
 
-def gaussians(inputs: SegmentInput) -> tuple[GaussianMixture, Callable[[], Tensor]]:
+def gaussians(
+    depth: Tensor, intrinsics: Tensor, config: SPGFConfig, features: Tensor | None = None
+) -> tuple[GaussianMixture, Callable[[], Tensor]]:
     """The mixture of :func:`segment`, and a function that writes the labels."""
-    z = array(inputs.depth)
+    z = array(depth)
     streams, height, width = z.shape
-    limits = _limits(inputs.config, inputs.depth_bins)
-    room = height * inputs.segments_per_row
+    limits = _limits(config)
+    room = height * config.segments_per_row(width)
     spans, runs = np.empty((streams, height, 4), np.int64), np.empty((streams, height * width, 2), np.int32)
     table, table_int = np.empty((streams, room, SEGMENT)), np.empty((streams, room, SEGMENT_INT), np.int64)
     shares = shares_of_stream(streams, height * width // _LIGHTER)
     rows = [height * i // shares for i in range(shares + 1)]
     scans, joins = [], []
-    for b, K in enumerate(array(inputs.intrinsics).tolist()):
+    for b, K in enumerate(array(intrinsics).tolist()):
         fx, fy, cx, cy = K[0][0], K[1][1], K[0][2], K[1][2]
-        slope = inputs.config.slope(min(fx, fy))
+        slope = config.slope(min(fx, fy))
         bins = _depth_bins(0.5 * min(width / fx, height / fy), limits)
         tables = spans[b], table[b], table_int[b]
         for first, last in itertools.pairwise(rows):
@@ -87,11 +89,11 @@ def gaussians(inputs: SegmentInput) -> tuple[GaussianMixture, Callable[[], Tenso
     weight = np.zeros((streams, k), dtype)
     for b, fit in enumerate(joined):
         write_gaussians(*fit[:3], mean[b], covariance[b], weight[b])
-    features = np.empty((streams, k, 0), dtype)
-    if inputs.features is not None:
-        features = _feature_means(array(inputs.features), labels().numpy(), weight)
+    means = np.empty((streams, k, 0), dtype)
+    if features is not None:
+        means = _feature_means(array(features), labels().numpy(), weight)
     not_compared = *(np.zeros((streams, k), dtype) for _ in range(3)), np.zeros((streams, k, 5), dtype)
-    fields = (mean, covariance, weight, *not_compared, features)
+    fields = (mean, covariance, weight, *not_compared, means)
     return GaussianMixture(*map(torch.from_numpy, fields)), labels
 
 
@@ -107,7 +109,7 @@ def _feature_means(features: np.ndarray, labels: np.ndarray, weight: np.ndarray)
 
 
 @functools.lru_cache(maxsize=16)
-def _limits(c: SPGFConfig, depth_bins: int) -> _Limits:
+def _limits(c: SPGFConfig) -> _Limits:
     return _Limits(
         noise_floor=float(c.noise_floor),
         noise_thresh=float(c.noise_thresh),
@@ -116,7 +118,7 @@ def _limits(c: SPGFConfig, depth_bins: int) -> _Limits:
         max_depth=float(c.depth_limit),
         shortest_bin=float(c.min_gaussian_length),
         longest_bin=float(c.frame_max_scale * c.min_gaussian_length),
-        depth_bins=depth_bins,
+        depth_bins=c.depth_bins,
         occlusion_gap=c.occlusion_gap,
         n_check=c.n_check,
         max_open=c.max_open,

@@ -20,24 +20,20 @@ from ufmstar_torch.anchors.kernels.learn import inliers, learn_in_view
 from ufmstar_torch.anchors.learn import COLUMNS, Learnt, learn
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.frame import FrameInput
-from ufmstar_torch.frames.output import StepOutput
+from ufmstar_torch.frames.output import UncertaintyOutput
 from ufmstar_torch.gaussians.camera import relative_pose
 from ufmstar_torch.gaussians.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.gaussians.state import UfMStarState
-from ufmstar_torch.kernels.cpu.arrays import array
-from ufmstar_torch.kernels.cpu.fuse import lift
+from ufmstar_torch.kernels.cpu.calls import array, each
 from ufmstar_torch.kernels.cpu.regress import Seen, View, fill_and_smooth, regress_maps, views_of
 from ufmstar_torch.kernels.cpu.rigid import COVARIANCE, FIELDS, WEIGHT, padded
 from ufmstar_torch.kernels.cpu.segment import gaussians
-from ufmstar_torch.kernels.cpu.stream import join, match
-from ufmstar_torch.kernels.cpu.threads import each
+from ufmstar_torch.kernels.cpu.stream import join, lift, match
 from ufmstar_torch.steps.disagree import overlap_disagreement
 from ufmstar_torch.steps.fuse import make_room
 from ufmstar_torch.steps.regress import at_pixels, distribute, memory_for, with_pixels
-from ufmstar_torch.steps.segment_input import SegmentInput
-from ufmstar_torch.steps.step import frame_statistics, unobserved
-from ufmstar_torch.steps.step_parts import StepObserver
+from ufmstar_torch.steps.step import StepObserver, step_output, unobserved
 
 Floats = NDArray[np.floating[Any]]
 _NAMES = tuple(field.name for field in fields(GaussianMixture))
@@ -78,7 +74,7 @@ def step(
     pixels: Tensor | None = None,
     smooth: bool = True,
     observer: StepObserver | None = None,
-) -> tuple[UfMStarState, StepOutput]:
+) -> tuple[UfMStarState, UncertaintyOutput]:
     """As :func:`ufmstar_torch.steps.step.step`, for CPU tensors."""
     stage = unobserved if observer is None else observer.stage
     segments = _segment(frame, array(frame.intrinsics), config, state.covariance.dtype)
@@ -120,8 +116,9 @@ def step(
     of_anchors = {} if learnt is None else learnt.tensors()
     changed = {**joined.mixture, **joined.sums, **of_anchors, **stream_fields, "smoothed": smoothed}
     updated = state.with_tensors(changed)
-    statistics = frame_statistics(frame, _counts(frame, pairs, joined, unmeasured), learnt)
-    out = StepOutput(disagreement, features, measured, residual, current_cam, statistics)
+    maps = {"disagreement": disagreement, "measured": measured, "features": features}
+    counts = _counts(frame, pairs, joined, unmeasured)
+    out = step_output(frame, maps, residual, pixels, current_cam, counts, learnt)
     stage("average")
     return updated, out
 
@@ -130,7 +127,8 @@ def _segment(
     frame: FrameInput, intrinsics: Floats, config: UfMStarConfig, stored: torch.dtype
 ) -> tuple[NDArray[Any], ...]:
     """Step 2: the fields of C_i in the camera frame, float64, with the covariances lifted to the reference's floor."""
-    mixture, _ = gaussians(SegmentInput.of_frame(frame, config))
+    limits = config.segment.scaled_to(*frame.size)
+    mixture, _ = gaussians(frame.informative_depth, frame.intrinsics, limits, frame.features)
     segments = tuple(map(array, mixture.to(torch.float64).tensors().values()))
     epsilon = 8 * torch.finfo(stored).eps
     for K, *written in zip(intrinsics.tolist(), *segments[:3], strict=True):

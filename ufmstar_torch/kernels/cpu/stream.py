@@ -8,8 +8,20 @@ import numpy as np
 
 from ufmstar_torch.kernels.compile_cpu import empty, kernel
 from ufmstar_torch.kernels.cpu.correspond import matches
-from ufmstar_torch.kernels.cpu.fuse import WORK, append, fuse_pairs
+from ufmstar_torch.kernels.cpu.fuse import WORK, append, floor_covariance, fuse_pairs
 from ufmstar_torch.kernels.cpu.rigid import FIELDS, gather, padded, relative, scatter, turn
+
+
+@kernel
+def lift(mean, covariance, weight, near, focal, widening, epsilon):
+    """Lift the covariances of the occupied slots, which are the first ones, to the floor of a segment (``step``), in
+    place: the variance across one pixel, and ``epsilon`` times the trace for storage."""
+    work = empty(WORK, np.float64)
+    for n in range(weight.size):
+        if not weight[n] > 0:
+            break
+        S, across = covariance[n], max(mean[n, 2], near) / focal
+        floor_covariance(S, max(across * across * widening, epsilon * (S[0, 0] + S[1, 1] + S[2, 2])), work)
 
 
 @kernel
@@ -75,7 +87,7 @@ def join(pose, first, member, slots, segments, pairs, distance, new, occupied, s
         new: [C] which segments to append, from slot ``occupied`` on.
         settings: as :func:`fuse_pairs`: whether weighted by overlap, epsilon, b_0 (0 = the paper) and near plane.
         extra: number of columns after the mixture's features. The last one is the feature of
-            ``unmeasured.before_regression``; the others are not written.
+            ``regress.with_measured_share``; the others are not written.
 
     Returns:
         The n components by field [13, n and more], their disagreement [n] and features [n, F] for the regression.

@@ -1,8 +1,4 @@
-"""First and last part of a step on a GPU: relative camera poses, and the components that a frame adds.
-
-The host learns the number of slots one frame late (``kernels.triton.step``). A mask therefore marks the frame's
-Gaussians without a slot, so that a later launch can append them.
-"""
+"""First and last part of a step on a GPU: relative camera poses, and the components that a frame adds."""
 
 from __future__ import annotations
 
@@ -68,43 +64,33 @@ def append(
     current: GaussianMixture,
     to_first: tuple[Tensor, Tensor],
     view: Tensor,
-    chosen: Tensor,
+    matched: Tensor,
     counts: Tensor,
     *,
     near_plane: float,
     paper: bool,
-    again: bool,
-    last: bool,
-) -> tuple[Tensor, Tensor]:
-    """Append Gaussians of a frame to ``mixture``, in place, and count them.
+) -> None:
+    """Append the unmatched Gaussians of a frame to ``mixture``, in place, and count them. Those without a slot are
+    dropped.
 
     Args:
         mixture: [B, K], in memory that only this step uses.
         current: C_i in the camera frame, [B, C].
         to_first: R and t to the mixture's frame.
         view: [B, 4], see :class:`Cameras`.
-        chosen: [B, C] bool: with ``again``, the Gaussians to append; else those that matched, which are not appended.
-        counts: [8, B] int64, written without ``again``.
+        matched: [B, C] bool, the Gaussians that matched, which are not appended.
+        counts: [8, B] int64, written.
         near_plane: nearer Gaussians are dropped [m].
-        paper: whether the first view has a weight in m (``views.first_weight``).
-        again: whether these Gaussians had no slot in an earlier launch.
-        last: whether the mixture cannot grow: Gaussians without a slot are dropped.
-
-    Returns:
-        Mask [B, C] of the Gaussians that wait for a slot; number of slots [B] int32 that would hold all Gaussians.
+        paper: whether the first view has a weight in m (``fuse.first_weight``).
     """
     b, c = current.weight.shape
-    waiting = torch.empty(b, c, dtype=torch.bool, device=counts.device)
-    needed = torch.empty(b, dtype=torch.int32, device=counts.device)
     channels = mixture.features.shape[2]
     launch(
         _append, (b,), current.mean, current.covariance, current.weight, current.features, *to_first,
-        view.contiguous(), chosen,
-        *mixture.tensors().values(), counts, waiting, needed, c, mixture.capacity, b,
-        near_plane=near_plane, paper=paper, again=again, last=last, channels=channels, padded=power_of_two(channels),
-        chunk=128,
+        view.contiguous(), matched,
+        *mixture.tensors().values(), counts, c, mixture.capacity, b,
+        near_plane=near_plane, paper=paper, channels=channels, padded=power_of_two(channels), chunk=128,
     )  # fmt: skip
-    return waiting, needed
 
 
 @triton.jit
@@ -144,10 +130,10 @@ def _cameras(
 
 @triton.jit
 def _append(
-    mean_c, covariance_c, weight_c, features_c, R, t, view, chosen,
-    mean, covariance, weight, disagreement, compared, views, reference, features, counts, waiting_mask, needed,
+    mean_c, covariance_c, weight_c, features_c, R, t, view, matches,
+    mean, covariance, weight, disagreement, compared, views, reference, features, counts,
     capacity_c, capacity_k, streams,
-    near_plane: tl.constexpr, paper: tl.constexpr, again: tl.constexpr, last: tl.constexpr, channels: tl.constexpr,
+    near_plane: tl.constexpr, paper: tl.constexpr, channels: tl.constexpr,
     padded: tl.constexpr, chunk: tl.constexpr,
 ):  # fmt: skip
     b = tl.program_id(0).to(tl.int64)
@@ -158,7 +144,7 @@ def _append(
     for first in range(0, capacity_k, chunk):
         k = first + lane
         n += tl.sum((tl.load(weight + b * capacity_k + k, mask=k < capacity_k, other=0.0) > 0).to(tl.int32), 0)
-    segments, matched, dropped, added, waiting = 0, 0, 0, 0, 0
+    segments, matched, dropped, added = 0, 0, 0, 0
     for first in range(0, capacity_c, chunk):
         inside = first + lane < capacity_c
         c = b * capacity_c + first + lane
@@ -167,13 +153,10 @@ def _append(
         x = tl.load(mean_c + 3 * c, mask=valid, other=0.0)
         y = tl.load(mean_c + 3 * c + 1, mask=valid, other=0.0)
         z = tl.load(mean_c + 3 * c + 2, mask=valid, other=0.0)
-        flag = tl.load(chosen + c, mask=inside, other=0) != 0
-        if again:
-            new = valid & flag
-        else:
-            new = valid & (z > exact(near_plane, z)) & ~flag
-            dropped += tl.sum((valid & (z <= exact(near_plane, z))).to(tl.int32), 0)
-            matched += tl.sum((valid & flag).to(tl.int32), 0)
+        matching = tl.load(matches + c, mask=inside, other=0) != 0
+        new = valid & (z > exact(near_plane, z)) & ~matching
+        dropped += tl.sum((valid & (z <= exact(near_plane, z))).to(tl.int32), 0)
+        matched += tl.sum((valid & matching).to(tl.int32), 0)
         segments += tl.sum(valid.to(tl.int32), 0)
         slot = n + tl.cumsum(new.to(tl.int32), 0) - 1
         has_slot = new & (slot < capacity_k)
@@ -196,19 +179,11 @@ def _append(
             stored = has_slot[:, None] & (f < channels)[None, :]
             value = tl.load(features_c + c[:, None] * channels + f[None, :], mask=stored, other=0.0)
             tl.store(features + k[:, None] * channels + f[None, :], value, mask=stored)
-        without_slot = new & ~has_slot
-        if last:
-            dropped += tl.sum(without_slot.to(tl.int32), 0)
-            added -= tl.sum(without_slot.to(tl.int32), 0)
-            without_slot = without_slot & (lane < 0)
-        tl.store(waiting_mask + c, without_slot, mask=inside)
+        dropped += tl.sum((new & ~has_slot).to(tl.int32), 0)
+        added += tl.sum(has_slot.to(tl.int32), 0)
         n += tl.sum(has_slot.to(tl.int32), 0)
-        added += tl.sum(new.to(tl.int32), 0)
-        waiting += tl.sum(without_slot.to(tl.int32), 0)
-    tl.store(needed + b, n + waiting)
-    if not again:
-        tl.store(counts + b, n)
-        tl.store(counts + streams + b, segments)
-        tl.store(counts + 2 * streams + b, matched)
-        tl.store(counts + 4 * streams + b, added)
-        tl.store(counts + 5 * streams + b, dropped)
+    tl.store(counts + b, n)
+    tl.store(counts + streams + b, segments)
+    tl.store(counts + 2 * streams + b, matched)
+    tl.store(counts + 4 * streams + b, added)
+    tl.store(counts + 5 * streams + b, dropped)

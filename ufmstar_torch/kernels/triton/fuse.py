@@ -27,7 +27,7 @@ from ufmstar_torch.kernels.triton.matrices import (
     turned,
 )
 from ufmstar_torch.steps.correspond import Correspondence
-from ufmstar_torch.steps.views import COMPLETE, LEAST
+from ufmstar_torch.steps.fuse import COMPLETE, LEAST
 
 _LANES = 32
 

@@ -20,6 +20,8 @@ from ufmstar_torch.kernels.triton.matrices import load_symmetric, moved, turned
 # As on the CPU: share of the denominator that culling may omit, and share of the prior in the threshold.
 EPSILON = {torch.float32: 1e-7, torch.float64: 1e-14}
 PRIOR = 1e-3
+# Numbers of a listed component: without and with the extent of the neighbourhood.
+FIELDS = {False: 7, True: 10}
 _LOG2_E = tl.constexpr(math.log2(math.e))
 _HALF_LOG_TWO_PI_CUBED = tl.constexpr(1.5 * math.log(2 * math.pi))
 _SLOTS = 128  # slots of the mixture processed together
@@ -35,6 +37,9 @@ def prepare(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """List the components that can contribute to the image, in slot order.
 
+    With ``config.regression == "neighbourhood"`` all components are listed: one whose density is negligible at a point
+    still decides the radius of its neighbourhood.
+
     Args:
         mixture: [B, K].
         camera: [B, 3, 3] float64 [px].
@@ -44,15 +49,16 @@ def prepare(
         motion: R [B, 3, 3] and t [B, 3] float64 from the mixture's frame to the camera's; None = identity.
 
     Returns:
-        Means [B, 3, K] float64 [m]; whitening and log2 of the peak [B, 7, K] in ``dtype``; index [B, K] int32 into the
-        mixture; their number [B] int32.
+        Means [B, 3, K] float64 [m]; whitening and log2 of the peak [B, 7, K] in ``dtype``, with the neighbourhood also
+        half the sides of the boxes [m], [B, 10, K]; index [B, K] int32 into the mixture; their number [B] int32.
     """
     b, capacity, device = mixture.streams, mixture.capacity, mixture.mean.device
     if motion is None:
         eye = torch.eye(3, dtype=torch.float64, device=device).repeat(b, 1, 1)
         motion = eye, torch.zeros(b, 3, dtype=torch.float64, device=device)
     means = torch.empty(b, 3, capacity, dtype=torch.float64, device=device)
-    fields = torch.empty(b, 7, capacity, dtype=dtype, device=device)
+    near = config.regression == "neighbourhood"
+    fields = torch.empty(b, FIELDS[near], capacity, dtype=dtype, device=device)
     index = torch.empty(b, capacity, dtype=torch.int32, device=device)
     count = torch.empty(b, dtype=torch.int32, device=device)
     launch(
@@ -60,6 +66,7 @@ def prepare(
         mixture.mean.contiguous(), mixture.covariance.contiguous(), mixture.weight.contiguous(), *motion, camera,
         means, fields, index, count, capacity, *size,
         share=math.log2(EPSILON[dtype] / 3) - 0.01 + math.log2(PRIOR * config.prior_weight), chunk=_SLOTS,
+        near=near, stride=FIELDS[near], sigmas=config.neighbourhood_sigmas,
     )  # fmt: skip
     return means, fields, index, count
 
@@ -94,7 +101,7 @@ def _outside(m, z, smm, smz, square, a, focal, centre, size):
 @triton.jit
 def _prepare(
     mean, covariance, weight, R, t, camera, means, fields, index, count, capacity, height, width,
-    share: tl.constexpr, chunk: tl.constexpr,
+    share: tl.constexpr, chunk: tl.constexpr, near: tl.constexpr, stride: tl.constexpr, sigmas: tl.constexpr,
 ):  # fmt: skip
     b = tl.program_id(0).to(tl.int64)
     lane = tl.arange(0, chunk)
@@ -129,7 +136,7 @@ def _prepare(
         a = tl.where(behind | anywhere, 1.0, a)
         outside = _outside(x, z, xx + least, xz, square, a, tl.load(camera), tl.load(camera + 2), width)
         outside = outside | _outside(y, z, yy + least, yz, square, a, tl.load(camera + 4), tl.load(camera + 5), height)
-        seen = inside & (anywhere | ~outside) & ~behind
+        seen = inside if near else inside & (anywhere | ~outside) & ~behind
 
         rank = n + tl.cumsum(seen.to(tl.int32), 0) - 1
         tl.store(index + b * capacity + rank, (first + lane).to(tl.int32), mask=seen)
@@ -137,7 +144,7 @@ def _prepare(
         tl.store(out, x, mask=seen)
         tl.store(out + capacity, y, mask=seen)
         tl.store(out + 2 * capacity, z, mask=seen)
-        out = fields + 7 * b * capacity + rank
+        out = fields + stride * b * capacity + rank
         scale = tl.sqrt(w * 0.0 + 0.5 * _LOG2_E)
         tl.store(out, i00 * scale, mask=seen)
         tl.store(out + capacity, i10 * scale, mask=seen)
@@ -146,5 +153,9 @@ def _prepare(
         tl.store(out + 4 * capacity, i21 * scale, mask=seen)
         tl.store(out + 5 * capacity, i22 * scale, mask=seen)
         tl.store(out + 6 * capacity, peak * _LOG2_E, mask=seen)
+        if near:
+            tl.store(out + 7 * capacity, sigmas * tl.sqrt(xx), mask=seen)
+            tl.store(out + 8 * capacity, sigmas * tl.sqrt(yy), mask=seen)
+            tl.store(out + 9 * capacity, sigmas * tl.sqrt(zz), mask=seen)
         n += tl.sum(seen.to(tl.int32), 0)
     tl.store(count + b, n)

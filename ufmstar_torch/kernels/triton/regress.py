@@ -4,6 +4,9 @@ The bound is that of ``kernels.cpu.regress_cull``: a component is omitted where 
 (eps / 3n) max(max_j l_j, pi_0 / 1000), with a lower bound l_j of each density. The first level is the image: a program
 per stream lists the components whose silhouette meets it. The second level is a tile of 16 x 16 pixels, with a program
 each. Chosen pixels are processed in groups of 256 instead of tiles.
+
+The paper's neighbourhood (``config.regression``) omits by distance instead: a tile sums the components whose boxes come
+within the far radius of one of its points.
 """
 
 from __future__ import annotations
@@ -20,11 +23,9 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.frame import FrameInput
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.kernels.triton.launch import launch, power_of_two
-from ufmstar_torch.kernels.triton.listing import EPSILON, PRIOR, prepare
+from ufmstar_torch.kernels.triton.listing import EPSILON, FIELDS, PRIOR, prepare
 from ufmstar_torch.kernels.triton.matrices import lowest_bit
-from ufmstar_torch.steps import unmeasured
-from ufmstar_torch.steps.regress import Regression
-from ufmstar_torch.steps.regress import regress_image as reference
+from ufmstar_torch.steps.regress import HALF, Regression
 
 _SIDE = 16  # pixels of a tile
 _CHUNK = 32  # components bounded at a time, the bits of a mask
@@ -65,7 +66,7 @@ def regress_frame(
         to_camera: R and t from the mixture's frame to the camera frame.
         frame: of B streams.
         memory: of the moving average.
-        config: exact regression, no anchors.
+        config: of UfM*.
         counts: [8, B] int64 (``append``), to which valid and unmeasured pixels are added.
         smooth: whether to average.
     """
@@ -94,9 +95,7 @@ def regress_image(
     config: UfMStarConfig,
     pixels: Tensor | None = None,
 ) -> Regression:
-    """As ``steps.regress.regress_image``, which also runs ``config.regression == "neighbourhood"``."""
-    if config.regression != "exact":
-        return reference(mixture_cam, depth, intrinsics, valid, config, pixels)
+    """As ``steps.regress.regress_image``."""
     maps = depth.new_empty(depth.shape if pixels is None else pixels.shape)
     features = depth.new_empty(*maps.shape, mixture_cam.features.shape[2])
     camera = intrinsics.to(torch.float64).contiguous()
@@ -115,6 +114,7 @@ def _launch(
     b, height, width = depth.shape
     chosen = pixels.shape[1] if subset else 0
     channels = mixture.features.shape[2]
+    near = config.regression == "neighbourhood"
     tiles = triton.cdiv(height, _SIDE) * triton.cdiv(width, _SIDE)
     launch(
         _regress, (triton.cdiv(chosen, _SIDE * _SIDE) if subset else tiles, b),
@@ -125,7 +125,8 @@ def _launch(
         least=math.log2(PRIOR * config.prior_weight), share=math.log2(EPSILON[depth.dtype] / 3) - 0.01,
         slack=16 * torch.finfo(depth.dtype).eps, channels=channels, padded=power_of_two(channels), side=_SIDE,
         chunk=_CHUNK, subset=subset, stepped=stepped is not None, alpha=alpha, mode=_UNMEASURED[config.unmeasured],
-        relative=config.unmeasured_relative, half=unmeasured.HALF,
+        relative=config.unmeasured_relative, half=HALF, near=near, stride=FIELDS[near],
+        near_radius=config.near_radius, far_radius=config.far_radius,
     )  # fmt: skip
 
 
@@ -170,19 +171,42 @@ def _bounds(means, fields, capacity, j, listed, cx, cy, cz, hx, hy, hz, slack: t
 
 
 @triton.jit
+def _gap(means, fields, capacity, j, x_0, y_0, z_0, x, y, z):
+    """Largest distance along an axis of points from the box of component j; (x_0, y_0, z_0) is their origin."""
+    real = fields.dtype.element_ty
+    dx = tl.abs(x - (tl.load(means + j) - x_0).to(real)) - tl.load(fields + 7 * capacity + j)
+    dy = tl.abs(y - (tl.load(means + capacity + j) - y_0).to(real)) - tl.load(fields + 8 * capacity + j)
+    dz = tl.abs(z - (tl.load(means + 2 * capacity + j) - z_0).to(real)) - tl.load(fields + 9 * capacity + j)
+    return tl.maximum(dx, tl.maximum(dy, dz))
+
+
+@triton.jit
+def _box_gap(means, fields, capacity, j, listed, cx, cy, cz, hx, hy, hz):
+    """Largest distance along an axis between the box c +- h and those of components j."""
+    real = fields.dtype.element_ty
+    dx = tl.abs(cx - tl.load(means + j, mask=listed, other=0.0).to(real)) - hx
+    dy = tl.abs(cy - tl.load(means + capacity + j, mask=listed, other=0.0).to(real)) - hy
+    dz = tl.abs(cz - tl.load(means + 2 * capacity + j, mask=listed, other=0.0).to(real)) - hz
+    dx -= tl.load(fields + 7 * capacity + j, mask=listed, other=0.0)
+    dy -= tl.load(fields + 8 * capacity + j, mask=listed, other=0.0)
+    dz -= tl.load(fields + 9 * capacity + j, mask=listed, other=0.0)
+    return tl.maximum(dx, tl.maximum(dy, dz))
+
+
+@triton.jit
 def _regress(
     depth, valid, camera, pixels, means, fields, index, count, m, features, out, out_f,
     views_k, informative, running, memory, measured, counts, height, width, chosen, capacity, streams,
     prior: tl.constexpr, prior_total: tl.constexpr, least: tl.constexpr, share: tl.constexpr, slack: tl.constexpr,
     channels: tl.constexpr, padded: tl.constexpr, side: tl.constexpr, chunk: tl.constexpr, subset: tl.constexpr,
     stepped: tl.constexpr, alpha: tl.constexpr, mode: tl.constexpr, relative: tl.constexpr,
-    half: tl.constexpr,
+    half: tl.constexpr, near: tl.constexpr, stride: tl.constexpr, near_radius: tl.constexpr, far_radius: tl.constexpr,
 ):  # fmt: skip
     real = depth.dtype.element_ty
     b = tl.program_id(1).to(tl.int64)
     lane = tl.arange(0, side * side)
     camera, index = camera + 9 * b, index + b * capacity
-    means, fields = means + 3 * b * capacity, fields + 7 * b * capacity
+    means, fields = means + 3 * b * capacity, fields + stride * b * capacity
     if subset:
         position = tl.program_id(0) * (side * side) + lane
         inside = position < chosen
@@ -221,11 +245,23 @@ def _regress(
     x, y, z = (x - x_0).to(real), (y - y_0).to(real), (z - z_low).to(real)
 
     part = tl.arange(0, chunk)
-    greatest = tl.full([chunk], least, real)
-    for first in range(0, n, chunk):
-        lower, _ = _bounds(means, fields, capacity, first + part, first + part < n, cx, cy, cz, hx, hy, hz, slack)
-        greatest = tl.maximum(greatest, lower)
-    threshold = tl.max(greatest, 0) + share - tl.log2(tl.maximum(n, 1).to(real))
+    if near:
+        least_gap = tl.full([side * side], inf, real)
+        for first in range(0, n, chunk):
+            listed = first + part < n
+            listed &= _box_gap(means, fields, capacity, first + part, listed, cx, cy, cz, hx, hy, hz) <= far_radius
+            remaining = tl.sum(tl.where(listed, tl.full([chunk], 1, tl.int64) << part.to(tl.int64), 0), 0)
+            while remaining != 0:
+                bit, remaining = lowest_bit(remaining)
+                gap = _gap(means, fields, capacity, first + bit, x_0, y_0, z_low, x, y, z)
+                least_gap = tl.minimum(least_gap, gap)
+        radius = tl.where(least_gap <= near_radius, near_radius, far_radius)
+    else:
+        greatest = tl.full([chunk], least, real)
+        for first in range(0, n, chunk):
+            lower, _ = _bounds(means, fields, capacity, first + part, first + part < n, cx, cy, cz, hx, hy, hz, slack)
+            greatest = tl.maximum(greatest, lower)
+        threshold = tl.max(greatest, 0) + share - tl.log2(tl.maximum(n, 1).to(real))
 
     evidence = tl.full([side * side], prior, real)
     total = tl.full([side * side], prior_total, real)
@@ -234,8 +270,12 @@ def _regress(
     sums = tl.zeros([side * side, padded], real)
     for first in range(0, n, chunk):
         listed = first + part < n
-        _, upper = _bounds(means, fields, capacity, first + part, listed, cx, cy, cz, hx, hy, hz, slack)
-        bits = tl.where(listed & (upper > threshold), tl.full([chunk], 1, tl.int64) << part.to(tl.int64), 0)
+        if near:
+            listed &= _box_gap(means, fields, capacity, first + part, listed, cx, cy, cz, hx, hy, hz) <= far_radius
+        else:
+            _, upper = _bounds(means, fields, capacity, first + part, listed, cx, cy, cz, hx, hy, hz, slack)
+            listed &= upper > threshold
+        bits = tl.where(listed, tl.full([chunk], 1, tl.int64) << part.to(tl.int64), 0)
         remaining = tl.sum(bits, 0)
         while remaining != 0:
             bit, remaining = lowest_bit(remaining)
@@ -248,6 +288,8 @@ def _regress(
             y2 = tl.load(fields + 3 * capacity + j) * dx + tl.load(fields + 4 * capacity + j) * dy
             y2 += tl.load(fields + 5 * capacity + j) * dz
             w = tl.exp2(tl.load(fields + 6 * capacity + j) - (y0 * y0 + y1 * y1 + y2 * y2))
+            if near:
+                w = tl.where(_gap(means, fields, capacity, j, x_0, y_0, z_low, x, y, z) <= radius, w, 0.0)
             k = b * capacity + tl.load(index + j)
             evidence += w
             if stepped:

@@ -13,9 +13,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.kernels.triton.launch import interpreted, launch, power_of_two
 from ufmstar_torch.kernels.triton.matrices import exact
-from ufmstar_torch.steps.segment_input import SegmentInput
 
 MOMENTS, INTEGERS = 8, 3  # of a finished segment: mean x, z; scatter xx, xz, zz; line x, z; length^2 | N, interval
 
@@ -42,21 +42,20 @@ class Rows:
     finished_index: Tensor
 
 
-def scanlines(inputs: SegmentInput) -> Rows:
+def scanlines(depth: Tensor, intrinsics: Tensor, limits: SPGFConfig) -> Rows:
     """Cut every row into segments (``segment_scanline.scanlines``), in two launches."""
-    b, height, width = inputs.depth.shape
-    device, limits = inputs.depth.device, inputs.config
-    most, rows = inputs.segments_per_row, b * height
+    b, height, width = depth.shape
+    device, most, rows = depth.device, limits.segments_per_row(width), b * height
 
     def integers(*shape: int, dtype: torch.dtype = torch.int32) -> Tensor:
         return torch.empty(*shape, dtype=dtype, device=device)
 
-    camera, depth = inputs.intrinsics.to(torch.float64).contiguous(), inputs.depth.contiguous()
-    lengths2 = torch.empty(b, inputs.depth_bins, dtype=torch.float64, device=device)
+    camera, depth = intrinsics.to(torch.float64).contiguous(), depth.contiguous()
+    lengths2 = torch.empty(b, limits.depth_bins, dtype=torch.float64, device=device)
     bins = torch.empty(b, height, width, dtype=torch.int16, device=device)
     launch(
         _bins, (triton.cdiv(height * width, 1024), b), depth, camera, lengths2, bins, height, width,
-        number=inputs.depth_bins, shortest=float(limits.min_gaussian_length),
+        number=limits.depth_bins, shortest=float(limits.min_gaussian_length),
         longest=float(limits.frame_max_scale * limits.min_gaussian_length), chunk=1024,
     )  # fmt: skip
     narrow = torch.int16 if width < 2**15 else torch.int32
@@ -74,7 +73,7 @@ def scanlines(inputs: SegmentInput) -> Rows:
         scaled=limits.fixed_slope, noise_floor=float(limits.noise_floor), noise_thresh=float(limits.noise_thresh),
         line_thresh=float(limits.line_thresh), max_depth=float(limits.depth_limit), gap=limits.occlusion_gap,
         n_check=limits.n_check, sparse=limits.sparse, max_open=limits.max_open, registers=power_of_two(limits.max_open),
-        number=inputs.depth_bins, lanes=lanes, warps=1,
+        number=limits.depth_bins, lanes=lanes, warps=1,
     )  # fmt: skip
     return result
 

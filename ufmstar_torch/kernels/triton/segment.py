@@ -16,13 +16,13 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.gaussians.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.kernels.triton.launch import launch, power_of_two
 from ufmstar_torch.kernels.triton.matrices import exact, floored, load_symmetric, store_symmetric
 from ufmstar_torch.kernels.triton.scanline import Rows, scanlines, slope_of
 from ufmstar_torch.steps.segment import max_gaussians
-from ufmstar_torch.steps.segment_input import SegmentInput
 
 _PRUNE = {"none": 0, "both": 1, "either": 2}
 _CHUNK = 32  # Gaussians of a program of ``_lift``
@@ -44,34 +44,38 @@ class Floor:
     epsilon: float
 
 
-def segment(inputs: SegmentInput) -> tuple[GaussianMixture, Tensor]:
+def segment(
+    depth: Tensor, intrinsics: Tensor, limits: SPGFConfig, features: Tensor | None = None
+) -> tuple[GaussianMixture, Tensor]:
     """As :func:`ufmstar_torch.steps.segment.segment`, computed in float64, with the capacity for accelerators."""
-    mixture, read_labels = fit(inputs)
+    mixture, read_labels = fit(depth, intrinsics, limits, features)
     return mixture, read_labels()
 
 
-def fit(inputs: SegmentInput, *, floor: Floor | None = None) -> tuple[GaussianMixture, Callable[[], Tensor]]:
+def fit(
+    depth: Tensor, intrinsics: Tensor, limits: SPGFConfig, features: Tensor | None = None,
+    *, floor: Floor | None = None,
+) -> tuple[GaussianMixture, Callable[[], Tensor]]:  # fmt: skip
     """Fit Gaussians to B depth maps.
 
     Args:
-        inputs: checked.
+        depth, intrinsics, limits, features: as :func:`ufmstar_torch.steps.segment.segment`.
         floor: of the covariances; the mixture is float64. None = no floor; the mixture has the depth's dtype.
 
     Returns:
         The mixture [B, C], and a function that writes and returns the labels [B, H, W] int64.
     """
-    b, height, _ = inputs.depth.shape
-    device = inputs.depth.device
-    most = inputs.segments_per_row
+    b, height, width = depth.shape
+    device = depth.device
+    most = limits.segments_per_row(width)
     total = most * height
-    capacity = min(total, max_gaussians(inputs))
-    channels = 0 if inputs.features is None else inputs.features.shape[1]
-    rows = scanlines(inputs)
-    dtype = inputs.depth.dtype if floor is None else torch.float64
+    capacity = min(total, max_gaussians(limits, height, width))
+    channels = 0 if features is None else features.shape[1]
+    rows = scanlines(depth, intrinsics, limits)
+    dtype = depth.dtype if floor is None else torch.float64
     mixture = GaussianMixture.empty(b, capacity, features=channels, dtype=dtype, device=device)
     member = torch.empty(b * height, most, dtype=torch.int32, device=device)
     slot_of = torch.empty(b, total, dtype=torch.int32, device=device)
-    limits = inputs.config
     lanes = power_of_two(2 * most)
     # A stream runs in the first launch that has enough lanes for its rows: one warp, which needs no barriers, in most.
     for least, enough in ((0, lanes),) if lanes <= _FEW else ((0, _FEW), (_FEW, lanes)):
@@ -79,11 +83,11 @@ def fit(inputs: SegmentInput, *, floor: Floor | None = None) -> tuple[GaussianMi
             _join, (b,),
             rows.camera, rows.moments, rows.integers, rows.count,
             mixture.mean, mixture.covariance, mixture.weight, member, slot_of, height, most, capacity, total,
-            rounded=floor is not None and inputs.depth.dtype == torch.float32,
+            rounded=floor is not None and depth.dtype == torch.float32,
             scale=float(limits.adaptive_thresh_scale), reference=float(limits.reference_focal),
             scaled=limits.fixed_slope, noise_floor=float(limits.noise_floor), angle2=float(limits.angle_cosine) ** 2,
             min_pixels=limits.min_pixels, min_rows=limits.min_rows, prune=_PRUNE[limits.prune],
-            single=inputs.depth.shape[2] < _SINGLE, least=least, lanes=enough, warps=max(1, min(8, enough // 32)),
+            single=width < _SINGLE, least=least, lanes=enough, warps=max(1, min(8, enough // 32)),
         )  # fmt: skip
     if floor is not None:
         launch(
@@ -91,9 +95,9 @@ def fit(inputs: SegmentInput, *, floor: Floor | None = None) -> tuple[GaussianMi
             capacity, near_plane=floor.near_plane, epsilon=floor.epsilon, pixel_variance=PIXEL_VARIANCE, chunk=_CHUNK,
             warps=1,
         )  # fmt: skip
-    read_labels = partial(_labelled, rows, member, slot_of, inputs.depth.shape)
-    if inputs.features is not None:
-        _average(inputs.features, read_labels(), mixture)
+    read_labels = partial(_labelled, rows, member, slot_of, depth.shape)
+    if features is not None:
+        _average(features, read_labels(), mixture)
     return mixture, read_labels
 
 

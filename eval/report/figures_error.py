@@ -1,33 +1,26 @@
-"""Figures of curves over all pixels: calibration, sparsification, NLL by size of the error, predictive entropy."""
+"""Figures over all pixels of errors and their prediction: NLL by size of the error, gates on sigma, entropy."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.eval.engine.judge import BY_ERROR
+from ufmstar_torch.eval.engine.record import Record
 from ufmstar_torch.eval.methods.method import ALONE, BASES, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report import style
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.means import value_of
-from ufmstar_torch.eval.report.names import count
+from ufmstar_torch.eval.report.quantities import row_labels, value_of
 from ufmstar_torch.eval.report.style import LineStyle
 from ufmstar_torch.eval.run.colours import FAINT, INK
-from ufmstar_torch.eval.suite.record import Record
 
 Curves = Mapping[str, Sequence[float]]
-PER_LINE, MOST_SEQUENCES = 4, 12
-# Axis labels of the two calibration diagrams.
-DELTA, QUANTILE = ("predicted share within 25 %", "true share"), ("predicted quantile", "share of truth below")
-# Colours and markers, in order, for methods without a ``Method``.
-_BY_ORDER = (("#6b6b6b", "^"), ("#E69F00", "s"), ("#0072B2", "o"), ("#009E73", "D"), ("#CC79A7", "v"), ("#D55E00", "P"))
 # The groups of the paper's figure of entropy, by the first letters of words in the names of data sets and sequences, as
 # TartanAir's environments. Every other data set is a group.
 ENVIRONMENTS = {
@@ -36,117 +29,10 @@ ENVIRONMENTS = {
     "driving": ("driving", "kitti"),
     "city": ("city", "soulcity", "neighborhood", "oldtown", "japanesealley"),
 }
-
-
-# ---- calibration ----
-
-
-def draw_calibration(results: Results, dataset: str) -> Any | None:
-    """Both curves over all pixels of a data set, one column per network; None if no row has a variance."""
-    panels: dict[str, dict[Row, Curves]] = {}
-    for row in (*results.default_rows(), *results.posterior_rows()):
-        if _has_curves(values := results.merged.get((dataset, row), {})):
-            panels.setdefault(row.method.base, {})[row] = values
-    title = f"Calibration on {dataset}, {count(len(results.sequences(dataset)), 'sequence')}"
-    return _draw_columns(title, [((BASES[base][0], ""), curves) for base, curves in panels.items()])
-
-
-def draw_sequence_calibration(results: Results, dataset: str, base: str) -> Any | None:
-    """Both curves of at most ``MOST_SEQUENCES`` sequences, evenly spaced in the order of the ECE_delta of UfM* (or of
-    the last row), the smallest and the largest included; None for a single sequence."""
-    by_row = {row: [r for r in results.of(row, dataset) if _has_curves(r.curves)] for row in results.default_rows(base)}
-    rows = [row for row, records in by_row.items() if records]
-    if len(results.sequences(dataset)) < 2:
-        return None  # equal to the data set's
-    ordered = sorted(by_row[_ours(rows)] if rows else [], key=lambda r: (value_of(r, "ece_delta"), r.sequence))
-    chosen = np.linspace(0, len(ordered) - 1, min(len(ordered), MOST_SEQUENCES)).round().astype(int)
-    panels = []
-    for name in (ordered[i].sequence for i in chosen):
-        shown = {row: record for row in rows for record in by_row[row] if record.sequence == name}
-        titles = (f"{name}\n{_errors(shown, 'ece_delta', 'δ')}", _errors(shown, "ece_q", "q"))
-        panels.append((titles, {row: record.curves for row, record in shown.items()}))
-    title = f"Calibration on single sequences of {dataset}, {BASES[base][0]}\nerrors alone → UfM*, from best to worst"
-    return _draw_columns(title, panels)
-
-
-def _ours(rows: Sequence[Row]) -> Row:
-    """UfM*, or the last row."""
-    return next((row for row in rows if row.method.fusion == UFM_STAR and not row.method.full), rows[-1])
-
-
-def _errors(records: Mapping[Row, Record], key: str, letter: str) -> str:
-    """The calibration errors of the base alone and of UfM*, or of the first and the last row."""
-    rows = list(records)
-    values = (f"{value_of(records[row], key):.3f}" for row in dict.fromkeys((rows[0], _ours(rows))))
-    return f"ECE_{letter} {' → '.join(values)}"
-
-
-def _has_curves(curves: Mapping[str, Any]) -> bool:
-    """True if at least one pixel had a variance and ground truth (else the curve is NaN, None in a record)."""
-    levels = curves.get("ece_q_observed") or ()
-    return len(levels) > 0 and all(value is not None and value == value for value in levels)
-
-
-def _draw_columns(title: str, panels: Sequence[tuple[tuple[str, str], Mapping[Row, Curves]]]) -> Any | None:
-    """Delta calibration above quantile calibration in each column, ``PER_LINE`` columns side by side. ``panels`` has
-    the titles of both, and curves by row; UfM* is drawn last, on top."""
-    if not panels:
-        return None
-    columns = min(len(panels), PER_LINE)
-    lines = -(-len(panels) // columns)
-    # A single column needs width for the title and the legend.
-    figure = style.new_figure(max(5.0, 0.4 + 2.6 * columns), 0.7 + 5.2 * lines, title)
-    axes = style.hidden_panels(figure, 2 * lines, columns)
-    for n, (titles, curves) in enumerate(panels):
-        rows = sorted(curves, key=lambda row: (row.method.fusion == UFM_STAR, row.setting.posterior, row.method.full))
-        drawn = {style.row_style(row): curves[row] for row in rows}
-        for below, words in enumerate((DELTA, QUANTILE)):
-            panel = axes[2 * (n // columns) + below, n % columns]
-            _draw_shares(panel, words, drawn, titles[below], named=n % columns == 0)
-    style.legend_below(figure)
-    return figure
-
-
-def _draw_shares(
-    axes: Any, words: tuple[str, str], lines: Mapping[LineStyle, Curves], title: str, *, named: bool = True
-) -> None:
-    """Draw confidence that the depth is within 25 % against its frequency (``DELTA``), or predicted quantiles against
-    the share of truth below them (``QUANTILE``), in the unit square with its diagonal."""
-    axes.set_visible(True)
-    axes.plot([0, 1], [0, 1], linestyle="--", linewidth=1.0, color=FAINT, label="exactly right")
-    for line_style, values in lines.items():
-        x, y = (np.array(values[f"ece_q_{name}"], float) for name in ("levels", "observed"))
-        if words is DELTA:
-            names = ("confidence", "accuracy", "pixels")
-            x, y, pixels = (np.array(values[f"ece_delta_{name}"], float) for name in names)
-            filled = pixels > 0.001 * pixels.sum()  # bins with more than 0.1 % of the pixels
-            x, y = x[filled], y[filled]
-        axes.plot(x, y, clip_on=False, **line_style.line)
-    axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal", xticks=[0, 0.5, 1], yticks=[0, 0.5, 1])
-    style.finish(axes, title=title, x=words[0], y=words[1] if named else "")
-
-
-def write_curves(path: Path, curves: Mapping[str, Curves], *, title: str = "") -> None:
-    """Draw delta calibration, quantile calibration and sparsification (``SequenceMetrics.curves()`` by the name in the
-    legend) side by side, and write the picture (PNG). Raises ValueError: there are no curves, or more than line
-    styles."""
-    if not 1 <= len(curves) <= len(_BY_ORDER):
-        raise ValueError(f"curves must hold 1 to {len(_BY_ORDER)} methods, got {len(curves)}")
-    figure = style.new_figure(12.6, 4.6, title)
-    delta, quantiles, sparse = figure.subplots(1, 3)
-    lines = {LineStyle(name, *line_style): curves[name] for name, line_style in zip(curves, _BY_ORDER, strict=False)}
-    _draw_shares(delta, DELTA, lines, "δ calibration")
-    _draw_shares(quantiles, QUANTILE, lines, "quantile calibration")
-    for line_style, values in lines.items():
-        x = np.arange(len(values["sparsification_rmse"])) / len(values["sparsification_rmse"])
-        sparse.plot(x, values["sparsification_rmse"], markevery=10, **line_style.line)
-        sparse.plot(x, values["sparsification_oracle_rmse"], linewidth=1.0, linestyle=":", color=line_style.colour)
-    sparse.set_xlim(0, 1)
-    sparse.set_ylim(bottom=0)
-    title, x_label = "sparsification (dotted: best possible)", "share of pixels left out, largest σ first"
-    style.finish(sparse, title=title, x=x_label, y="RMSE [m]")
-    style.legend_below(figure)
-    style.save_figure(figure, path)
+# Colours and markers of the lines, in order. Rows of one method differ in their settings, so each has a line.
+_STYLES = (("#0072B2", "o"), ("#D55E00", "s"), ("#009E73", "D"), ("#E69F00", "^"), ("#CC79A7", "v"), ("#6b6b6b", "P"))
+# Gates that are written at the curve.
+_NAMED = (0.05, 0.1, 0.2)
 
 
 # ---- NLL by size of the error ----
@@ -185,6 +71,56 @@ def _error_curves(results: Results, dataset: str, base: str) -> dict[str, dict[R
             if kind == BY_ERROR and np.isfinite(values).any() and Method.parse(reference).base == base:
                 curves.setdefault(reference, {})[row] = values
     return dict(sorted(curves.items(), key=lambda item: (item[0].startswith("UfM"), item[0])))
+
+
+# ---- what a gate on sigma / depth keeps ----
+
+
+def draw_gates(results: Results, dataset: str) -> Any | None:
+    """Median error and coverage of the pixels that a gate on sigma / d keeps, against their share; None without a row
+    that has a variance."""
+    return gates_figure(_lines(results, dataset), f"Gates on sigma / depth on {dataset}")
+
+
+def _lines(results: Results, dataset: str) -> dict[str, Curves]:
+    """Curves over all pixels of a data set, by the row's label: of rows with intervals, then of each method's first
+    row, at most as many as there are styles."""
+    labels, plain = row_labels(results.rows), results.default_rows()
+    found = {row: results.merged.get((dataset, row), {}) for row in results.rows}
+    rows = [row for row, curves in found.items() if "coverage_found" in curves]
+    rows += [row for row in plain if row not in rows]
+    lines = {labels[row]: found[row] for row in rows if np.isfinite(_values(found[row], "gate_kept")).any()}
+    return dict(list(lines.items())[: len(_STYLES)])
+
+
+def gates_figure(lines: Mapping[str, Curves], title: str) -> Any | None:
+    """Median error, share within 25 % and coverage of a gate's pixels against their share, by the name in the legend
+    (``SequenceMetrics.curves()``)."""
+    if not lines:
+        return None
+    figure = style.new_figure(12.6, 4.6, title)
+    panels = figure.subplots(1, 3)
+    styled = [(LineStyle(name, *how), lines[name]) for name, how in zip(lines, _STYLES, strict=False)]
+    names = {"error": "median relative error", "delta1": "share within 25 %", "coverage": "share in the 90 % interval"}
+    for axes, (name, label) in zip(panels, names.items(), strict=True):
+        for line_style, curves in styled:
+            share, values, gates = (_values(curves, f"gate_{key}") for key in ("kept", name, "threshold"))
+            shown = share > 0.001
+            axes.plot(share[shown], values[shown], markevery=10, **line_style.line)
+            for gate in _NAMED if name == "error" else ():
+                at = int(np.abs(gates - gate).argmin())
+                if shown[at]:
+                    axes.annotate(f"{gate:g}", (share[at], values[at]), size=style.TICK, color=line_style.colour)
+        axes.set_xlim(0, 1)
+        axes.set_ylim(bottom=0, top=None if name == "error" else 1)
+        style.finish(axes, title="numbers: largest sigma / depth" if name == "error" else "", x="share kept", y=label)
+    panels[2].axhline(0.9, linestyle="--", linewidth=1.0, color=FAINT)
+    style.legend_below(figure)
+    return figure
+
+
+def _values(curves: Curves, name: str) -> Any:
+    return np.array(curves.get(name, ()), float)
 
 
 # ---- the paper's figure of predictive entropy ----

@@ -1,13 +1,17 @@
 """The paper's "System demonstration": a quantised FastDepth with an aleatoric head, live, among objects of many sizes.
 
-UfM* runs in real time on two cores, and its disagreement is high where the aleatoric variance is low.
+UfM* runs in real time on two cores, and its disagreement is high where the aleatoric variance is low. The folder OUT
+gets a table, a picture, and the cumulative costs.
+
+    python examples/onboard.py --seconds 120 --out OUT
 """
 
 from __future__ import annotations
 
+import argparse
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,17 +19,22 @@ from typing import Any
 
 import numpy as np
 import torch
+from cumulative import CounterLog, EnergyReadings, cumulative_costs, draw_cumulative, read_power
 from numpy.typing import NDArray
+from quantise import quantise
 
+from ufmstar_torch import models
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.bench.cumulative import CounterLog, EnergyReadings, cumulative_costs, read_power
 from ufmstar_torch.eval.bench.energy import CPU, EnergyMeter
-from ufmstar_torch.eval.bench.quantise import quantise
+from ufmstar_torch.eval.commands.terminal import Bars
+from ufmstar_torch.eval.engine.files import to_json, write_json_atomic
 from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.engine.realtime import RealTime
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
+from ufmstar_torch.eval.report.style import save_figure
+from ufmstar_torch.eval.report.text import number, realtime_table
 from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range
-from ufmstar_torch.eval.run.machine import load_average
+from ufmstar_torch.eval.run.machine import hardware, load_average, share_threads, versions
 from ufmstar_torch.eval.run.panels import DECADES, Bar, GridRow, Panel, draw_grid
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence, in_memory
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
@@ -38,11 +47,12 @@ from ufmstar_torch.models.trained import load_trained
 from ufmstar_torch.uncertain_depth import UncertainDepth
 
 FPS = 30.0
-GRAPH, PICTURE = "onboard_int8.onnx", "onboard.png"
+GRAPH, PICTURE, COSTS = "onboard_int8.onnx", "onboard.png", "onboard_costs.png"
 _PATH, _WALKED = 900, 300  # frames of the whole path at walking pace, and of the part that is walked back and forth
 _CALIBRATION = 24  # images of another tour, for the ranges of the activations
 _SIZES = {(160, 224): (160, 224)}  # size of the images by that of the network's input; default: half of VGA
 _HALF_VGA = (240, 320)
+_TARGET_MS, _TARGET_LOST = 50.0, 0.01
 _ROWS, _MARKED = 4, np.array([0, 213, 255])
 Report = Callable[[Progress], None]
 
@@ -217,14 +227,81 @@ def draw_contrasts(path: Path, contrasts: list[Contrast]) -> None:
     high = robust_range(maps, from_zero=True)[1]
     scale = ColourScale(high / 10**DECADES, high, ERROR_MAP, logarithmic=True)  # M would be black beside the error
     rows = []
-    for number, c in enumerate(chosen):
+    for index, c in enumerate(chosen):
         marked = c.image.copy()
         if marked.shape[:2] == c.error.shape:
             marked[c.contradicted] = (0.4 * marked[c.contradicted] + 0.6 * _MARKED).astype(np.uint8)
         shown = (c.aleatoric_sigma, c.disagreement, c.error)
         panels = [Panel(c.image), *(Panel(scale.rgb(values)) for values in shown), Panel(marked)]
-        rows.append(GridRow(f"{number + 1}", [], panels))
+        rows.append(GridRow(f"{index + 1}", [], panels))
     rows[0] = rows[0].captioned(["image", "σ, aleatoric", "√M, disagreement", "|error|", "A low and M high"])
     height, width = chosen[0].error.shape
     title = "Disagreement is high where the aleatoric variance is low"
     draw_grid(path, rows, [Bar("σ, √M and |error| [m]", scale, 1, 3)], aspect=height / width, title=title, words=0.4)
+
+
+def onboard_table(summary: Mapping[str, Any]) -> str:
+    """The real-time table, its target, and the contrast of disagreement."""
+    measured, network = summary["realtime"], summary["network"]
+    lines = [realtime_table(measured)]
+    latency = measured["latency_ms"] or {}
+    met = latency.get("p99", math.inf) < _TARGET_MS and (measured["lost_share"] or 0) < _TARGET_LOST
+    words = f"p99 below {_TARGET_MS:g} ms and less than {100 * _TARGET_LOST:g} % lost at 30 images/s"
+    lines.append(f"target, {words}: {'met' if met else 'missed'} (load average {number(summary['load_average'])})")
+    if shift := network.get("depth_shift"):
+        lines.append(
+            f"{network['quantised']}: depth shifted by {100 * shift['median']:.2g} % in the median, "
+            f"{100 * shift['p99']:.2g} % at most for 99 % of the pixels"
+        )
+    if contrast := summary.get("contrast"):
+        m = {name: number(value) for name, value in contrast.items()}
+        lines.append(
+            f"where the aleatoric variance is low: RMSE {m['rmse_high']} m at high disagreement "
+            f"({100 * contrast['share']:.0f} % of the pixels; aleatoric sigma {m['aleatoric_sigma_high']} m, sqrt(M) "
+            f"{m['disagreement_high']} m), {m['rmse_low']} m elsewhere"
+        )
+    costs = summary.get("costs") or {}
+    if costs:
+        lines.append(_cost_line(costs))
+    files = ["summary.json", *([PICTURE] if contrast else []), *([COSTS] if costs else [])]
+    return "\n".join([*lines, f"{summary['out']}: {', '.join(files)}"])
+
+
+def _cost_line(costs: Mapping[str, Any]) -> str:
+    """The time and energy of the parts of a live run."""
+    seconds = ", ".join(f"{name} {number(values[-1])} s" for name, values in costs["seconds"].items())
+    if "joules" not in costs:
+        return f"time: {seconds}; energy is not measurable here: {costs['not_measurable']}"
+    joules = ", ".join(f"{name} {number(values[-1])} J" for name, values in costs["joules"].items())
+    return f"time: {seconds}; energy: {joules}"
+
+
+def main(words: Sequence[str] | None = None) -> dict[str, Any]:
+    """Run the demonstration, write its folder, and print its table. Returns the content of summary.json."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("ufmstar_onboard"), help="folder for the results")
+    packaged = Path(models.__file__).parent / "weights" / "demo.safetensors"
+    weights_help = "of `ufmstar train`, whose first network is quantised; or a FastDepth (.onnx)"
+    parser.add_argument("--weights", type=Path, default=packaged, help=weights_help)
+    parser.add_argument("--seconds", type=float, default=120.0, help="duration of the walk [s]")
+    parser.add_argument("--seed", type=int, default=100_003, help="of the rooms")
+    power_help = "log of an external power meter: CSV with the columns time (seconds since 1970) and power (W)"
+    parser.add_argument("--power", type=Path, help=power_help)
+    chosen = parser.parse_args(words)
+    if not 1 <= chosen.seconds < math.inf:
+        parser.error(f"--seconds must be at least 1, got {chosen.seconds}")
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    share_threads()
+    with Bars() as bars:
+        measured = run_onboard(chosen.out, chosen.weights, chosen.seconds, chosen.seed, bars.show, chosen.power)
+    if measured["costs"]:
+        save_figure(draw_cumulative(measured["costs"]), chosen.out / COSTS)
+    about = {"out": str(chosen.out), "settings": {name: str(value) for name, value in vars(chosen).items()}}
+    summary: dict[str, Any] = to_json(about | measured | {"hardware": hardware(), "versions": versions()})
+    write_json_atomic(chosen.out / "summary.json", summary)
+    print(onboard_table(summary))
+    return summary
+
+
+if __name__ == "__main__":
+    main()

@@ -1,7 +1,7 @@
-"""Runs compiled code, which releases the GIL, on several threads.
+"""Calls of compiled code: tensors as arrays, and work on several threads.
 
-numba's parallel loops start OpenMP, which resets torch's number of threads to all cores. This module uses a thread pool
-instead, which lasts from call to call.
+numba's parallel loops start OpenMP, which resets torch's number of threads to all cores. Compiled code, which releases
+the GIL, therefore runs on a thread pool that lasts from call to call.
 """
 
 from __future__ import annotations
@@ -12,9 +12,26 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
+_HALVES = (torch.float16, torch.bfloat16)
 _SHARE = 160 * 160  # pixels; below that a thread costs more than it saves
+
+
+def array(value: Tensor) -> NDArray[Any]:
+    """A contiguous array on the CPU that shares the tensor's memory where it can; half and bfloat16 become float32.
+
+    A call of torch takes microseconds, and several times longer after a network has evicted the CPU's caches: calls
+    without effect are skipped.
+    """
+    if value.requires_grad:
+        value = value.detach()
+    if value.dtype in _HALVES:
+        value = value.to(torch.float32)
+    return np.ascontiguousarray((value if value.is_cpu else value.cpu()).numpy())
 
 
 def each(function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:

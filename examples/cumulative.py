@@ -22,9 +22,11 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.eval.bench.energy import EnergyMeter
 from ufmstar_torch.eval.engine.realtime import RealTime
+from ufmstar_torch.eval.report import style
 
 NETWORK, OURS, REST = "camera and network", "UfM*", "rest"
 COLUMNS = ("time", "power")
+_COLOURS = ("#E69F00", "#0072B2", "#d0d0d0")  # of the three
 _PERIOD = 0.5  # [s] between two readings of the counters
 Array = NDArray[np.float64]
 
@@ -127,3 +129,17 @@ def cumulative_costs(results: RealTime, readings: EnergyReadings | str) -> dict[
 
 def _lists(parts: Mapping[str, Array]) -> dict[str, list[float]]:
     return {name: values.tolist() for name, values in parts.items()}
+
+
+def draw_cumulative(costs: Mapping[str, Any]) -> Any:
+    """The paper's system figure (c): time, and energy if it was measured, of the parts of a live run above each other,
+    from :func:`cumulative_costs`."""
+    panels = [("times", "seconds", "cumulative time [s]")]
+    panels += [("energy_times", "joules", "cumulative energy [J]")] if "joules" in costs else []
+    figure = style.new_figure(5.2 * len(panels), 3.6, "Cost of a live run")
+    for axes, (times, kind, label) in zip(np.atleast_1d(figure.subplots(1, len(panels))), panels, strict=True):
+        axes.stackplot(costs[times], *costs[kind].values(), labels=list(costs[kind]), colors=_COLOURS)
+        axes.margins(0)
+        style.finish(axes, x="time of the run [s]", y=label)
+    style.legend_below(figure)
+    return figure

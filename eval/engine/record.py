@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,14 +12,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.engine.judge import METRICS
+from ufmstar_torch.eval.engine.files import write_atomic, write_json_atomic
 from ufmstar_torch.eval.methods.row import Row, row_from
-from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
-from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
-from ufmstar_torch.files.tensors import read_tensors
+from ufmstar_torch.files.limits import read_text
+from ufmstar_torch.files.read import read_tensors
 
 FORMAT = 1
+METRICS = "metrics"  # name of the sums of ``SequenceMetrics``
+# States of metrics on the CPU by name, to be added over sequences: "metrics" (``SequenceMetrics``) and
+# "nll_by_error:REFERENCE" (``NLLByError``); and "confidence", samples of pixels for a recalibration.
 Sums = Mapping[str, Mapping[str, Tensor]]
+_DENSE_ENTRIES = 4096  # largest sum that is stored with its zeros; Spearman's 514 x 514 counts are mostly 0
+_NOT_STORED = ("path", "sums")
 
 
 class ResultsError(ValueError):
@@ -30,10 +34,6 @@ class ResultsError(ValueError):
 class Record:
     """One row of a table on one sequence."""
 
-    suite: str  # name, as "paper-table-1"
-    dataset: str  # as "scannet"
-    sequence: str  # name in the data set
-    network: str  # label, "FastDepth" or "ResNet50-Monodepth2"
     method: str  # ``Method.name``
     setting: Mapping[str, Any] = field(default_factory=dict)  # ``Setting.to_dict()``; {} = the default
     # "selected", "done", "judged", "skipped" (counts) and "reasons" (count by reason); for UfM* "without_segment" and
@@ -48,9 +48,14 @@ class Record:
     state: Mapping[str, float] = field(default_factory=dict)
     # Median time per frame [ms] by stage: "network" (one inference, or all), "uncertainty".
     ms: Mapping[str, float] = field(default_factory=dict)
+    suite: str = ""  # name, as "paper-table-1"
+    dataset: str = ""  # as "scannet"
+    sequence: str = ""  # name in the data set
+    network: str = ""  # label, "FastDepth" or "ResNet50-Monodepth2"
     # "versions", "machine", "device", "runtime" of the networks, digests of networks and sequence.
     provenance: Mapping[str, Any] = field(default_factory=dict)
     path: Path = field(default=Path(), compare=False)  # of ROW.json; ROW.pt in the same folder has the sums
+    sums: Sums = field(default_factory=dict, compare=False, repr=False)  # of a new record; see :meth:`load_sums`
 
     @cached_property
     def row(self) -> Row:
@@ -63,16 +68,16 @@ class Record:
         counts = {f"{group}.{key}": v for group in ("frames", "state", "ms") for key, v in getattr(self, group).items()}
         return {**self.figures, **{name: v for name, v in counts.items() if isinstance(v, int | float)}}
 
-    def save(self, path: Path, sums: Sums) -> None:
+    def save(self, path: Path) -> None:
         """Write the sums, then the record as JSON, each atomically: if the record exists, both are complete."""
         path.unlink(missing_ok=True)  # an unreadable record
-        packed = {name: {key: pack(value) for key, value in states.items()} for name, states in sums.items()}
+        packed = {name: {key: pack(value) for key, value in states.items()} for name, states in self.sums.items()}
         write_atomic(path.with_suffix(".pt"), lambda file: torch.save(packed, file), durable=True)
-        values = {name: value for name, value in asdict(self).items() if name != "path"}
-        write_json_atomic(path, {"format": FORMAT, **values})
+        names = [f.name for f in fields(self) if f.name not in _NOT_STORED]
+        write_json_atomic(path, {"format": FORMAT, **{name: getattr(self, name) for name in names}})
 
-    def sums(self) -> Sums:
-        """``RowFigures.sums``. Raises ResultsError: the file has none."""
+    def load_sums(self) -> Sums:
+        """The sums of a stored record. Raises ResultsError: the file has none."""
         path = self.path.with_suffix(".pt")
         try:
             with path.open("rb") as file:
@@ -88,10 +93,10 @@ class Record:
         """Read a record. Raises ResultsError: the file is not a record of this format, or its row does not exist; the
         message names the file."""
         try:
-            values = json.loads(path.read_text(encoding="utf-8"))
+            values = json.loads(read_text(path))
         except (ValueError, RecursionError) as error:
             raise ResultsError(f"{path} is not a record: {error}") from error
-        names = {f.name for f in fields(cls)} - {"path"}
+        names = {f.name for f in fields(cls)} - set(_NOT_STORED)
         if not isinstance(values, dict) or values.pop("format", None) != FORMAT or values.keys() != names:
             raise ResultsError(f"{path} is not a record of format {FORMAT}")
         texts = ("suite", "dataset", "sequence", "network", "method")
@@ -106,3 +111,22 @@ class Record:
         except (ValueError, TypeError, LookupError, AttributeError) as error:
             raise ResultsError(f"{path}: {error}") from error
         return record
+
+
+def pack(value: Tensor) -> Tensor | dict[str, Any]:
+    """Tensors and plain values for ``torch.save``, equal to ``value`` after :func:`unpack`; large ones by their
+    non-zero entries."""
+    if value.numel() <= _DENSE_ENTRIES:
+        # A view would be saved with its whole storage.
+        return value.clone()
+    flat = value.flatten()
+    index = flat.nonzero()[:, 0]
+    return {"shape": list(value.shape), "index": index.to(torch.int32), "values": flat[index]}
+
+
+def unpack(stored: Tensor | dict[str, Any]) -> Tensor:
+    """The packed tensor, bit for bit; tensors are returned unchanged."""
+    if isinstance(stored, Tensor):
+        return stored
+    flat = stored["values"].new_zeros(stored["shape"]).flatten()
+    return flat.index_put((stored["index"].long(),), stored["values"]).reshape(stored["shape"])

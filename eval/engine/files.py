@@ -1,4 +1,4 @@
-"""Strict JSON, and atomic writing of files (``ufmstar_torch.files.atomic``)."""
+"""Strict JSON, and atomic writing of files (``ufmstar_torch.files.write``)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from ufmstar_torch.files.atomic import remove_temporaries as remove_temporaries
-from ufmstar_torch.files.atomic import write_atomic as write_atomic
+from ufmstar_torch.files.write import remove_temporaries as remove_temporaries
+from ufmstar_torch.files.write import write_atomic as write_atomic
 
 
 def write_bytes_atomic(path: Path, content: bytes) -> None:

@@ -1,0 +1,55 @@
+"""Times the default with network and UfM* in two threads (``UncertainDepth.stream``)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from itertools import islice
+from typing import Any
+
+import torch
+
+from ufmstar_torch import UncertainDepth
+from ufmstar_torch.eval.bench.measure import Plan
+from ufmstar_torch.eval.bench.networks import DEPTH, TimedNetwork
+from ufmstar_torch.eval.bench.timing import paired_ratio, pinned_threads, spread
+from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
+from ufmstar_torch.eval.sequences.images import image_tensor
+
+
+def time_overlap(network: TimedNetwork, sequence: FrameSequence, *, device: torch.device, plan: Plan) -> dict[str, Any]:
+    """Time the frames of a stream, each followed by the network alone on the same frame, in wall time.
+
+    Args:
+        network: predicts the depth.
+        sequence: with images.
+        device: of the network and of UfM*.
+        plan: as for ``measure.measure``, with threads: those of the network, and as many of UfM*.
+
+    Returns:
+        "latency": time of a frame of the stream [ms]; "ratio_to_network": over that of the network alone.
+    """
+    wanted = None if plan.frames is None else plan.warm_up + plan.frames
+    frames = list(islice(sequence.readable(lambda error: None), wanted))
+    whole, alone = list[float](), list[float]()
+    with pinned_threads(plan.threads or 1):
+        model = UncertainDepth(network.members, preprocess=network.preprocess, check_poses=0)
+        results = model.stream(_inputs(frames, device))
+        for frame in frames[:-1]:  # nothing overlaps the last one
+            started = time.perf_counter()
+            next(results)
+            whole.append(1e3 * (time.perf_counter() - started))
+            x, K = network.prepare(frame, device)
+            started = time.perf_counter()
+            network.predict(DEPTH, x, K)
+            alone.append(1e3 * (time.perf_counter() - started))
+        results.close()
+    counted = slice(plan.warm_up, None)
+    return {"latency": spread(whole[counted]), "ratio_to_network": paired_ratio(whole[counted], alone[counted])}
+
+
+def _inputs(frames: Sequence[Frame], device: torch.device) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
+    """Image, pose and intrinsics of each frame."""
+    for frame in frames:
+        pose, K = torch.from_numpy(frame.T_world_cam), torch.from_numpy(frame.intrinsics)
+        yield image_tensor(frame).to(device), pose, K
