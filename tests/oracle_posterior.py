@@ -17,6 +17,7 @@ START = {
     "wrong": (0.015, 20.0, 0.0015, 0.15),
     "inlier": (1.0, 20.0, 0.05, 4.0),
     "between": (0.04, 20.0, 9e-4, 1.0),
+    "centre": (0.0, 0.0, -14.0, 14.0),
     "calibration": (0.0, 0.0, 0.0, 1e6),
 }
 PRIOR, DRIFT, MEMORY = np.array([0.5, 0.2, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
@@ -182,6 +183,7 @@ def update(state, depth, claimed, pixel, g, variance, motion=None):
         new[name] = (weights * (part + square - total) * unit).sum(), weights.sum()
     z2 = np.minimum(residual**2 / total, CLIP)
     new |= discs(state, logs, Q, mean0, H, y, weight, noise, z2, node, u, v, stated - 1 / N, away)
+    c, new["centre"], new["between"] = surfaces(state, node, y - H[:, 2:4] @ mean[2:4], noise)
     weights = 3 + sum(MEMORY**k for k in range(state["frames"] + 1))
     slopes = state["slopes"] * (1 - 1 / weights) + mean[1:4] / weights
     after = {"frames": state["frames"] + 1, "m0": m0, "slopes": slopes, "b": mean[:4], "C": C[:4, :4], "sums": {}}
@@ -202,10 +204,17 @@ def update(state, depth, claimed, pixel, g, variance, motion=None):
     wide = [elsewhere(*each) for each in zip(around, unseen, strict=True)]
     p = np.where(p < 0.1, p + unmeasured * (0.1 - p), p)
     wide = [each + unmeasured * (2 - each) for each in wide]
-    if motion is not None:
-        p = 1 - (1 - p) * (1 - moving(motion, depth.shape, logs, offset, share, ratio(after, "between")))
     alone = [second_moment(0.0, *each) for each in zip(spread, offset, wide, strict=True)]
     spread = [second_moment(*each) for each in zip(p, spread, offset, wide, strict=True)]
+    if motion is not None:
+        e = offset + mean[0] + X[:, 1] * mean[1] - c
+        P = moving(motion, depth.shape, logs, e, share, ratio(after, "between"))
+        elsewhere_ = [second_moment(1.0, 0.1, *each) for each in zip(e, wide, strict=True)]
+        p, spread = 1 - (1 - p) * (1 - P), (1 - P) * np.array(spread) + P * np.array(elsewhere_)
+    alone, spread = np.array(alone), np.array(spread)
+    beyond = np.maximum((spread - (1 - p) * alone) / np.maximum(p, 1e-12), alone)
+    alone = np.minimum(alone, np.quantile(alone, 0.7))
+    p = np.maximum(p, np.clip((spread - alone) / np.maximum(np.maximum(beyond, 4 * alone) - alone, 1e-12), 0, 1))
     for k, x in enumerate(HX[:, 1:4]):
         offset[k] += share[k] ** 2 / (share[k] ** 2 + 0.3**2) * (x @ (slopes - mean[1:4]))
     posterior, variance, outlier = read(depth, np.nan_to_num(claimed), logs, mean[:4], offset, spread, p, share)
@@ -213,29 +222,55 @@ def update(state, depth, claimed, pixel, g, variance, motion=None):
     return after, posterior, variance, inlier, outlier
 
 
-def moving(motion, size, logs, offset, share, between):
+def surfaces(state, node, y, noise):
+    """The constant of most surfaces, and the sums of centre and between."""
+    cells = sorted(set(node))
+    y = [np.average(y[node == i], weights=1 / noise[node == i]) for i in cells]
+    s2, mean, variance = ratio(state, "between"), ratio(state, "centre"), 0.15**2 if state["frames"] else PRIOR[0]
+
+    def loss(c):
+        return sum(1.5 * math.log(1 + (one - c) ** 2 / s2 / 2) for one in y) / 40 + (c - mean) ** 2 / variance / 2
+
+    c, n = min([*np.quantile(y, np.linspace(0.02, 0.98, 33)), mean], key=loss), len(y) / 8
+    value, prior, low, high = START["between"]
+    above, below = (MEMORY * one for one in state["sums"]["between"])
+    for _ in range(8):
+        weights = [3 / (2 + (one - c) ** 2 / s2) for one in y]
+        sums = sum(w * one for w, one in zip(weights, y, strict=True)) / s2 / 40, sum(weights) / s2 / 40
+        c = (sums[0] + mean / variance) / (sums[1] + 1 / variance)
+        square = sum(w * (one - c) ** 2 for w, one in zip(weights, y, strict=True)) / 8
+        s2 = (above + (1 - MEMORY) * prior * value + square) / (below + (1 - MEMORY) * prior + n)
+        s2 = min(max(s2, low), high)
+    return c, (c * n, n), (square, n)
+
+
+def moving(motion, size, logs, e, share, between):
     """Probability of motion at the nodes."""
     rows, cols = logs.shape
-    offset, share, ratios, P = offset.reshape(logs.shape), share.reshape(logs.shape), np.zeros(logs.shape), []
+    e, share, P = e.reshape(logs.shape), share.reshape(logs.shape), []
+    ratios, sides = np.zeros((2, *logs.shape))
     for r in range(rows):
         for c in range(cols):
-            f, v = offset[r, c], between + 0.8**2
+            f, v = e[r, c], between + 0.8**2
             normal_density = math.exp(-f * f / v / 2) / math.sqrt(2 * math.pi * v)
             student = (1 + f * f / between / 2) ** -1.5 / (2 * math.sqrt(2) * math.sqrt(between))
             ratios[r, c] = max(1 - share[r, c], 0) * math.log(normal_density / student)
+            sides[r, c] = max(1 - share[r, c], 0) * math.log(1.9 if f > 0 else 0.1)
     for r in range(rows):
         for c in range(cols):
-            weights, values = [], []
+            weights, values, of_side = [], [], []
             for i in range(max(r - 3, 0), min(r + 4, rows)):
                 for j in range(max(c - 3, 0), min(c + 4, cols)):
                     near = math.exp(-((i - r) ** 2 + (j - c) ** 2) / 4.5)
                     weights.append(near / (1 + ((logs[i, j] - logs[r, c]) / 0.3) ** 2))
                     values.append(ratios[i, j])
+                    of_side.append(sides[i, j])
             near = [(1 - abs((v + 0.5) / size[0] * rows - 0.5 - r), 1 - abs((u + 0.5) / size[1] * cols - 0.5 - c), m)
                     for u, v, m in motion]  # fmt: skip
             near = [(a * b, m) for a, b, m in near if a > 0 and b > 0]
             tests = sum(w * m for w, m in near) / sum(w for w, _ in near) if near else 0.0
-            odds = -1.57 + math.log(0.12 + 0.88 * math.exp(tests)) + 1.06 * np.average(values, weights=weights)
+            passing = 0.12 * math.exp(1.06 * np.average(of_side, weights=weights))
+            odds = -1.57 + 1.06 * np.average(values, weights=weights) + math.log(passing + 0.88 * math.exp(tests))
             P.append(max(1 / (1 + math.exp(-odds)) - 0.15, 0) / 0.85)
     return np.array(P)
 
@@ -357,11 +392,9 @@ def discs(state, logs, Q, mean0, H, y, weight, noise, z2, node, u, v, measured, 
         scores.append(abs(interval.standard(mixture, math.exp(error[i]))))
     inlier, outlier = (1 - p) * normal(error, inlier_variance), p * normal(error + offset, wide)
     inlier, outlier = inlier / (inlier + outlier), outlier / (inlier + outlier)
-    y2 = (error + offset) ** 2
     return pairs(state, logs, held, node, error, var, away, noise) | {
         "wrong": ((area * outlier).sum(), (area * more_wrong).sum()),
         "inlier": ((area * inlier * factor * error**2 / inlier_variance).sum(), (area * inlier).sum()),
-        "between": ((area * y2 * 3 / (2 + y2 / ratio(state, "between"))).sum(), area.sum()),
         "calibration": ((area * error**2 / final).sum(), area.sum()),
         "scores": (scores, interval.weights(away[held], area[held], everywhere)),
     }

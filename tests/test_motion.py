@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import oracle_posterior as oracle
@@ -124,6 +125,29 @@ def test_positions_of_tests_move_with_the_pixels_of_a_resized_image(moving_tour)
     np.testing.assert_array_equal(motion[:, 2], landmarks.motion[:, 2])
 
 
+def test_most_corners_on_large_things_do_not_contradict_the_poses():
+    """Half of the corners lie on things of a fifth of the image, before walls with little texture."""
+    source, counts = landmark_source("dense"), []
+    for frame in islice(open_sequence("tour:960?style=scales&frames=60&size=240x320&movers=6"), 10):
+        counts.append(len(source.update(frame.image, frame.T_world_cam, frame.intrinsics).depth))
+    assert min(counts[4:]) > 50
+
+
+def test_poses_without_a_group_of_corners_that_fits_contradict_the_images():
+    source, rng, counts = landmark_source("dense"), np.random.default_rng(0), []
+    for frame in islice(open_sequence("tour:960?style=scales&frames=60&size=240x320&movers=6"), 10):
+        T = frame.T_world_cam.copy()
+        T[:3, :3] = T[:3, :3] @ rotation(rng.normal(0, np.deg2rad(4), 3))
+        counts.append(len(source.update(frame.image, T, frame.intrinsics).depth))
+    assert np.median(counts[2:]) == 0
+
+
+def rotation(w):
+    """[3, 3] from a vector of angles [rad]."""
+    w = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+    return torch.linalg.matrix_exp(torch.from_numpy(w)).numpy()
+
+
 # --- the posterior -------------------------------------------------------------------------------------------
 
 
@@ -163,6 +187,77 @@ def test_a_ratio_that_no_other_surface_has_is_explained_by_motion_and_a_usual_on
     assert probability(*arguments, 0.5**2, (28, 28)).max() < 0.15, "in this stream surfaces differ that much"
     far = probability(offset.ravel(), logs.ravel(), zero + 1, zero, 0.05**2, (28, 28))
     assert far.max() < 0.06, "without evidence there is nothing to explain"
+
+
+def test_motion_that_passes_the_tests_makes_a_surface_look_farther():
+    n = 28 * 28
+    e, logs, zero = np.zeros((28, 28)), np.zeros((28, 28)), np.zeros(n)
+    e[8:20, 8:16], logs[8:20, 8:16] = 0.7, -0.8
+    inside, passed = (e > 0).ravel(), np.full(n, -4.0)
+    P = probability(e.ravel(), logs.ravel(), zero, passed, 0.05**2, (28, 28))
+    nearer = probability(-e.ravel(), logs.ravel(), zero, passed, 0.05**2, (28, 28))
+    assert P[inside].max() > 0.3
+    assert nearer[inside].max() < P[inside].max() / 2
+    P, nearer = (probability(x.ravel(), logs.ravel(), zero, zero + 3, 0.05**2, (28, 28)) for x in (e, -e))
+    assert nearer[inside].min() > P[inside].min() - 0.1, "tests that fail show motion on either side"
+
+
+def approached(frames=12):
+    """Frames of an exact network, whose depths are 1.35 times too large, and anchors of a board at twice its distance
+    that grows from a twentieth to nearly half of the image."""
+    rng = np.random.default_rng(0)
+    for share in np.linspace(0.22, 0.68, frames):
+        depth, half = np.full((48, 64), 4.0), np.array([48, 64]) * share / 2
+        depth += np.linspace(0, 1, 64)
+        (top, left), (bottom, right) = (([24, 32] + sign * half).astype(int) for sign in (-1, 1))
+        board = np.zeros((48, 64), bool)
+        board[top:bottom, left:right] = True
+        depth[board] = 1.5
+        pixel = (rng.uniform(0.02, 0.96, (400, 2)) * [64, 48]).round()
+        u, v = pixel.astype(int).T
+        factor = np.where(board[v, u], 2.0, 1.0) * np.exp(rng.normal(0, 0.02, 400)) / 1.35
+        yield depth, board, pixel, depth[v, u] * factor, (0.02 * depth[v, u]) ** 2
+
+
+def test_a_thing_that_walks_ahead_neither_shifts_the_scale_nor_escapes_however_large_it_becomes():
+    packed, z = torch.zeros(1, SIZE, dtype=torch.float64), []
+    for depth, board, *anchors in approached():
+        frame, rows = checked(depth, *anchors)
+        rows = replace(rows, motion=torch.from_numpy(points(-4.0, (48, 64)))[None])
+        packed, out = update(packed, frame, rows, torch.zeros(1, 48, 64, dtype=torch.float64), MODEL)
+        found, sigma = out.depth[0].numpy(), out.variance[0].sqrt().numpy()
+        z.append(np.abs(found - depth / 1.35) / sigma)
+        assert np.median(found[board] * 1.35 / depth[board]) > 1.9, "the evidence's depth is stated"
+        assert np.sqrt(np.mean(z[-1][~board] ** 2)) < 1.5
+    last = [values[board] for values, (_, board, *_) in zip(z, approached(), strict=True)][3:]
+    assert np.sqrt(np.mean(np.concatenate(last) ** 2)) < 4
+
+
+def test_an_exact_network_s_posterior_covers_what_moves_in_a_tour(moving_tour):
+    """And an outlier of the inliers' sigma is as probable there as stated."""
+    ufm, moving, still = UfMStar(UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())), [], []
+    probabilities, outliers = [], []
+    for i, (frame, landmarks) in enumerate(zip(*moving_tour, strict=True)):
+        camera, seen = torch.from_numpy(frame.intrinsics)[None], frame.depth > 0
+        depth = np.where(seen, 1.35 * frame.depth, 3.0)
+        pose, anchors = torch.from_numpy(frame.T_world_cam)[None], landmarks.anchors(frame.intrinsics, camera)
+        out = ufm(torch.from_numpy(depth)[None], pose, camera, anchors=anchors)
+        z2 = ((out.depth[0].numpy() - frame.depth) / out.std[0].numpy()) ** 2
+        if i >= 8:
+            moving.append(z2[seen & frame.moving])
+            still.append(z2[seen & ~frame.moving])
+            error2 = (out.depth[0].numpy() - frame.depth)[seen] ** 2
+            outliers.append(error2 > 9 * out.posterior_inlier_variance[0].numpy()[seen])
+            probabilities.append(out.posterior_outlier[0].numpy()[seen])
+    moving, still = np.concatenate(moving), np.concatenate(still)
+    assert moving.mean() ** 0.5 < 2
+    assert np.mean(moving > 16) < 0.03
+    assert still.mean() ** 0.5 < 1
+    p, outlier = np.concatenate(probabilities), np.concatenate(outliers)
+    assert p[outlier].mean() > 5 * p[~outlier].mean()
+    high = p > 0.5
+    assert outlier[high].mean() > 0.15
+    assert outlier[p < 0.05].mean() < 0.05
 
 
 def test_motion_widens_the_variance_and_a_range_sensor_s_anchors_need_none():

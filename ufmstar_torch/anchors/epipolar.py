@@ -61,7 +61,7 @@ def median(values: NDArray[np.float64]) -> float:
     return float(ordered[(n - 1) // 2] + ordered[n // 2]) / 2
 
 
-def weighted_median(values: NDArray[np.float64], weight: NDArray[np.float64]) -> float:
-    """The median of values [N] with weights [N]."""
+def weighted_quantile(values: NDArray[np.float64], weight: NDArray[np.float64], share: float) -> float:
+    """The quantile ``share`` of values [N] with weights [N]."""
     order = values.argsort()
-    return float(values[order[np.searchsorted(weight[order].cumsum(), weight.sum() / 2)]])
+    return float(values[order[np.searchsorted(weight[order].cumsum(), weight.sum() * share)]])

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.bundle import PoseRefinement
 from ufmstar_torch.anchors.corners import find, follow
-from ufmstar_torch.anchors.epipolar import NEAREST, median, off_lines, weighted_median
+from ufmstar_torch.anchors.epipolar import NEAREST, median, off_lines, weighted_quantile
 from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, OtherCameraError, checked
 from ufmstar_torch.anchors.saved_state import SavedState, saved_image
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
@@ -56,6 +56,9 @@ _CLEAR_SHARE = 1 / 3
 _CELLS = 6
 # The median of the absolute value of a standard normal variable.
 _MEDIAN = 0.6745
+# Corners on a thing that moves leave their epipolar lines as a group. The standard deviation is that by the quantile
+# _REST of the distances, _REST_QUANTILE of a normal one, where it is below 1/_APART of that by the median.
+_REST, _REST_QUANTILE, _APART = 0.3, 0.3853, 4.0
 
 
 @dataclass(frozen=True)
@@ -303,14 +306,20 @@ class LandmarkTracker(SavedState):
         distance, rho, baseline = off_lines(*views, self._K, _NEAR * self._depth, far)
         cell = (views[0] * _CELLS / self._gray.shape[::-1]).astype(np.int64).clip(0, _CELLS - 1) @ [1, _CELLS]
         weight = 1 / np.bincount(cell)[cell]  # by area: a moving object may have most of the corners
-        newest = self._newest_line_error = weighted_median(distance, weight) / _MEDIAN
+        newest = weighted_quantile(distance, weight, 0.5) / _MEDIAN
+        lowest = weighted_quantile(distance, weight, _REST) / _REST_QUANTILE
+        if median(motion) >= _STILL and lowest < newest / _APART:
+            newest = lowest
+        self._newest_line_error = newest
         self._line_error = newest if self._line_error < 0 else _FADE * self._line_error + (1 - _FADE) * newest
         self.baseline = median(baseline)
         determines_depth = (rho > 0) & (motion > _MOVES)
         if determines_depth.sum() >= _ENOUGH:
             self._depth_count += 1
             share = max(1 - _MEMORY, 1 / self._depth_count)
-            self._depth *= (1 / weighted_median(rho[determines_depth], weight[determines_depth]) / self._depth) ** share
+            self._depth *= (
+                1 / weighted_quantile(rho[determines_depth], weight[determines_depth], 0.5) / self._depth
+            ) ** share
 
     def _followed(self, gray: NDArray[np.uint8], T: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
         """Positions [N, 2] in the new image, and [N] True for corners that were tracked there and back."""

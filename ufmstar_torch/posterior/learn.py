@@ -41,12 +41,13 @@ STEPS = (0.7548776662466927, 0.5698402909980532)
 
 
 def learnt(
-    scene: Scene, field: Field, weight: Floats, left_out: LeftOut, running: Running, away: Floats
+    scene: Scene, field: Field, weight: Floats, left_out: LeftOut, running: Running, away: Floats,
+    of_surfaces: dict[str, tuple[float, float]],
 ) -> tuple[Floats, Floats]:  # fmt: skip
     """The packed memory after the frame; and [2, M] scores of held-out anchors with their weights (``conformal``).
-    ``away`` [R C]: distance of every node from evidence."""
+    ``away`` [R C]: distance of every node from evidence; ``of_surfaces``: sums from ``motion.surfaces``."""
     sums, scores = _of_discs(scene, weight, left_out, running, away)
-    above, below = running.added(_of_neighbours(scene, left_out, running) | sums)
+    above, below = running.added(_of_neighbours(scene, left_out, running) | sums | of_surfaces)
     first, b = [running.frames + 1, scene.grid.mean], field.coefficients
     slopes = running.with_slopes(b[1:])
     return np.concatenate([first, above, below, slopes, b, field.covariance.ravel()]), scores
@@ -94,7 +95,6 @@ def _of_discs(
     sums = {
         "wrong": (area * elsewhere, area * more_wrong),
         "inlier": (area * (1 - elsewhere) * factor * error**2 / inlier_variance, area * (1 - elsewhere)),
-        "between": (area * _student(error + offset, running.ratios["between"]), area),
         "calibration": (area * error**2 / stated, area),
     }
     added = {name: (float(above.sum()), float(below.sum())) for name, (above, below) in sums.items()}
@@ -104,13 +104,6 @@ def _of_discs(
     moments = second_moments(config, scale * (at_pixel + measured), p, offset, wide + measured)
     scores = np.stack([score(error, p, *moments), image_weights(away, area, everywhere)])
     return _of_pairs(scene, node, np.stack([error, variance, away, noise]), running) | added, scores
-
-
-def _student(residual: Floats, square: float) -> Floats:
-    """[N] squares of residuals with the weights of a Student-t distribution of two degrees of freedom and the squared
-    scale ``square``: their mean is the squared scale of largest likelihood."""
-    weighted: Floats = 3 * residual**2 / (2 + residual**2 / square)
-    return weighted
 
 
 def _of_pairs(

@@ -1,25 +1,33 @@
 """Motion as a second explanation of evidence: the surface moves, and its matched depth is wrong.
 
 Where a surface moves along its epipolar line, matching measures a wrong depth. The evidence then asks for another
-ratio of depth and prediction, y, than other surfaces. At a node, f is the part of y that the shared scale b . x does
-not explain. Over the surfaces of a stream that stand still, f is Student-t distributed with two degrees of freedom and
-the scale s ("between", learnt from held-out anchors); with motion it is normal with the variance s^2 + ``_MOVING``^2.
-With these densities, the log odds of motion at a node are
+ratio of depth and prediction, y, than other surfaces:
 
-    l = PRIOR + log(a + (1 - a) e^m) + ``_WEIGHT`` mean(r),
-    r = (1 - distance/reach) log(N(f; s^2 + _MOVING^2)/t_2(f; s)).
+    y = c + b_u u + b_v v + e.
+
+Over the surfaces of a stream that stand still, e is Student-t distributed with two degrees of freedom and the scale s
+("between"). c is the most probable constant of the frame by this density and a normal prior about its running mean
+("centre"), so that a large thing that moves does not shift it, as it shifts b. b's slope in log d is left out, because
+it would follow a near thing. s is the most likely scale of the recent frames. With motion, e is normal with the
+variance s^2 + ``_MOVING``^2. The log odds of motion at a node are
+
+    l = PRIOR + ``_WEIGHT`` mean(r) + log(a exp(``_WEIGHT`` mean(q)) + (1 - a) e^m),
+    r = (1 - distance/reach) log(N(e; s^2 + _MOVING^2)/t_2(e; s)).
 
 m is the log likelihood ratio of the tests in the images (``anchors.motion``), and a the share of motion that passes all
-tests. The mean is over neighbouring nodes of similar predicted depth, in a Gaussian window: the network bounds the
-region that moves. A surface counts as still unless there is evidence of motion: the probability of motion is
-P = max(0, (sigma(l) - c)/(1 - c)).
+tests. Such a thing follows the camera and looks farther than it is: e < 0 has the probability ``_NEARER``, and q is the
+log ratio of this one-sided density and the symmetric one, times 1 - distance/reach. The means are over neighbouring
+nodes of similar predicted depth, in a Gaussian window: the network bounds the region that moves. A surface counts as
+still unless there is evidence of motion: the probability of motion is P = max(0, (sigma(l) - c_0)/(1 - c_0)).
 
-With the probability P the local correction does not hold, as on another surface: the depth is that of the prediction
-with the shared scale, y - b . x is normal with the variance w (``update``). The stated depth stays that of the
-evidence, which is right more often than the prediction even where P exceeds one half; its variance is the second moment
-about it. So P adds to the probability p of another surface: 1 - (1 - p)(1 - P).
+With the probability P, the depth is that of the prediction at the scale of most surfaces: e is normal with the variance
+w (``update``). The stated depth stays that of the evidence, which is right more often than the prediction even where P
+exceeds one half; its variance is the second moment about it. P adds to the probability p of another surface:
+1 - (1 - p)(1 - P).
 
-The constants are fitted to eight tours with six moving things each, FastDepth and the demo's network.
+The constants are fitted to eight tours with six moving things each, FastDepth and the demo's network; ``_NEARER`` to
+six tours with and without things that move, FastDepth, an exact network and one that errs by another factor in every
+cube of space.
 """
 
 from __future__ import annotations
@@ -29,14 +37,56 @@ import math
 import numpy as np
 
 from ufmstar_torch.posterior.field import fast
-from ufmstar_torch.posterior.running import Floats
+from ufmstar_torch.posterior.running import Floats, Running
+from ufmstar_torch.posterior.scene import Scene
 
-# Standard deviation of log depth that motion adds.
-_MOVING = 0.8
-# Log odds of motion without evidence, share a, weight of the ratio's likelihood, and c.
+# Standard deviation of log depth that motion adds; probability that motion that passes all tests looks nearer.
+_MOVING, _NEARER = 0.8, 0.05
+# Log odds of motion without evidence, share a, weight of the ratio's likelihood, and c_0.
 _PRIOR, _PASSING, _WEIGHT, _CERTAIN = -1.57, 0.12, 1.06, 0.15
 # Window of the mean: standard deviation and half width [nodes], and difference of log d at which a weight is halved.
 _SIGMA, _HALF, _CONTRAST = 1.5, 3, 0.3
+# Number of nodes that count as one surface in the choice of c, and as one anchor in the estimate of s.
+_SURFACE, _ANCHOR = 40.0, 8.0
+# Standard deviation of c about its running mean; number of first candidates, and of iterations.
+_CHANGE, _CANDIDATES, _ITERATIONS = 0.15, 33, 8
+
+
+def surfaces(scene: Scene, b: Floats, running: Running) -> tuple[float, dict[str, tuple[float, float]]]:
+    """The constant c of a frame, and the sums for the ratios "centre" and "between" (``Running.added``).
+
+    Each iteration computes c for s by a step of iterated reweighting, and s for c. The first starts at the most
+    probable of some quantiles of y - b_u u - b_v v.
+
+    Args:
+        scene: of the frame.
+        b: [4] coefficients of the frame.
+        running: up to the frame before.
+    """
+    observed, nu, s2 = scene.observed, scene.config.degrees_of_freedom, running.ratios["between"]
+    mean, variance = running.ratios["centre"], _CHANGE**2 if running.frames else scene.config.prior_sigma**2
+    weights = np.bincount(observed.node, 1 / scene.noise, len(scene.grid.log_depth))
+    seen = np.flatnonzero(weights)
+    if not len(seen):
+        return mean, {"centre": (0.0, 0.0), "between": (0.0, 0.0)}
+    weighted = (observed.value - in_image(observed.features, b)) / scene.noise
+    y = np.bincount(observed.node, weighted, len(weights))[seen] / weights[seen]
+    candidates, count = np.append(np.quantile(y, np.linspace(0.02, 0.98, _CANDIDATES)), mean), len(y) / _ANCHOR
+    loss = (nu + 1) / 2 * np.log1p((y[:, None] - candidates) ** 2 / s2 / nu).sum(0) / _SURFACE
+    c, square = float(candidates[(loss + (candidates - mean) ** 2 / variance / 2).argmin()]), 0.0
+    for _ in range(_ITERATIONS):
+        weight = (nu + 1) / (nu + (y - c) ** 2 / s2)
+        precision = weight / s2 / _SURFACE
+        c = float((precision @ y + mean / variance) / (precision.sum() + 1 / variance))
+        square = float((weight * (y - c) ** 2).mean())
+        s2 = running.after("between", square * count, count)
+    return c, {"centre": (c * count, count), "between": (square * count, count)}
+
+
+def in_image(x: Floats, b: Floats) -> Floats:
+    """[N] b_u u + b_v v for features x [N, 4]."""
+    part: Floats = x[:, 2:] @ b[2:]
+    return part
 
 
 def tests_at(motion: Floats, height: int, width: int, rows: int, cols: int) -> Floats:
@@ -62,25 +112,27 @@ def _spread(u, v, value, sums, weights):
 
 
 def probability(
-    offset: Floats, log_depth: Floats, away: Floats, tests: Floats, between: float, size: tuple[int, int]
+    e: Floats, log_depth: Floats, away: Floats, tests: Floats, between: float, size: tuple[int, int]
 ) -> Floats:
     """[n] probability P that the surface at a node moves.
 
     Args:
-        offset: [n] f.
+        e: [n] ratios less those of most surfaces.
         log_depth: [n] of the prediction.
         away: [n] distance from evidence as a share of ``reach``.
         tests: [n] from :func:`tests_at`.
-        between: s^2, the squared scale of f over still surfaces.
+        between: s^2, the squared scale of e over still surfaces.
         size: R and C of the nodes.
     """
-    variance, square = between + _MOVING**2, offset**2
+    variance, square, near = between + _MOVING**2, e**2, np.maximum(1 - away, 0)
     moving = -(square / variance + math.log(2 * math.pi * variance)) / 2
     still = -1.5 * np.log1p(square / between / 2) - math.log(2 * math.sqrt(2 * between))
-    ratio = np.maximum(1 - away, 0) * (moving - still)
-    around = np.zeros(size)
-    _mean_around(ratio.reshape(size), log_depth.reshape(size), around)
-    odds = _PRIOR + np.log(_PASSING + (1 - _PASSING) * np.exp(tests)) + _WEIGHT * around.ravel()
+    side = np.where(e > 0, math.log(2 * (1 - _NEARER)), math.log(2 * _NEARER))
+    means = np.zeros((2, *size))
+    for value, mean in zip((near * (moving - still), near * side), means, strict=True):
+        _mean_around(value.reshape(size), log_depth.reshape(size), mean)
+    r, q = _WEIGHT * means.reshape(2, -1)
+    odds = _PRIOR + r + np.log(_PASSING * np.exp(q) + (1 - _PASSING) * np.exp(tests))
     P: Floats = np.maximum(1 / (1 + np.exp(-odds.clip(-50, 50))) - _CERTAIN, 0) / (1 - _CERTAIN)
     return P
 

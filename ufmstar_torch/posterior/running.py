@@ -8,7 +8,8 @@ Frames with anchors update these ratios:
 - unseen: increase of the error's variance with the distance from evidence
 - wrong: probability that the local correction does not hold
 - inlier: factor by which the variance is too small where the correction holds
-- between: squared scale of y - b . x over surfaces (``motion``)
+- between: squared scale of e, by which surfaces differ (``motion``)
+- centre: c, the constant about which most surfaces lie (``motion``); the only ratio that may be negative
 - calibration: mean z^2 of held-out anchors
 
 Each ratio is the quotient of two sums that fade towards a prior, so that few anchors change it little.
@@ -56,6 +57,7 @@ def ratios(config: PosteriorConfig) -> dict[str, Ratio]:
         "wrong": Ratio(config.wrong, weight, config.wrong / 10, 10 * config.wrong),
         "inlier": Ratio(1.0, weight, 0.05, 4.0),
         "between": Ratio(config.between**2, weight, 0.03**2, 1.0),
+        "centre": Ratio(0.0, 0.0, -LARGEST_LOG, LARGEST_LOG),
         "calibration": Ratio(0.0, 0.0, 0.0, 1e6),
     }
 
@@ -74,8 +76,10 @@ def restarted(packed: Tensor, config: PosteriorConfig) -> Tensor:
 
 def require(packed: Tensor) -> None:
     """Raise a ValueError if no anchors can have led to the memory [B, SIZE]."""
-    frames, mean, sums, _, covariance = packed.split([1, 1, 2 * RATIOS, SLOPES + FEATURES, _MATRIX], 1)
+    frames, mean, _, _, covariance = packed.split([1, 1, 2 * RATIOS, SLOPES + FEATURES, _MATRIX], 1)
     matrix = covariance.reshape(-1, FEATURES, FEATURES)
+    signed = 2 + list(ratios(PosteriorConfig())).index("centre")
+    sums = torch.cat([packed[:, 2:signed], packed[:, signed + 1 : 2 + 2 * RATIOS]], 1)
     scale = matrix.abs().amax((1, 2)).clamp(1e-300, 1e300)
     low = torch.linalg.eigvalsh(matrix / scale[:, None, None])[:, 0]
     faults = {
@@ -133,6 +137,14 @@ class Running(NamedTuple):
         n = fade * self.below + (1 - fade) * weight + below
         total = fade * self.above + (1 - fade) * weight * value + above
         return np.minimum(np.maximum(total, least * n), largest * n), n
+
+    def after(self, name: str, above: float, below: float) -> float:
+        """A ratio after a frame with its numerator and denominator."""
+        k, prior = list(self.ratios).index(name), ratios(self.config)[name]
+        fade = 0.5 ** (1 / self.config.half_life)
+        n = fade * self.below[k] + (1 - fade) * prior.weight + below
+        total = fade * self.above[k] + (1 - fade) * prior.weight * prior.value + above
+        return float(min(max(total / n, prior.least), prior.largest))
 
     def with_slopes(self, slopes: Floats) -> Floats:
         """Mean slopes [3] after a frame with anchors whose coefficients have the ``slopes`` [3]."""

@@ -35,8 +35,10 @@ Variance over the squared depth at a node, with share = min(1, distance/reach):
   Gaussian window of width ``near``, and of one virtual anchor with z^2 = 1.
 - ``steepness`` is the variance of f over a node and its neighbours: a depth edge may be one node off in f.
 - m exceeds v where v is large, because the error of the depth is log-normal. Errors beyond a factor F (``farthest``) do
-  not count: without this limit, errors that never occur would decide the variance. The output ``inlier`` is m(v).
-- p is the probability that the depth is of another surface than its evidence: the output ``outlier``.
+  not count: without this limit, errors that never occur would decide the variance. The output ``inlier`` is m(v), at
+  most its 70 % quantile over the image.
+- p is the probability that the depth is of another surface than its evidence. Where the inliers' variance exceeds the
+  usual one of the image, a larger output ``outlier`` stands for the difference (``distribution.divided``).
 - The ratios include the held-out anchors of this frame.
 
 Before the first anchor the network may be off by any factor. The squared share of the variance of b's constant in that
@@ -56,7 +58,9 @@ a is the variance of the anchors' y in a Gaussian window: depths differ more bet
 farther the evidence, the more surfaces lie between. v and w are at most ``widest``. Contradictory evidence thus limits
 the certainty of every pixel.
 
-Anchors that matching has measured are wrong on surfaces that move: p then includes the probability of ``motion``.
+Anchors that matching has measured are wrong on surfaces that move. With the probability P of ``motion``, the depth is
+that of the prediction at the scale of most surfaces: the variance becomes (1 - P) V + P tail, with the tail about
+their ratio instead of b . x, and p includes P.
 
 A stream whose anchors were all invalid so far has the network's depth with the variance of a node without evidence. A
 stream without anchors has UfM*'s output.
@@ -77,9 +81,10 @@ from ufmstar_torch.frames.frame import AnchorInput, FrameInput
 from ufmstar_torch.kernels.cpu.calls import array, each
 from ufmstar_torch.posterior.cells import cell_means, features, read
 from ufmstar_torch.posterior.config import PosteriorConfig
+from ufmstar_torch.posterior.distribution import divided
 from ufmstar_torch.posterior.field import at
 from ufmstar_torch.posterior.learn import learnt
-from ufmstar_torch.posterior.motion import probability, tests_at
+from ufmstar_torch.posterior.motion import in_image, probability, surfaces, tests_at
 from ufmstar_torch.posterior.running import Floats, Running
 from ufmstar_torch.posterior.scene import (
     MOST_WRONG,
@@ -114,8 +119,8 @@ class Posterior:
         variance: [B, H, W] [m^2]; UfM*'s in a stream without anchors.
         calibration: [B] running mean z^2 of held-out anchors: 1 = as predicted, above = too certain; NaN before any.
         unseen: [B] variance of y per image width of distance from evidence.
-        outlier: [B, H, W] probability in [0, 1] that a pixel lies on another surface than its evidence; NaN where not
-            valid or in a stream without anchors.
+        outlier: [B, H, W] probability in [0, 1] that the error is not one of the inliers: the pixel lies on another
+            surface than its evidence, or the surface moves; NaN where not valid or in a stream without anchors.
         inlier: [B, H, W] variance if the pixel does not [m^2]; UfM*'s in a stream without anchors.
         scores: for each stream, [2, M] scores of the frame's held-out anchors and their weights (``conformal``).
     """
@@ -193,9 +198,9 @@ def _of_stream(
     scene = scene_of(grid, depth, valid, anchors, running)
     field, left_out, weight = fitted(scene)
     away = away_from(scene, weight * config.weak_sigma**2 >= 1)
-    scores = np.zeros((2, 0))
+    scores, (c, of_surfaces) = np.zeros((2, 0)), surfaces(scene, field.coefficients, running)
     if has_valid:
-        memory, scores = learnt(scene, field, weight, left_out, running, away)
+        memory, scores = learnt(scene, field, weight, left_out, running, away, of_surfaces)
     else:
         memory = running.drifted(grid.mean) if running.frames and valid.any() else packed
     node = np.arange(rows * cols)
@@ -211,11 +216,14 @@ def _of_stream(
     scale = local_scale(scene, left_out, all_anchors)
     p = np.minimum(updated.ratios["wrong"] * wrong_factor(config, away, scale), MOST_WRONG)
     p, wide = misscaled(config, share, p, wide)
+    variance, inlier = second_moments(config, scale * variance, p, offset, wide)
     if anchors.motion is not None:
         tests = tests_at(anchors.motion, depth.shape[0], depth.shape[1], rows, cols)
-        P = probability(offset, grid.log_depth, away / config.reach, tests, updated.ratios["between"], (rows, cols))
-        p = 1 - (1 - p) * (1 - P)
-    variance, inlier = second_moments(config, scale * variance, p, offset, wide)
+        e = mean - c - in_image(x, b)
+        P = probability(e, grid.log_depth, away / config.reach, tests, updated.ratios["between"], (rows, cols))
+        one = np.ones_like(P)
+        p, variance = 1 - (1 - p) * (1 - P), (1 - P) * variance + P * second_moments(config, variance, one, e, wide)[0]
+    inlier, p = divided(variance, inlier, p)
     offset = offset + slopes_away(config, x, away, b[1:], updated.slopes)
     nodes = np.stack([grid.log_depth, offset, variance, inlier, p, away / config.reach], 1)
     depth, spread, inlier, p = read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
