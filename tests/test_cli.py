@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -230,7 +231,7 @@ def test_messages_do_not_depend_on_the_encoding_of_the_terminal(tmp_path, path):
     """Also an option's error, which tyro frames in other letters; a file's name that it cannot show is escaped."""
     command = [sys.executable, "-m", "ufmstar_torch.cli"]
     odd = tmp_path / "grün \udcff"
-    path.rename(odd)
+    shutil.copytree(path, odd)
     for words, expected in ((("run", "x", "--poses", "foo"), "invalid choice 'foo' for argument '--poses'"),
                             (("data", "check", str(odd)), "gr\\xfcn \\udcff")):  # fmt: skip
         environment = {**os.environ, "PYTHONIOENCODING": "ascii"}

@@ -78,7 +78,7 @@ def test_images_are_compared_with_poses_at_the_beginning_alone(monkeypatch):
     for frame in (*video()[:3], None, *video()[:2]):
         model.reset() if frame is None else model(frame.image, frame.T_world_cam, frame.intrinsics)
     assert added == [1, 2, 1]
-    with pytest.raises(ValueError, match="check_poses must be a number of images of at least 0, got -1"):
+    with pytest.raises(ValueError, match="check_poses must be a whole number of at least 0, got -1"):
         UncertainDepth(lambda image: image[:, 0], check_poses=-1)
 
 

@@ -317,7 +317,7 @@ def test_no_frames_at_all(tmp_path, layout):
         ({"truth_scale": 0}, "truth_scale is in metres per unit"),
         ({"fps": 0}, "fps must be positive"),
         ({"max_pose_gap": -1}, "max_pose_gap must be a time"),
-        ({"max_time_difference": float("nan")}, "max_time_difference must be a time"),
+        ({"max_time_difference": float("nan")}, "max_time_difference must be a number, got nan"),
         ({"images": "rgb"}, "layout 'tum' takes no images"),
         ({"topics": ["/image"]}, "layout 'tum' takes no topics: topics is an option of bag$"),
         ({"drive": 3}, "layout 'tum' takes no drive: drive is an option of kitti360$"),

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.options import Positional, arg, reader
 from ufmstar_torch.eval.methods.method import UFM_STAR
-from ufmstar_torch.eval.report.quantities import count
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -47,6 +46,7 @@ read = reader(RecalibrateOptions, "ufmstar recalibrate")
 def main(options: RecalibrateOptions) -> int:
     """Fit, write the file, and print the figures on held-out sequences. Returns the exit code."""
     from ufmstar_torch.eval.report.data import load_results
+    from ufmstar_torch.eval.report.quantities import count
     from ufmstar_torch.eval.report.table import aligned
 
     with usage_errors(ValueError):

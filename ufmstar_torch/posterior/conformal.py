@@ -33,7 +33,7 @@ LEVELS: Final = (0.5, 0.9, 0.99)
 NORMAL: Final = (0.6744897501960817, 1.6448536269514722, 2.5758293035489004)
 _SLOPE: Final = np.array([2 * z * math.exp(-z * z / 2) / math.sqrt(2 * math.pi) for z in NORMAL])
 # Factor from the scores' quantiles to the pixels', fitted on tours (docs/measure_thresholds.py --fit).
-TRANSFER: Final = (1.02, 1.15, 1.1)
+TRANSFER: Final = (1.13, 1.19, 1.05)
 RATE: Final = 0.1  # step of the adaptation in frames with many scores
 PRIOR: Final = 3.0  # number of frames that the start counts for
 FEW: Final = 20.0  # number of scores of a frame at which its step is halved
