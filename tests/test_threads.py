@@ -65,6 +65,32 @@ def test_a_second_thread_is_refused_by_name_and_changes_nothing():
     assert model.ufm.frames.tolist() == [3]
 
 
+def test_a_second_thread_is_refused_while_a_stream_waits_for_its_network(monkeypatch):
+    network, fused = Waiting(), threading.Event()
+    model = UncertainDepth(network, posterior=False, check_poses=0)
+    original = UncertainDepth._fused
+
+    def announced(self, *args, **kwargs):
+        try:
+            return original(self, *args, **kwargs)
+        finally:
+            fused.set()
+
+    monkeypatch.setattr(UncertainDepth, "_fused", announced)
+    results = []
+    thread = threading.Thread(target=lambda: results.extend(model.stream([(IMAGE, POSE, K)] * 2)), name="camera")
+    thread.start()
+    try:
+        assert fused.wait(60)
+        assert network.inside.wait(60)
+        with pytest.raises(RuntimeError, match="thread 'camera' is in UncertainDepth"):
+            model.reset()
+    finally:
+        network.go_on.set()
+        thread.join()
+    assert len(results) == model.image_index == 2
+
+
 def test_every_frame_of_many_threads_is_counted_or_refused():
     ufm, refused = UfMStar(), []
     start = threading.Barrier(3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -83,6 +83,7 @@ class _Predicted:
     "mean_uncertainty",
     "_predicted",
     "_fused",
+    "_fused_beside",
     "reset",
     "stream_state",
     "load_stream_state",
@@ -246,13 +247,22 @@ class UncertainDepth(NetworksInTurn):
                         yield self._fused(waiting)
                     waiting = ahead
                     continue
-                predicting = pool.submit(self._predict, *frame, number=self._next + 1)
-                out = self._fused(waiting)
-                wait([predicting])  # the networks are idle while the caller has the result
+                out, predicting = self._fused_beside(waiting, pool, frame)
                 yield out
                 waiting = predicting.result()
         if waiting is not None:
             yield self._fused(waiting)
+
+    def _fused_beside(
+        self, predicted: _Predicted, pool: ThreadPoolExecutor, frame: Iterable[Any]
+    ) -> tuple[UncertaintyOutput, Future[_Predicted]]:
+        """The result of an image, and the prediction for the next one, which the networks compute in the pool's thread;
+        they are idle when this returns."""
+        predicting = pool.submit(self._predict, *frame, number=self._next + 1)
+        try:
+            return self._fused(predicted), predicting
+        finally:
+            wait([predicting])
 
     def _networks_on_cpu(self) -> bool:
         """True if a second thread may run the networks: those on an accelerator run beside the CPU anyway, and autocast
