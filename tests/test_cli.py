@@ -227,6 +227,13 @@ def test_a_reader_that_closes_the_output_ends_the_command_quietly(words, unbuffe
     assert not [text for text in ("failed", "Broken pipe", "Traceback", "Exception") if text in ended.stderr]
 
 
+def test_a_process_without_an_output_runs_a_command():
+    """As ``ufmstar --version >&-`` does."""
+    code = "import sys; sys.stdout = None; from ufmstar_torch.cli import main; sys.exit(main(['--version']))"
+    ended = subprocess.run([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
 def test_messages_do_not_depend_on_the_encoding_of_the_terminal(tmp_path, path):
     """Also an option's error, which tyro frames in other letters; a file's name that it cannot show is escaped."""
     command = [sys.executable, "-m", "ufmstar_torch.cli"]

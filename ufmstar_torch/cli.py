@@ -64,7 +64,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             return _main(list(sys.argv[1:] if arguments is None else arguments))
         finally:
-            sys.stdout.flush()
+            if sys.stdout is not None:  # it is None in a process without an output
+                sys.stdout.flush()
     except BrokenPipeError:  # the reader of the output has closed it, as `head` does
         _silence()
         return CLOSED
