@@ -1,4 +1,4 @@
-"""UfM* as a module: the only stateful class of the core."""
+"""UfM* as a module: the state of all streams, and the step and the corrections that change it."""
 
 from __future__ import annotations
 

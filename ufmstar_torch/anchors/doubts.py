@@ -110,5 +110,5 @@ class AnchorDoubts:
 
 
 def _within(pixel: NDArray[np.float64], size: tuple[int, int]) -> int:
-    """How many of the whole positions [N, 2] lie in an image of ``size`` (H, W)."""
+    """The number of whole positions [N, 2] in an image of ``size`` (H, W)."""
     return int(np.count_nonzero(((pixel >= 0) & (pixel < size[::-1])).all(1)))

@@ -131,8 +131,8 @@ MAPS: dict[str, MapKind] = {
     "anchored": MapKind("B", "m^2", "the mean square error at anchors in excess of M + A + E"),
     "bias": MapKind("r", "1", "the relative error g/d - 1 that anchors let expect"),
     "measured": MapKind("s", "1", "the share of M that rests on surfaces seen from different places"),
-    "posterior_outlier": MapKind("p", "1", "the probability of another surface than that of the correcting anchors"),
-    "posterior_inlier_variance": MapKind("V_1", "m^2", "the variance on the surface of these anchors"),
+    "posterior_outlier": MapKind("p", "1", "the probability of another surface than that of the anchors, or of motion"),
+    "posterior_inlier_variance": MapKind("V_1", "m^2", "the variance otherwise, limited to a quantile of the image's"),
     "confidence": MapKind("c", "1", "the network's confidence, in its own unit"),
     "features": MapKind("", "1", "the regressed further entries of H, [B, H, W, F], in the caller's units"),
 }

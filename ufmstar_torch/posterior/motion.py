@@ -11,7 +11,7 @@ Over the surfaces of a stream that stand still, e is Student-t distributed with 
 it would follow a near thing. s is the most likely scale of the recent frames. With motion, e is normal with the
 variance s^2 + ``_MOVING``^2. The log odds of motion at a node are
 
-    l = PRIOR + ``_WEIGHT`` mean(r) + log(a exp(``_WEIGHT`` mean(q)) + (1 - a) e^m),
+    l = ``_PRIOR`` + ``_WEIGHT`` mean(r) + log(a exp(``_WEIGHT`` mean(q)) + (1 - a) e^m),
     r = (1 - distance/reach) log(N(e; s^2 + _MOVING^2)/t_2(e; s)).
 
 m is the log likelihood ratio of the tests in the images (``anchors.motion``), and a the share of motion that passes all

@@ -9,7 +9,7 @@ to the network's shape at the stream's scale. At the distance a from evidence th
 mean slopes of the stream (``running``), with the shares l^2/(a^2 + l^2) and a^2/(a^2 + l^2), l = ``slope_reach``: in a
 turn, anchors at one side of the image are no evidence of the network's shape at the other.
 
-f is a Gaussian field on a grid whose links are weaker across edges of the predicted depth (``grid``, ``field``). An
+f is a Gaussian field on a grid whose links are weaker across edges of the predicted depth (``scene``, ``field``). An
 anchor of standard deviation s observes y with the variance
 
     n = roughness + blur^2 + noise s^2/g^2 + alone/N.
@@ -121,7 +121,7 @@ class Posterior:
         unseen: [B] variance of y per image width of distance from evidence.
         outlier: [B, H, W] probability in [0, 1] that the error is not one of the inliers: the pixel lies on another
             surface than its evidence, or the surface moves; NaN where not valid or in a stream without anchors.
-        inlier: [B, H, W] variance if the pixel does not [m^2]; UfM*'s in a stream without anchors.
+        inlier: [B, H, W] variance of the inliers [m^2]; UfM*'s in a stream without anchors.
         scores: for each stream, [2, M] scores of the frame's held-out anchors and their weights (``conformal``).
     """
 

@@ -35,8 +35,8 @@ def segment(
 
     Returns:
         The mixture [B, K] in the camera frame in order of emission: sample covariance (divisor N - 1; zeros for N = 1;
-        eigenvalues not floored), weight = N [px], disagreement 0, count 1. Its dtype is that of the depth. K is the
-        largest number of Gaussians of any stream, at least 1; on an accelerator, :func:`max_gaussians`.
+        eigenvalues not floored), weight = N [px], zeros for what views compare. Its dtype is that of the depth. K is
+        the largest number of Gaussians of any stream, at least 1; on an accelerator, :func:`max_gaussians`.
         Labels [B, H, W] int64: each pixel's slot, -1 = none.
     """
     frame = Frame.of(depth, intrinsics, limits)

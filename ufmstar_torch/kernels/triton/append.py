@@ -1,4 +1,4 @@
-"""First and last part of a step on a GPU: relative camera poses, and the components that a frame adds."""
+"""Two parts of a step on a GPU: relative camera poses, and the components that a frame adds."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from ufmstar_torch.kernels.triton.launch import launch
 from ufmstar_torch.kernels.triton.matrices import exact, load_symmetric, lowest_bit, moved, turned
 from ufmstar_torch.steps.correspond import Correspondence
 
-WORD = 32  # candidates c in one entry of ``Pairs.bits``
+WORD = 32  # candidates c in one word of the matches (:func:`match_bits`)
 _CHUNK = 64
 
 
