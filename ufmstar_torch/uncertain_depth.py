@@ -226,7 +226,7 @@ class UncertainDepth(NetworksInTurn):
         """The predictions of a video, in order, with the networks one image ahead of UfM*.
 
         Both run at the same time: networks on a GPU with ``multiview_device="cpu"``, those on the CPU in a thread of
-        their own. Each result is yielded after the next frame has been read.
+        their own, except under autocast. Each result is yielded after the next frame has been read.
 
         Args:
             frames: image, pose and intrinsics of each frame, as in :meth:`forward`.
