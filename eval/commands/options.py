@@ -224,7 +224,7 @@ def _description(options: type) -> str:
 
 
 def _rarer(text: str, options: type) -> str:
-    """How to type an unknown option that is a rarer one of the readers; "" for others."""
+    """The words for an unknown option that is a rarer one of the readers; "" for others."""
     from ufmstar_torch.eval.sequences.options import Options
 
     unknown = re.match(r"Unrecognized options: --([\w-]+)", text)

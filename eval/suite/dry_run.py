@@ -1,4 +1,4 @@
-"""What an evaluation would do: its rows with their networks, and its sequences with their number of frames."""
+"""The plan of an evaluation: its rows with their networks, and its sequences with their number of frames."""
 
 from __future__ import annotations
 
