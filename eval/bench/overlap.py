@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from itertools import islice
 from typing import Any
 
@@ -34,16 +35,15 @@ def time_overlap(network: TimedNetwork, sequence: FrameSequence, *, device: torc
     whole, alone = list[float](), list[float]()
     with pinned_threads(plan.threads or 1):
         model = UncertainDepth(network.members, preprocess=network.preprocess, check_poses=0)
-        results = model.stream(_inputs(frames, device))
-        for frame in frames[:-1]:  # nothing overlaps the last one
-            started = time.perf_counter()
-            next(results)
-            whole.append(1e3 * (time.perf_counter() - started))
-            x, K = network.prepare(frame, device)
-            started = time.perf_counter()
-            network.predict(DEPTH, x, K)
-            alone.append(1e3 * (time.perf_counter() - started))
-        results.close()
+        with closing(model.stream(_inputs(frames, device))) as results:
+            for frame in frames[:-1]:  # nothing overlaps the last one
+                started = time.perf_counter()
+                next(results)
+                whole.append(1e3 * (time.perf_counter() - started))
+                x, K = network.prepare(frame, device)
+                started = time.perf_counter()
+                network.predict(DEPTH, x, K)
+                alone.append(1e3 * (time.perf_counter() - started))
     counted = slice(plan.warm_up, None)
     return {"latency": spread(whole[counted]), "ratio_to_network": paired_ratio(whole[counted], alone[counted])}
 
