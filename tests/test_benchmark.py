@@ -13,9 +13,12 @@ from layouts import write_tum
 from onnx_files import small_network, write_fastdepth
 
 from ufmstar_torch import cli
+from ufmstar_torch.eval.bench.measure import Plan
+from ufmstar_torch.eval.bench.overlap import time_overlap
 from ufmstar_torch.eval.bench.settings import BenchSettings
 from ufmstar_torch.eval.bench.timing import STAGES, StagedStep, paired_ratio, pinned_threads, spread
 from ufmstar_torch.eval.commands.bench import main, read
+from ufmstar_torch.eval.sequences import open_sequence
 
 # ---- statistics and clocks ----
 
@@ -61,6 +64,11 @@ def test_every_moment_belongs_to_the_stage_that_needs_it(work):
     medians = {name: times["median_ms"] for name, times in summary["stages"].items()}
     assert medians == pytest.approx({name: 2000 + 100 * number for number, name in enumerate(STAGES)})
     assert summary["stages_total"]["median_ms"] == pytest.approx(sum(medians.values()))
+
+
+def test_a_single_timed_frame_overlaps_nothing():
+    sequence = open_sequence("tour:1?frames=2&size=48x64")
+    assert time_overlap(None, sequence, device=torch.device("cpu"), plan=Plan(frames=1, warm_up=1)) is None
 
 
 def threads():

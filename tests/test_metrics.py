@@ -391,3 +391,24 @@ print(loaded, issubclass(ECEDelta, torchmetrics.Metric), issubclass(torchmetrics
 def test_metrics_load_no_other_metrics_of_torchmetrics_until_these_are_used():
     process = subprocess.run([sys.executable, "-c", LEAN], capture_output=True, text=True, check=False)
     assert process.stdout.splitlines() == ["[] True True"], process.stderr
+
+
+THREADS = """
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
+from ufmstar_torch.eval.metrics import ECEDelta
+together = Barrier(3)
+
+def name(_):
+    together.wait()
+    from torchmetrics import MeanSquaredError
+    return MeanSquaredError.__name__
+
+with ThreadPoolExecutor(3) as pool:
+    print(*pool.map(name, range(3)))
+"""
+
+
+def test_threads_wait_until_torchmetrics_is_whole():
+    process = subprocess.run([sys.executable, "-c", THREADS], capture_output=True, text=True, check=False)
+    assert process.stdout.split() == ["MeanSquaredError"] * 3, process.stderr

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from itertools import islice
 from typing import Any
 
@@ -17,7 +18,9 @@ from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.eval.sequences.images import image_tensor
 
 
-def time_overlap(network: TimedNetwork, sequence: FrameSequence, *, device: torch.device, plan: Plan) -> dict[str, Any]:
+def time_overlap(
+    network: TimedNetwork, sequence: FrameSequence, *, device: torch.device, plan: Plan
+) -> dict[str, Any] | None:
     """Time the frames of a stream, each followed by the network alone on the same frame, in wall time.
 
     Args:
@@ -27,23 +30,25 @@ def time_overlap(network: TimedNetwork, sequence: FrameSequence, *, device: torc
         plan: as for ``measure.measure``, with threads: those of the network, and as many of UfM*.
 
     Returns:
-        "latency": time of a frame of the stream [ms]; "ratio_to_network": over that of the network alone.
+        "latency": time of a frame of the stream [ms]; "ratio_to_network": over that of the network alone. None if only
+        one frame follows the warm-up, since nothing overlaps the last one.
     """
     wanted = None if plan.frames is None else plan.warm_up + plan.frames
     frames = list(islice(sequence.readable(lambda error: None), wanted))
+    if len(frames) < plan.warm_up + 2:
+        return None
     whole, alone = list[float](), list[float]()
     with pinned_threads(plan.threads or 1):
         model = UncertainDepth(network.members, preprocess=network.preprocess, check_poses=0)
-        results = model.stream(_inputs(frames, device))
-        for frame in frames[:-1]:  # nothing overlaps the last one
-            started = time.perf_counter()
-            next(results)
-            whole.append(1e3 * (time.perf_counter() - started))
-            x, K = network.prepare(frame, device)
-            started = time.perf_counter()
-            network.predict(DEPTH, x, K)
-            alone.append(1e3 * (time.perf_counter() - started))
-        results.close()
+        with closing(model.stream(_inputs(frames, device))) as results:
+            for frame in frames[:-1]:
+                started = time.perf_counter()
+                next(results)
+                whole.append(1e3 * (time.perf_counter() - started))
+                x, K = network.prepare(frame, device)
+                started = time.perf_counter()
+                network.predict(DEPTH, x, K)
+                alone.append(1e3 * (time.perf_counter() - started))
     counted = slice(plan.warm_up, None)
     return {"latency": spread(whole[counted]), "ratio_to_network": paired_ratio(whole[counted], alone[counted])}
 

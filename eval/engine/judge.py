@@ -23,7 +23,7 @@ from ufmstar_torch.eval.engine.stream import FrameResult
 from ufmstar_torch.eval.methods import method
 from ufmstar_torch.eval.methods.row import Row
 
-if TYPE_CHECKING:  # torchmetrics takes seconds to import, and a sequence without ground truth does not need it
+if TYPE_CHECKING:  # a sequence without ground truth does not need torchmetrics, whose import takes a while
     from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 
 # Names of a run's figures: of UfM*, of the network alone, and of the posterior if there is one.

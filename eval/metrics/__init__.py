@@ -1,6 +1,6 @@
 """Streaming metrics (section "Metrics for Uncertainty"): sums only, so that memory does not grow with frames.
 
-The names below load torchmetrics (seconds) when they are first used, not when this package is imported.
+The names below load the base of torchmetrics when they are first used, not when this package is imported.
 """
 
 from __future__ import annotations

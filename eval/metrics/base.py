@@ -171,8 +171,8 @@ class SumMetric(Metric):
 
     @abstractmethod
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        """The pixels' contribution to each state, by name. On a GPU it must not wait
-        for a value, so it selects pixels by ``Selection``."""
+        """The pixels' contribution to each state, by name. On a GPU it must not wait for a value, so it selects pixels
+        by ``Selection``."""
 
     def merge_state(self, incoming_state: dict[str, Any] | Metric) -> None:
         """Add another metric's sums to this one's. Raises ValueError: the other metric has other settings."""

@@ -13,6 +13,7 @@ from ufmstar_torch.eval.engine.judge import CONFIDENCE
 from ufmstar_torch.eval.engine.record import FORMAT, METRICS, Record, ResultsError, Sums
 from ufmstar_torch.eval.methods.row import Row, plain_rows, row_from
 from ufmstar_torch.eval.suite.folder import FAILED, EvalFolder
+from ufmstar_torch.files.limits import read_text
 
 Curves = Mapping[str, list[float]]
 
@@ -162,7 +163,7 @@ def _about(out: Path) -> dict[str, Any]:
 def _read_json(path: Path) -> Any:
     """The content of a JSON file, None if it does not exist."""
     try:
-        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+        return json.loads(read_text(path)) if path.is_file() else None
     except (ValueError, RecursionError) as error:
         raise ResultsError(f"{path} is not JSON: {error}") from error
 

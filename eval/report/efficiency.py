@@ -172,7 +172,7 @@ def _notes(run: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], network: M
     return [*notes, *(f"{method} is left out: {why}." for method, why in run["left_out"].items())]
 
 
-# ---- the paper's figures of the time of UfM*'s stages, and of cumulative time and energy on a small computer ----
+# ---- the paper's figure of the time of UfM*'s stages ----
 
 # The stages of a step of UfM*, from dark to light, for prints in grey.
 STAGES = {

@@ -43,7 +43,7 @@ def write_report(out: Path, *, figures: bool = True) -> Report:
     results = load_results(out, with_sums=figures)
     EVALUATION.require_no_links(out)
     # Temporary files of a killed report; those of eval.json and the records belong to `ufmstar eval`.
-    for pattern in ("tables/.*.tmp", "figures/.*.tmp", ".results.*.tmp", ".table.*.tmp", ".report.*.tmp"):
+    for pattern in ("tables/.*.tmp", "figures/.*.tmp", ".results.*.tmp", ".report.*.tmp"):
         remove_temporaries(out.glob(pattern))
     tables = all_tables(results)
     files, undrawn = [write_tidy(results), *write_tables(out / "tables", tables)], dict[str, str]()
