@@ -7,7 +7,7 @@ The second argument is the run's recording, whose ground truth is compared; with
     python examples/tsdf.py out/tour "tour:5?frames=60&size=120x160"
 """
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -89,4 +89,8 @@ def main(out, recording=None):
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), *sys.argv[2:3])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path, help="folder of `ufmstar run`")
+    parser.add_argument("sequence", nargs="?", help="the run's recording, for its ground truth")
+    arguments = parser.parse_args()
+    main(arguments.out, arguments.sequence)
