@@ -325,7 +325,7 @@ def _require_size(checkpoint: Checkpoint, dtype: torch.dtype) -> None:
         with torch.device("meta"):
             config = CONFIG_MAPPING[checkpoint.model_type].from_dict(checkpoint.config)
             model: nn.Module = AutoModelForDepthEstimation.from_config(config, dtype=dtype)
-    except (*DAMAGE, NotImplementedError, StrictDataclassError) as error:
+    except (*DAMAGE, StrictDataclassError) as error:
         raise _unbuilt(checkpoint, error) from error
     size = sum(tensor.nbytes for tensor in (*model.parameters(), *model.buffers()))
     stored = sum(file.stat().st_size for file in folder.iterdir() if file.suffix in (".safetensors", ".bin"))

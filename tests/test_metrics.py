@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 import warnings
 from collections import Counter
 
@@ -376,39 +374,3 @@ class TestRanking:
         sure = v.sqrt() <= 0.2
         got = figures(NLLByError(), d, v, g, sure)["nll_by_error"]
         np.testing.assert_array_equal(got, figures(NLLByError(), d[sure], v[sure], g[sure])["nll_by_error"])
-
-
-LEAN = """
-import sys
-from ufmstar_torch.eval.metrics import ECEDelta
-loaded = sorted(name for name in ("torchvision", "transformers", "torch._dynamo") if name in sys.modules)
-import torchmetrics
-whole = torchmetrics.MeanMetric, torchmetrics.utilities.data, torchmetrics.functional, torchmetrics.__version__
-print(loaded, issubclass(ECEDelta, torchmetrics.Metric), issubclass(torchmetrics.MeanMetric, torchmetrics.Metric))
-"""
-
-
-def test_metrics_load_no_other_metrics_of_torchmetrics_until_these_are_used():
-    process = subprocess.run([sys.executable, "-c", LEAN], capture_output=True, text=True, check=False)
-    assert process.stdout.splitlines() == ["[] True True"], process.stderr
-
-
-THREADS = """
-from concurrent.futures import ThreadPoolExecutor
-from threading import Barrier
-from ufmstar_torch.eval.metrics import ECEDelta
-together = Barrier(3)
-
-def name(_):
-    together.wait()
-    from torchmetrics import MeanSquaredError
-    return MeanSquaredError.__name__
-
-with ThreadPoolExecutor(3) as pool:
-    print(*pool.map(name, range(3)))
-"""
-
-
-def test_threads_wait_until_torchmetrics_is_whole():
-    process = subprocess.run([sys.executable, "-c", THREADS], capture_output=True, text=True, check=False)
-    assert process.stdout.split() == ["MeanSquaredError"] * 3, process.stderr

@@ -199,7 +199,7 @@ READS = {
 @pytest.mark.skipif(not Path("/dev/zero").exists(), reason="this system has no /dev/zero")
 @pytest.mark.parametrize("read", READS.values(), ids=READS)
 def test_a_file_without_an_end(read, tmp_path):
-    """A device, and a pipe that nobody writes to."""
+    """Each reader refuses a device that never ends and a pipe that has no writer, instead of waiting for them."""
     suffix = "toml" if read is suite_named else "txt"
     endless, pipe = tmp_path / f"endless.{suffix}", tmp_path / f"pipe.{suffix}"
     endless.symlink_to("/dev/zero")

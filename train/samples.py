@@ -80,8 +80,9 @@ class SampleDataset(Dataset[Sample]):
 
 def joined(samples: Sequence[Sample], how: Callable[[list[Tensor]], Tensor] = torch.cat) -> Sample:
     """The values of several samples joined along their first dimension; a loader's ``collate_fn``."""
-    values: Any = {name: how([one[name] for one in samples]) for name in Sample.__annotations__}  # type: ignore[literal-required]
-    return values
+    values: list[Any] = list(samples)
+    joint: Any = {name: how([one[name] for one in values]) for name in Sample.__annotations__}
+    return joint
 
 
 def make_sample(frame: Frame, preprocess: Preprocess) -> Sample:

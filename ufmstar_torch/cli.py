@@ -53,7 +53,8 @@ _MOST_THREADS = 64
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command and return its exit code: 0 done, 1 failed, 2 wrong usage, 130 interrupted, 141 nobody reads on.
+    """Run a command and return its exit code: 0 done, 1 failed, 2 wrong usage, 130 interrupted, 141
+    the reader closed the output.
 
     Args:
         arguments: without the program's name; None = ``sys.argv[1:]``.
@@ -72,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(words: Sequence[str]) -> int:
-    """Run the command of the words and return its exit code. Raises BrokenPipeError: nobody reads the output."""
+    """Run the command of the words and return its exit code. Raises BrokenPipeError: the reader closed the output."""
     if words[:1] in ([], ["-h"], ["--help"]):
         commands = "\n".join(f"  {name:13}{purpose}" for name, (_, purpose) in COMMANDS.items())
         print(_HELP.format(commands=commands), end="")

@@ -265,8 +265,8 @@ class UncertainDepth(NetworksInTurn):
             wait([predicting])
 
     def _networks_on_cpu(self) -> bool:
-        """True if a second thread may run the networks: those on an accelerator run beside the CPU anyway, and autocast
-        holds for one thread."""
+        """True if :meth:`stream` runs the networks in a thread of their own. An accelerator needs no thread to work
+        beside the CPU, and autocast is valid in the caller's thread alone."""
         device = self._device()
         return (device is None or device.type == "cpu") and not torch.is_autocast_enabled("cpu")
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # a sequence without ground truth does not need torchmetrics,
 
 # Names of a run's figures: of UfM*, of the network alone, and of the posterior if there is one.
 UFM, ALONE, POSTERIOR = "ufm", "network_alone", "posterior"
-# Names of a row's sums, beside METRICS.
+# Names under which a row stores its sums, in addition to those of METRICS.
 BY_ERROR, CONFIDENCE = "nll_by_error", "confidence"
 EACH = 512  # evenly spaced pixels of a frame for ``ufmstar recalibrate --covariate confidence``
 # The user's metrics by name (``sequences.plugins``).

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
-
-from ufmstar_torch.eval.metrics.torchmetrics_import import Metric
+from torchmetrics import Metric
 
 COUNT, SUM = torch.int64, torch.float64  # kinds of states
 
