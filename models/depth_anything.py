@@ -15,13 +15,8 @@ from typing import Self
 import torch
 
 from ufmstar_torch.models.checkpoints import CheckpointError
-from ufmstar_torch.models.hugging_face import (
-    Checkpoint,
-    HuggingFaceDepth,
-    HuggingFaceSpec,
-    load_hugging_face,
-    read_checkpoint,
-)
+from ufmstar_torch.models.hugging_face import HuggingFaceDepth, HuggingFaceSpec, load_hugging_face
+from ufmstar_torch.models.hugging_face_checkpoint import Checkpoint, read_checkpoint
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import PlainSpec
 

@@ -19,7 +19,8 @@ from torch import Tensor, nn
 from ufmstar_torch.frames.prediction import DepthPrediction, takes_intrinsics
 from ufmstar_torch.models.dropout import DecoderDropout
 from ufmstar_torch.models.heads import resized
-from ufmstar_torch.models.hugging_face import Checkpoint, HuggingFaceDepth, HuggingFaceSpec, read_checkpoint
+from ufmstar_torch.models.hugging_face import HuggingFaceDepth, HuggingFaceSpec
+from ufmstar_torch.models.hugging_face_checkpoint import Checkpoint, read_checkpoint
 from ufmstar_torch.models.network import INITIAL_DEPTH, Backbone, in_eval_mode
 from ufmstar_torch.models.outputs import as_map
 from ufmstar_torch.models.preprocess import Preprocess

@@ -13,7 +13,8 @@ from torch import nn
 
 from ufmstar_torch.models.alignment import Alignment, fit_affine_depth, fit_inverse_depth
 from ufmstar_torch.models.heads import UncertaintyHead
-from ufmstar_torch.models.hugging_face import HuggingFaceDepth, HuggingFaceSpec, read_checkpoint
+from ufmstar_torch.models.hugging_face import HuggingFaceDepth, HuggingFaceSpec
+from ufmstar_torch.models.hugging_face_checkpoint import read_checkpoint
 from ufmstar_torch.models.module_backbone import ModuleSpec
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import PlainSpec
