@@ -137,6 +137,32 @@ def _finish(call: Callable[[], Any], device: torch.device) -> Any:
     return result
 
 
+def _staged(rows: Iterable[Row], device: torch.device, clock: Clock) -> dict[str, StagedStep]:
+    """Steps of UfM* without anchors whose stages are timed, by the row's label."""
+    twins = {row.label: MultiviewStep(row, device) for row in rows if not row.setting.anchors}
+    return {
+        label: StagedStep(twin.estimator.ufm, twin, device, clock)
+        for label, twin in twins.items()
+        if isinstance(twin.estimator, Gaussians)
+    }
+
+
+def _inputs(
+    rows: Iterable[Row], frame: Frame, maps: Mapping[Part, DepthPrediction], cameras: Mapping[str, torch.Tensor],
+    device: torch.device,
+) -> dict[str, tuple[torch.Tensor | None, Frame, DepthPrediction]]:  # fmt: skip
+    """Image (with anchors alone), frame without image, and prediction of a row's step, by the row's label.
+    ``cameras``: K [1, 3, 3] of the maps, by the network."""
+    image, bare = image_tensor(frame).to(device), _bare(frame)
+    informative = shows_something(reduced(image))
+    inputs = {}
+    for row in rows:
+        stated = maps[row.method.base, inference_of(row)]
+        prediction = replace(stated, intrinsics=cameras[row.method.base], informative=informative)
+        inputs[row.label] = image if row.setting.anchors else None, bare, prediction
+    return inputs
+
+
 def inference_of(row: Row) -> str:
     """The form of inference of a row's prediction."""
     return EVERY if row.method.every_member else ONCE
@@ -170,16 +196,15 @@ def time_parts(
     Raises:
         FrameError: a frame has no image.
     """
-    parts, steps, sampled = TimedParts(warm_up, clock), dict[str, MultiviewStep](), dict[str, MultiviewStep]()
+    parts, fused = TimedParts(warm_up, clock), [row for row in rows if row.method.fusion != ALONE]
+    steps = {row.label: MultiviewStep(row, multiview_device) for row in fused}
+    parts.staged |= _staged(fused, multiview_device, clock)
+    sampled = {
+        row.label: MultiviewStep(row, multiview_device) for row in fused if samples and row.label in parts.staged
+    }
     forms = {row.method.base: {DEPTH} for row in rows}
     for row in rows:
         forms[row.method.base].add(inference_of(row))
-        if row.method.fusion != ALONE:
-            steps[row.label], twin = (MultiviewStep(row, multiview_device) for _ in range(2))
-            if isinstance(twin.estimator, Gaussians) and not row.setting.anchors:
-                parts.staged[row.label] = StagedStep(twin.estimator.ufm, twin, multiview_device, clock)
-                if samples:
-                    sampled[row.label] = MultiviewStep(row, multiview_device)
     sizes: dict[str, list[float]] = {label: [] for label in steps}
     for number, frame in enumerate(frames):
         turn = number - warm_up if restart and number >= warm_up else number
@@ -193,13 +218,8 @@ def time_parts(
         }
         keep = repeated and turn < _INFERENCES and bool({DEPTH, ONCE, EVERY} & set(metered))
         maps = parts.run(number, inferences, device, keep=keep)
-        image, bare = image_tensor(frame).to(multiview_device), _bare(frame)
-        informative = shows_something(reduced(image))
-        inputs = {}
-        for row in rows:
-            base, K = row.method.base, prepared[row.method.base][1].cpu().double()
-            prediction = replace(maps[base, inference_of(row)], intrinsics=K, informative=informative)
-            inputs[row.label] = image if row.setting.anchors else None, bare, prediction
+        cameras = {base: K.cpu().double() for base, (_, K) in prepared.items()}
+        inputs = _inputs(rows, frame, maps, cameras, multiview_device)
         multiview: dict[Part, Callable[[], Any]] = {
             (label, MULTIVIEW): partial(step, *inputs[label], first=turn == 0) for label, step in steps.items()
         }
