@@ -10,7 +10,9 @@ sigma_w and sigma_s are learnt (EM). The error d of the newest pose has the prio
 variance c, so the mean of d^2 should be sigma^2 - c. Images determine independent errors. They hardly determine errors
 that successive poses share; the mean product of successive d estimates these. Errors of a late trajectory are
 proportional to the motion: ``time_offset`` estimates the offset, and the poses are corrected for it first. A single
-pose with a far larger error than the others starts another trajectory: SLAM has closed a loop.
+pose with a far larger error than the others starts another trajectory: SLAM has closed a loop. Tracks of things that
+move would turn the poses towards them: where many tracks fit the input poses much worse than the largest group, only
+the group refines them.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.anchors.epipolar import median
+from ufmstar_torch.anchors.epipolar import FAR, NEAR, median, off_lines, on_lines
 from ufmstar_torch.anchors.saved_state import SavedState
 from ufmstar_torch.anchors.time_offset import TimeOffset
 
@@ -43,6 +45,9 @@ _STUDENT, _STEPS, _DEPTH_STEPS = 4.0, 4, 6
 # and _TIMES the recent scores, and the error's mean square, as shifts of a position, exceeds _SHIFT [px^2]. Otherwise
 # the poses are noisier than learnt so far.
 _SCORE, _TIMES, _SHIFT = 60.0, 5.0, 1.0
+# Least share of the tracks that do not fit the input poses, for them to be taken for tracks of things that move, which
+# the poses would follow; below .2 on recordings of still scenes.
+_MOVING = 0.25
 # Least numbers of corners and views for a refinement.
 _ENOUGH, _VIEWS = 8, 3
 
@@ -118,13 +123,16 @@ class PoseRefinement(SavedState):
         tracks, views = seen[:, -1] & (seen.sum(1) > 1), np.flatnonzero(seen.any(0))
         if tracks.sum() < _ENOUGH or len(views) < _VIEWS:
             return T_world_cam
+        shift = self.offset.shift(T_world_cam[views])
+        poses = moved(T_world_cam[views], shift.ravel())
+        tracks[tracks] = _static(pixel[np.ix_(tracks, views)], seen[np.ix_(tracks, views)], poses, K, depth)
+        if tracks.sum() < _ENOUGH:
+            return T_world_cam
         unit = np.array([[1], [depth]]) / K[0, 0]  # w [rad] and s [m] that shift a position by a pixel
         ray = (pixel[np.ix_(tracks, views)] - K[:2, 2]) / K.diagonal()[:2]
         growth = 1 + _DRIFT * np.arange(len(views) - 2, -1, -1)
         precision = seen[np.ix_(tracks, views[:-1])] / growth * (K[0, 0] / _TRACKING) ** 2
         prior = np.broadcast_to(1 / (self._variance[:, None] * unit**2), (len(views), 2, 3)).ravel()
-        shift = self.offset.shift(T_world_cam[views])
-        poses = moved(T_world_cam[views], shift.ravel())
         rho = inverse_depths(ray, precision, poses, 1 / depth, _STUDENT, _DEPTH_STEPS)
         A, b, by_error, rho_step = equations(ray, precision, poses, rho, 1 / depth, _STUDENT)
         try:
@@ -170,3 +178,18 @@ class PoseRefinement(SavedState):
         product = float((error * self._last_error).sum()) / 3
         self.correlated = max(_MEMORY * self.correlated + (1 - _MEMORY) * product, 0.0)
         self._last_error = error
+
+
+def _static(
+    pixel: NDArray[np.float64], seen: NDArray[np.bool_], T_world_cam: NDArray[np.float64], K: NDArray[np.float64],
+    depth: float,
+) -> NDArray[np.bool_]:  # fmt: skip
+    """Which tracks [N] refine the poses [W, 4, 4]: the largest group that fits them between its first view and the
+    newest. All, where few do not fit: their Student-t weights suffice. Arguments as in :meth:`PoseRefinement.refine`.
+    """
+    first = seen.argmax(1)
+    before, T_before = pixel[np.arange(len(pixel)), first], T_world_cam[first]
+    distance, *_ = off_lines(pixel[:, -1], before, T_world_cam[-1], T_before, K, NEAR * depth, FAR * depth)
+    tracking = _TRACKING * np.sqrt(1 + _DRIFT * (seen.shape[1] - 2 - first))
+    fits, _ = on_lines(distance / tracking, pixel[:, -1], 2 * K[:2, 2], 1.0)
+    return fits | bool(fits.mean() > 1 - _MOVING)
