@@ -14,11 +14,10 @@ from torch import Tensor
 from ufmstar_torch.eval.engine.rows import RowResult
 from ufmstar_torch.eval.engine.stream import FrameResult
 from ufmstar_torch.eval.sequences.frame import Frame
-from ufmstar_torch.frames.output import MAPS
+from ufmstar_torch.frames.output import EVERY_FRAME, MAPS
 
 _OF_NETWORK = ("aleatoric", "epistemic", "confidence", "features")  # maps that are not stored
 _BEFORE = ("network_depth", "ufm_variance")  # maps that are stored where a posterior corrects them
-_COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels", "unmeasured", "single_view")
 # [m] No depth network is more accurate than this sigma.
 NEAR_ZERO = 1e-3
 
@@ -60,7 +59,7 @@ def _figures(row: RowResult) -> dict[str, Any]:
         "intrinsics": [K[0][0], K[1][1], K[0][2], K[1][2]],
         "T_world_cam": row.T_world_cam,
         "member": row.out.member,
-        **{count: int(getattr(statistics, count)[0]) for count in _COUNTS},
+        **{name: getattr(statistics, name)[0].item() for name in EVERY_FRAME},
         "mean_disagreement": _mean(disagreement, valid),
         "mean_sigma": _mean(std, valid),
         "mean_network_sigma": None if network_variance is None else _mean(network_variance.sqrt(), valid),
