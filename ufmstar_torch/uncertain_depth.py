@@ -177,8 +177,8 @@ class UncertainDepth(NetworksInTurn):
             TypeError, ValueError: see the class.
         """
         members = modules_of(networks)
-        own = isinstance(preprocess, str) and preprocess == "own"
-        return members, shared_preprocess(members) if own else preprocess
+        shared = isinstance(preprocess, str) and preprocess == "own"
+        return members, shared_preprocess(members) if shared else preprocess
 
     def forward(
         self,
