@@ -223,7 +223,7 @@ def job_from(options: EvalOptions) -> EvalJob:
 
 
 def _evaluate(options: EvalOptions) -> int:
-    from ufmstar_torch.eval.engine.warm_up import warm_up_command
+    from ufmstar_torch.eval.engine.progress import warm_up_command
     from ufmstar_torch.eval.suite.tasks import evaluate_suite, executor_of
 
     how: dict[str, Any] = {"resume": options.output.resume, "overwrite": options.output.overwrite}

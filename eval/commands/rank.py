@@ -88,8 +88,7 @@ def main(options: RankOptions) -> int:
 
 def _scores(options: RankOptions) -> ImageScores:
     """Stream the sequences."""
-    from ufmstar_torch.eval.engine.progress import frame_progress
-    from ufmstar_torch.eval.engine.stream import Stopped, frame_results
+    from ufmstar_torch.eval.engine.stream import Stopped, frame_progress, frame_results
     from ufmstar_torch.eval.run.depth_check import DepthCheck
     from ufmstar_torch.eval.run.rank import ImageScores, require_part
     from ufmstar_torch.eval.run.run import warm_up_job

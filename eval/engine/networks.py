@@ -12,8 +12,8 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.eval.engine.clock import timed
 from ufmstar_torch.eval.engine.predictions import DepthSource
+from ufmstar_torch.eval.engine.progress import timed
 from ufmstar_torch.eval.methods.setting import CROP, OF_NETWORK, RESIZE
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.anchors.kernels.cholesky import factored, inverted
+from ufmstar_torch.anchors.kernels.cholesky import factored, inverted, reduced
 from ufmstar_torch.anchors.kernels.dense import Views
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
 from ufmstar_torch.kernels.compile_cpu import empty, leaf, reordered
@@ -244,15 +244,4 @@ def _equations(
             weighted[n, i] = mean_change[n, i]
             mean_change[n, i] *= over
             r[i] -= weighted[n, i] * mean[n]
-    whole = count - count % 4
-    for n in range(0, whole, 4):  # four pixels at a time: A is read and written once for them
-        for i in range(size):
-            one, two, three, four = weighted[n, i], weighted[n + 1, i], weighted[n + 2, i], weighted[n + 3, i]
-            for j in range(i + 1):
-                A[i, j] -= (one * mean_change[n, j] + two * mean_change[n + 1, j]) + (
-                    three * mean_change[n + 2, j] + four * mean_change[n + 3, j]
-                )
-    for n in range(whole, count):
-        for i in range(size):
-            for j in range(i + 1):
-                A[i, j] -= weighted[n, i] * mean_change[n, j]
+    reduced(A, weighted, mean_change)
