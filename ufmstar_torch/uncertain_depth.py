@@ -378,8 +378,8 @@ class UncertainDepth(NetworksInTurn):
         average: bool = False,
     ) -> MeanUncertainty:
         """Like :meth:`forward`, but computes the average of V per image, for active learning. The default source of
-        anchors is not asked: V has B only from a source that the constructor was passed, or from earlier calls of
-        :meth:`forward`.
+        anchors does not search the image: V has B only from a source that the constructor was passed, or from earlier
+        calls of :meth:`forward`.
 
         Args:
             image, pose, intrinsics, valid, features, anchors: as in :meth:`forward`.
