@@ -145,8 +145,8 @@ class PoseErrors(SavedState):
         if trusted:
             self._learn_camera(result, prior[0][-CAMERA:, -CAMERA:], views.image.shape[2])
         compared = np.isfinite(measured.value[found]) & (measured.agreed[found] > 1)[:, None]
-        self._learn_noise(result.residual[compared], result.across_residual, measured.across_noise[found], shares)
-        dispersion = (self._disagreement + result.residual.sum(1)) / np.maximum(measured.agreed[found], 1)
+        self._learn_noise(result.residual.T[compared], result.across_residual.T, measured.across_noise[found], shares)
+        dispersion = (self._disagreement + result.residual.sum(0)) / np.maximum(measured.agreed[found], 1)
         return Fit(result.rho, _PATCH * dispersion * result.match + result.common, result.off_line)
 
     def _prior(self, shares: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
