@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from ufmstar_torch.anchors.anchors import check_anchor_values as reference_check
+from ufmstar_torch.anchors.check import check_anchor_values as reference_check
 from ufmstar_torch.anchors.kernels.learn import check_anchor_values
 from ufmstar_torch.frames import frame as reference
 from ufmstar_torch.frames.frame import check_frame

@@ -15,9 +15,8 @@ from ufmstar_torch import UfMStarConfig
 from ufmstar_torch.eval.engine.estimators import Alone, Gaussians, output_of
 from ufmstar_torch.eval.engine.maps import own_depth
 from ufmstar_torch.eval.engine.predictions import PredictionCache
-from ufmstar_torch.eval.engine.progress import frame_progress
 from ufmstar_torch.eval.engine.rows import RowRunner
-from ufmstar_torch.eval.engine.stream import FrameResult, Stopped, frame_results
+from ufmstar_torch.eval.engine.stream import FrameResult, Stopped, frame_progress, frame_results
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.sequences import FrameError
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import sys
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -15,11 +13,9 @@ from time import perf_counter
 from typing import Self
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from ufmstar_torch.files.read import read_tensors
-from ufmstar_torch.files.write import hold, remove_temporaries, write_atomic
+from ufmstar_torch.files.state_file import StateFile
 from ufmstar_torch.frames.arguments import (
     CameraLike,
     ImageLike,
@@ -29,7 +25,7 @@ from ufmstar_torch.frames.arguments import (
     as_pose,
     require_number,
 )
-from ufmstar_torch.frames.clock import PoseBuffer, StreamClock, Verdict
+from ufmstar_torch.frames.clock import PoseBuffer, StreamClock, Verdict, require_stamp
 from ufmstar_torch.frames.frame import FRAME_FAULTS, NOT_FINITE
 from ufmstar_torch.frames.output import UncertaintyOutput
 from ufmstar_torch.frames.warnings import LOGGER
@@ -85,51 +81,6 @@ class _Waiting:
     image: ImageLike
     intrinsics: Tensor
     received: float
-
-
-class StateFile:
-    """The file of a model's stream state, which one process at a time writes. The model continues from it if it exists.
-
-    Raises:
-        FileNotFoundError, IsADirectoryError: the folder does not exist, or ``file`` is one.
-        ValueError: another process writes the file, or the model cannot continue from it, and is unchanged.
-    """
-
-    def __init__(self, file: Path, model: UncertainDepth) -> None:
-        if not file.parent.is_dir():
-            raise FileNotFoundError(f"state: no such folder: {file.parent}")
-        if file.is_dir():
-            raise IsADirectoryError(f"state must be a file, got the folder {file}")
-        self._file, target = file, Path(os.path.realpath(file))
-        lock = hold(target.with_name(f".{target.name}.lock"))
-        if lock is None:
-            raise ValueError(f"state: another process is writing {file}: each needs a file of its own")
-        self._lock = lock
-        try:  # temporary files of a killed process go
-            remove_temporaries(path for path in target.parent.iterdir() if path.name.startswith(f".{target.name}."))
-            if file.exists():
-                self._load(model)
-        except BaseException:
-            lock.release()
-            raise
-
-    def _load(self, model: UncertainDepth) -> None:
-        try:
-            with self._file.open("rb") as opened:
-                state = read_tensors(opened, "it")
-            model.load_stream_state(state)
-        except (RuntimeError, TypeError, ValueError, OSError) as error:
-            text = f"state {self._file} cannot be continued: {error}. Delete the file, or name another one, to begin"
-            raise ValueError(f"{text} anew") from error
-
-    def save(self, model: UncertainDepth) -> None:
-        """Write the model's state atomically."""
-        values = model.stream_state()
-        write_atomic(self._file, lambda file: torch.save(values, file))
-
-    def release(self) -> None:
-        """Let other processes write the file."""
-        self._lock.release()
 
 
 class LiveDepth:
@@ -208,7 +159,7 @@ class LiveDepth:
             BaseException: the model or ``on_result`` failed before.
         """
         self._raise()
-        received, stamp = perf_counter(), _seconds(stamp)
+        received, stamp = perf_counter(), require_stamp(stamp)
         if len(as_image(rgb)) != 1:
             raise ValueError("rgb must be one image: create one LiveDepth per camera")
         K = self._intrinsics if intrinsics is None else as_intrinsics(intrinsics)
@@ -247,7 +198,7 @@ class LiveDepth:
             BaseException: the model or ``on_result`` failed before.
         """
         self._raise()
-        stamp, pose = _seconds(stamp), _pose(T, self.model.ufm.config.rotation_tolerance)
+        stamp, pose = require_stamp(stamp), _pose(T, self.model.ufm.config.rotation_tolerance)
         with self._changed:
             self._counts["poses"] += 1
             self._counts["dropped_poses"] += self._poses.add(stamp, pose, perf_counter(), self._image_clock.newest)
@@ -394,19 +345,6 @@ class LiveDepth:
         del self._waiting[:count]
         if count:
             self._dropped[reason] += count
-
-
-def _seconds(stamp: float) -> float:
-    """The stamp as a float. Raises TypeError, ValueError: not a finite number in seconds, exact to 1 ms."""
-    if isinstance(stamp, bool) or not isinstance(stamp, float | int | np.floating | np.integer):
-        raise TypeError(f"stamp must be a number of seconds, got {type(stamp).__name__}")
-    exact = stamp.item() if isinstance(stamp, np.generic) else stamp
-    if not abs(exact) < sys.float_info.max:
-        raise ValueError(f"stamp must be finite [s], got {stamp}")
-    step = float(np.spacing(abs(stamp))) if isinstance(stamp, np.floating) else math.ulp(exact)
-    if step > SAME_TIME:
-        raise ValueError(f"stamp must be in seconds and exact to 1 ms, got {stamp}, which is exact to {step:g} s")
-    return float(stamp)
 
 
 def _pose(T: CameraLike, tolerance: float) -> np.ndarray:

@@ -22,10 +22,10 @@ from ufmstar_torch.eval.engine.estimators import make_estimator
 from ufmstar_torch.eval.engine.examples import ExampleWriter
 from ufmstar_torch.eval.engine.judge import RowJudge, SequenceError, references
 from ufmstar_torch.eval.engine.predictions import DepthSource, PredictionCache
-from ufmstar_torch.eval.engine.progress import Progress, frame_progress
+from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.engine.record import Record
 from ufmstar_torch.eval.engine.rows import RowRunner
-from ufmstar_torch.eval.engine.stream import frame_results
+from ufmstar_torch.eval.engine.stream import frame_progress, frame_results
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import CORNERS

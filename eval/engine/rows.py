@@ -13,9 +13,9 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.landmarks import Landmarks
 from ufmstar_torch.eval.engine.anchors import AnchorSource
-from ufmstar_torch.eval.engine.clock import timed
 from ufmstar_torch.eval.engine.estimators import Estimator
 from ufmstar_torch.eval.engine.predictions import DepthSource
+from ufmstar_torch.eval.engine.progress import timed
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError

@@ -6,29 +6,25 @@ those of one row on many sequences.
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from time import perf_counter
-from typing import TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.engine.clock import timed
 from ufmstar_torch.eval.engine.predictions import FramePredictions, PredictionCache, sequence_digest
+from ufmstar_torch.eval.engine.progress import Progress, timed
 from ufmstar_torch.eval.engine.rows import RowResult, RowRunner
+from ufmstar_torch.eval.engine.threads import read_ahead
 from ufmstar_torch.eval.methods.perturb import selects
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.frames.prediction import DepthPrediction
 
-_AHEAD = 2  # frames; decoding releases Python's lock
 _CPU = torch.device("cpu")
-Read = TypeVar("Read")
 
 
 class Stopped(Exception):
@@ -85,33 +81,40 @@ def frame_results(
 
     selected = [index for n, index in enumerate(indices) if any(selects(row.setting, n) for row in rows)]
     last = perf_counter()
-    with closing(read_ahead(read, selected)) as frames:
+    with closing(read_ahead(read, selected)) as reading:
         for number, index in enumerate(indices):
             if stop():
                 raise Stopped
             active, ms = [row for row in rows if selects(row.setting, number)], dict[str, float]()
             results, skipped, frame = dict[str, RowResult](), dict[str, str](), None
-            try:
-                if active:
-                    with timed(ms, "read", device):
-                        predictions = next(frames).result()
-                        check(predictions.frame)
-                    with timed(ms, "predict", device):
-                        predicted = {row.key: predictions.of(row.source, row.images, row.every) for row in active}
-                    with timed(ms, "truth", device):
-                        truths = _truths(predictions.frame, predicted)
-                    frame = predictions.frame
-            except FrameError as error:
-                skipped, active = {row.key: error.reason for row in active}, []
-            for row in active:
-                assert frame is not None
+            if active:
                 try:
-                    results[row.key] = row.update(frame, predicted[row.key], truths[row.key])
+                    with timed(ms, "read", device):
+                        predictions = next(reading).result()
+                        check(predictions.frame)
+                    predicted, truths = _predicted(predictions, active, ms, device)
+                    frame = predictions.frame
+                except FrameError as error:
+                    skipped, active = {row.key: error.reason for row in active}, []
+            for row in active:
+                try:
+                    results[row.key] = row.update(predictions.frame, predicted[row.key], truths[row.key])
                 except FrameError as error:
                     skipped[row.key] = error.reason
             now = perf_counter()
             ms["cycle"], last = 1000 * (now - last), now
             yield FrameResult(number, index, names[index], frame, results, skipped, ms)
+
+
+def _predicted(
+    predictions: FramePredictions, rows: Sequence[RowRunner], ms: dict[str, float], device: torch.device
+) -> tuple[dict[str, DepthPrediction], dict[str, NDArray[np.float32] | None]]:
+    """The rows' predictions, and the ground truth at their pixels, by key; adds their times to ``ms``. Raises
+    FrameError: there is nothing to predict from, or the depth map has no camera."""
+    with timed(ms, "predict", device):
+        predicted = {row.key: predictions.of(row.source, row.images, row.every) for row in rows}
+    with timed(ms, "truth", device):
+        return predicted, _truths(predictions.frame, predicted)
 
 
 def _truths(frame: Frame, predictions: Mapping[str, DepthPrediction]) -> dict[str, NDArray[np.float32] | None]:
@@ -128,15 +131,16 @@ def _truths(frame: Frame, predictions: Mapping[str, DepthPrediction]) -> dict[st
     return truths
 
 
-def read_ahead(read: Callable[[int], Read], indices: Iterable[int]) -> Generator[Future[Read]]:
-    """Yield what ``read`` returns for some indices, in order, read by one thread at most two ahead. Its error is raised
-    by ``result()``. Closing the generator ends the thread."""
-    thread, reading = ThreadPoolExecutor(1), deque[Future[Read]]()
-    try:
-        for index in indices:
-            reading.append(thread.submit(read, index))
-            if len(reading) > _AHEAD:
-                yield reading.popleft()
-        yield from reading
-    finally:
-        thread.shutdown(cancel_futures=True)
+def frame_progress(show: Callable[[Progress], object], total: int) -> Callable[[FrameResult], None]:
+    """Show the progress over ``total`` frames: at the start, and by the returned function after every frame."""
+    skipped = 0
+
+    def shown(result: FrameResult) -> None:
+        nonlocal skipped
+        skipped += bool(result.skipped)
+        each = (int(row.out.statistics.components[0]) for row in result.rows.values())
+        components = next((count for count in each if count), None)
+        show(Progress("frames", result.number + 1, total, components, skipped))
+
+    show(Progress("frames", 0, total))
+    return shown

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.anchors.anchors import FARTHEST_OFF
+from ufmstar_torch.anchors.check import FARTHEST_OFF
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, part, reordered_leaf
 
 # Upper limit of |y|: anchors that are off by more are not valid.
@@ -159,7 +159,7 @@ def finish(depth, factor, variance, inlier, common, floor):
     errors that all anchors of the frame share.
 
     ``common``: variance of the inverse-depth error, variance of the logarithm of a factor, mean square of rejected
-    anchors' relative errors (``AnchorInput``), and the limit of the first two, over the squared depth.
+    anchors' relative errors (``Anchors``), and the limit of the first two, over the squared depth.
     """
     shared, scale, contradiction, limit = common
     for i in range(depth.shape[0]):

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, part
+from ufmstar_torch.kernels.compile_cpu import empty, leaf, part
 from ufmstar_torch.posterior.cells import steepness
 from ufmstar_torch.posterior.field import at, conditioned
 from ufmstar_torch.posterior.moments import below, second_moments
@@ -39,7 +39,7 @@ LEAST_REST = 5
 STEPS = (0.7548776662466927, 0.5698402909980532)
 
 
-@kernel
+@part
 def sums_of(scene, weight, left_out, ratios, frames, config):
     """Sums over a frame's anchors, and the scores of the held-out ones.
 

@@ -30,7 +30,7 @@ MOST_WRONG = 0.5
 
 
 class AnchorRows(NamedTuple):
-    """N anchors of one stream, as in ``AnchorInput``, whose ``index`` is ``at_pixel``."""
+    """N anchors of one stream, as in ``Anchors``, whose ``index`` is ``at_pixel``."""
 
     pixel: Floats
     at_pixel: NDArray[np.int64]
@@ -170,7 +170,7 @@ def _prior(grid, ratios, expected, config):
     return Prior(config.precision / ratios.amplitude, right, down, mean, precision, grid.cols)
 
 
-@kernel
+@part
 def fitted(grid, depth, valid, anchors, ratios, expected, config):
     """The :class:`Scene`; the field with robust weights; its :class:`LeftOut`; the anchors' weights [N]; and the
     distance of every node from evidence [n]. Arguments of :func:`_scene_of`; the covariance in ``expected`` is

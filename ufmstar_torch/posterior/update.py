@@ -78,7 +78,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.special import ndtri
 
-from ufmstar_torch.frames.frame import AnchorInput, FrameInput
+from ufmstar_torch.anchors.anchors import Anchors
+from ufmstar_torch.frames.frame import FrameInput
 from ufmstar_torch.kernels.compile_cpu import empty, kernel
 from ufmstar_torch.kernels.cpu.calls import array, each
 from ufmstar_torch.posterior.cells import finish, interpolate, steepness
@@ -138,7 +139,7 @@ class Posterior:
 
 
 def update(
-    packed: Tensor, frame: FrameInput, anchors: AnchorInput | None, claimed: Tensor, config: PosteriorConfig,
+    packed: Tensor, frame: FrameInput, anchors: Anchors | None, claimed: Tensor, config: PosteriorConfig,
     floor: float = 0.0,
 ) -> tuple[Tensor, Posterior]:  # fmt: skip
     """Process a frame of B streams, one after the other, on the CPU.
@@ -172,17 +173,17 @@ def update(
     return torch.from_numpy(after).to(device), found
 
 
-def _anchors(anchors: AnchorInput | None, streams: int) -> list[tuple[AnchorRows, Floats | None] | None]:
+def _anchors(anchors: Anchors | None, streams: int) -> list[tuple[AnchorRows, Floats | None] | None]:
     """For each stream its anchors, and the tests of motion, None without any."""
     if anchors is None:
         return [None] * streams
-    fields = (anchors.pixel, anchors.index, anchors.predicted, anchors.depth, anchors.variance, anchors.valid)
+    fields = (anchors.pixel, anchors.index, anchors.predicted, anchors.depth, anchors.variance, anchors.mask)
     motion = [None] * streams if anchors.motion is None else array(anchors.motion)
     tested = [None if one is None or not np.isfinite(one).any() else one for one in motion]
     return list(zip(map(AnchorRows, *map(array, fields)), tested, strict=True))
 
 
-def _common(anchors: AnchorInput | None, streams: int, config: PosteriorConfig) -> list[tuple[float, ...]]:
+def _common(anchors: Anchors | None, streams: int, config: PosteriorConfig) -> list[tuple[float, ...]]:
     """For each stream the arguments of ``cells.finish``."""
     columns = [[0.0] * streams] * 3
     if anchors is not None:
@@ -209,10 +210,10 @@ def _of_stream(
         logs = np.log(depth)
     grid = grid_of(logs, valid, rows, cols, numbers)
     expected = running.expected(grid.mean, config)
-    scene, field, left_out, weight, away = fitted(grid, depth, valid, anchors, running.ratios, expected, numbers)
+    of_frame = grid, depth, valid, anchors, running.ratios, expected, running.frames, numbers
+    scene, field, left_out, away, sums, (below, distance, area) = evidence_of(*of_frame)
     scores, (c, of_surfaces) = np.zeros((2, 0)), surfaces(scene, field.coefficients, running, config)
-    if len(weight):
-        sums, (below, distance, area) = sums_of(scene, weight, left_out, running.ratios, running.frames, numbers)
+    if len(scene.noise):
         sums[:, CENTRE], sums[:, BETWEEN] = of_surfaces["centre"], of_surfaces["between"]
         after[:] = running.learnt(sums, grid.mean, field.coefficients, field.covariance, config)
         z = ndtri(torch.from_numpy(below).clamp_(TAIL, 1 - TAIL)).abs_().numpy()
@@ -232,6 +233,16 @@ def _of_stream(
     np.exp(factor, out=factor)
     finish(depth, factor, variance, inlier, common, floor)
     return scores
+
+
+@kernel
+def evidence_of(grid, depth, valid, anchors, ratios, expected, frames, config):
+    """A frame's anchors: the scene, the field, leave-one-out predictions, the distance of every node from evidence
+    (:func:`~ufmstar_torch.posterior.scene.fitted`); and the sums and scores of held-out anchors
+    (:func:`~ufmstar_torch.posterior.learn.sums_of`)."""
+    scene, field, left_out, weight, away = fitted(grid, depth, valid, anchors, ratios, expected, config)
+    sums, scores = sums_of(scene, weight, left_out, ratios, frames, config)
+    return scene, field, left_out, away, sums, scores
 
 
 @kernel
