@@ -17,8 +17,7 @@ from ufmstar_torch.eval.engine.progress import timed
 from ufmstar_torch.eval.methods.setting import CROP, OF_NETWORK, RESIZE
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
-from ufmstar_torch.frames.networks import NetworksInTurn
-from ufmstar_torch.frames.prediction import DepthPrediction
+from ufmstar_torch.frames.prediction import DepthPrediction, NetworksInTurn
 from ufmstar_torch.models.dropout import MonteCarloDropout, set_sampling
 from ufmstar_torch.models.ensemble import LazyMember
 from ufmstar_torch.models.inference import BF16, runtime_of

@@ -17,10 +17,12 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ufmstar_torch.eval.check.image_fit import DepthFit, depth_at_pixels, depth_fit
 from ufmstar_torch.eval.engine.files import to_json, write_bytes_atomic
 from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
 from ufmstar_torch.eval.engine.rows import RowResult
@@ -68,6 +70,7 @@ class RunFolder:
         metrics: of these frames.
         seconds: time from the beginning to the last of these frames.
         outputs: by file that is made from all frames None, or why it was not made.
+        first_maps: of ``keep_first_map``.
     """
 
     def __init__(self, job: RunJob, path: Path) -> None:
@@ -75,6 +78,7 @@ class RunFolder:
         self.records: list[dict[str, Any]] = []
         self.outputs: dict[str, str | None] = {}
         self.metrics = RunMetrics(load_plugins(job.settings.get("plugin", ())).metrics)
+        self.first_maps: FirstMaps = {}
         self._unit: float | None = None  # of the depth PNGs [m per count]
         (path / FRAMES).mkdir(exist_ok=True)
         write_bytes_atomic(path / RECORDS, b"")
@@ -88,12 +92,37 @@ class RunFolder:
             arrays = frame_arrays(result.frame, row)
             write_frame(frame_file(self.path, result.name), arrays)
             self._unit = write_pngs(self.path, result.name, arrays, self._unit)
+        keep_first_map(self.job, result, self.first_maps)
         ms = {"metrics": 1000 * judged, "write": 1000 * (perf_counter() - started - judged)}
         record: dict[str, Any] = to_json(frame_record(result, UFM, ms))
         with (self.path / RECORDS).open("ab") as file:
             file.write(json.dumps(record, allow_nan=False).encode() + b"\n")
         self.records.append(record)
         self.seconds += result.ms["cycle"] / 1000
+
+
+# By index of a frame: the network's depth map [h, w], its valid pixels, and the intrinsics of map and image.
+FirstMaps = dict[int, tuple[NDArray[Any], NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]]
+
+
+def keep_first_map(job: RunJob, result: FrameResult, maps: FirstMaps) -> None:
+    """Add the depth map of a frame in which tracked corners of the job begin."""
+    row = result.rows.get(UFM)
+    if row is not None and result.frame is not None and any(result.index == one.first for one in job.corners):
+        depth, valid = row.prediction.depth[0].numpy(), row.valid.numpy()
+        maps[result.index] = depth, valid, row.intrinsics, result.frame.intrinsics
+
+
+def fitted_depth(job: RunJob, maps: FirstMaps) -> DepthFit | None:
+    """Compare maps with the depth of the corners that begin in them; None if the motion is too small, or if the poses
+    contradict the images."""
+    if job.image_fit is None or job.image_fit.problem:
+        return None
+
+    def depth_at(index: int, pixel: NDArray[np.float64]) -> NDArray[Any] | None:
+        return depth_at_pixels(*maps[index], pixel) if index in maps else None
+
+    return depth_fit(job.sequence, job.corners, depth_at)
 
 
 def frame_arrays(frame: Frame | None, row: RowResult) -> dict[str, NDArray[Any]]:

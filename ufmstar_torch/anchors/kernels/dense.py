@@ -10,7 +10,7 @@ copied at once. Loops run over all pixels of a window, so that they are vectoris
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -95,6 +95,7 @@ class Measured:
             because they share the patch.
         agreed: [N] number of agreeing views; 0 = not measured.
         contradicted: [N] number of views that disagree.
+        shown: [N] number of views that show the line from infinity to ``WHOLE`` times the starting inverse depth.
         value: [N, V] inverse depth in each agreeing view [1/m]; NaN in other views, here and below.
         noise: [N, V] variance of the position along the line from the match alone [px^2].
         along: [N, V, 2] unit direction (u, v) in which the point moves along the line.
@@ -110,6 +111,7 @@ class Measured:
     variance: NDArray[np.float64]
     agreed: NDArray[np.int64]
     contradicted: NDArray[np.int64]
+    shown: NDArray[np.int64]
     value: NDArray[np.float64]
     noise: NDArray[np.float64]
     along: NDArray[np.float64]
@@ -118,10 +120,6 @@ class Measured:
     across: NDArray[np.float64]
     across_noise: NDArray[np.float64]
     centre: NDArray[np.float64]
-
-    def only(self, chosen: NDArray[np.int64]) -> Measured:
-        """The pixels with the indices ``chosen``."""
-        return Measured(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
 def measure(image: NDArray[np.uint8], pixel: NDArray[np.float64], views: Views, search: Search) -> Measured:
@@ -134,15 +132,15 @@ def measure(image: NDArray[np.uint8], pixel: NDArray[np.float64], views: Views, 
         search: settings.
     """
     n, v = len(pixel), len(views.image)
-    rho, variance, agreed, contradicted = np.zeros(n), np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.int64)
+    (rho, variance), (agreed, contradicted, shown) = np.zeros((2, n)), np.zeros((3, n), np.int64)
     each = np.full((n, v, 8), np.nan)
     centre = np.zeros((n, 2))
-    outputs = rho, variance, agreed, contradicted, each, centre
+    outputs = rho, variance, agreed, contradicted, shown, each, centre
     _measure(image, pixel, eights(views.image), views.H, views.b, views.noise, search, *outputs)
     value, noise, _, _, speed, slope, across, across_noise = np.moveaxis(each, 2, 0)
     along = each[:, :, 2:4]
     columns = value, noise, along, speed, slope, across, across_noise, centre
-    return Measured(rho, variance, agreed, contradicted, *columns)
+    return Measured(rho, variance, agreed, contradicted, shown, *columns)
 
 
 def eights(images: NDArray[np.uint8]) -> NDArray[np.uint64]:
@@ -171,7 +169,7 @@ def best_pixels(image, cell, pixel, strength):
 
 
 @reordered
-def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, contradicted, each, centre):
+def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, contradicted, shown, each, centre):
     start, first_low, first_high, sigmas, least_score, least_rival, match = search
     height, width = image.shape
     flat = image.reshape(image.size)
@@ -190,9 +188,9 @@ def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, con
             x, y = H[k, 0, 0] * u + H[k, 0, 1] * v + H[k, 0, 2], H[k, 1, 0] * u + H[k, 1, 1] * v + H[k, 1, 2]
             z = H[k, 2, 0] * u + H[k, 2, 1] * v + H[k, 2, 2]
             low, high = first_low, first_high
-            if first and not (
-                _within(x, y, z, b[k], 0.0, width, height) and _within(x, y, z, b[k], WHOLE * start, width, height)
-            ):
+            ends = _within(x, y, z, b[k], 0.0, width, height) and _within(x, y, z, b[k], WHOLE * start, width, height)
+            shown[n] += ends
+            if first and not ends:
                 continue
             if not first:
                 speed = _speed(x, y, z, b[k], at)[2]
