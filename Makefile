@@ -2,7 +2,7 @@
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: install test test-all lint flat types site package bench clean
+.PHONY: install test test-all lint flat types site package clean
 
 install:
 	python3 -m venv $(VENV)
@@ -41,9 +41,6 @@ package:
 		rm -rf build/archive && $(BIN)/pip install --quiet --no-deps --target build/archive $$archive && \
 		PYTHONPATH=$(CURDIR)/build/archive $(BIN)/python -P tests/installed.py || exit 1; \
 	done
-
-bench:
-	$(BIN)/ufmstar bench
 
 clean:
 	rm -rf build dist *.egg-info

@@ -28,13 +28,14 @@ from torch.nn.functional import adaptive_avg_pool2d, interpolate
 
 from ufmstar_torch import PosteriorConfig, UfMStar
 from ufmstar_torch.anchors import landmark_source
-from ufmstar_torch.anchors.anchors import check_anchors
+from ufmstar_torch.anchors.anchors import Anchors
+from ufmstar_torch.anchors.check import check_anchors
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.eval.sequences.open import open_sequence
-from ufmstar_torch.frames.frame import AnchorInput, FrameInput, check_frame
+from ufmstar_torch.frames.frame import FrameInput, check_frame
 from ufmstar_torch.gaussians.camera import resize_intrinsics
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.network import DepthNetwork
@@ -64,7 +65,7 @@ class Prepared:
     """One frame's input of the posterior, its anchors by source of evidence, and the true depth [h, w] [m]."""
 
     frame: FrameInput
-    anchors: Mapping[str, AnchorInput]
+    anchors: Mapping[str, Anchors]
     claimed: Tensor
     truth: Tensor
 

@@ -29,9 +29,9 @@ import numpy as np
 import torch
 
 from ufmstar_torch import LiveDepth, LiveResult, UfMStarConfig, UncertainDepth
-from ufmstar_torch.eval.run.export import points_of
 from ufmstar_torch.eval.sequences import FrameError
 from ufmstar_torch.eval.sequences import ros_messages as ros
+from ufmstar_torch.eval.sequences.ground_truth import points_of
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.message_builder import MessageBuilder
 from ufmstar_torch.eval.sequences.poses import poses_from_quaternions

@@ -15,7 +15,6 @@ from onnx_files import small_network, write_fastdepth
 from ufmstar_torch import cli
 from ufmstar_torch.eval.bench.measure import Plan
 from ufmstar_torch.eval.bench.overlap import time_overlap
-from ufmstar_torch.eval.bench.settings import BenchSettings
 from ufmstar_torch.eval.bench.timing import STAGES, StagedStep, paired_ratio, pinned_threads, spread
 from ufmstar_torch.eval.commands.bench import main, read
 from ufmstar_torch.eval.sequences import open_sequence
@@ -92,76 +91,63 @@ def test_threads_are_pinned_and_restored(fails):
 # ---- end to end ----
 
 
-def bench(path, *words):
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    return str(write_fastdepth(tmp_path_factory.mktemp("net") / "net.onnx", small_network()))
+
+
+def bench(path, weights, *words):
     """The report of a tiny run."""
-    words = [*words, "--frames", "2", "--history", "2", "--threads", "1", "--json", str(path)]
+    words = ["--model", "fastdepth", "--weights", weights, "--runtime", "torch", *words]
+    words += ["--frames", "2", "--history", "2", "--threads", "1", "--json", str(path)]
     before = threads()
     assert main(read(words)) == 0
     assert threads() == before
     return json.loads(path.read_text())
 
 
-RATIOS = ("mean of 1,000 pixels / step", "check and average / step")
-
-
-def test_a_tiny_run_from_end_to_end(tmp_path, capsys):
-    report = bench(tmp_path / "bench.json", "--sizes", "64", "--backends", "auto", "torch")
-    (small,) = report["results"]
-    assert small["map"] == "64 x 64"
-    assert set(small["machine"]["versions"]) >= {"ufmstar_torch", "torch", "numba", "numpy", "python"}
-    assert set(small["machine"]["hardware"]) >= {"cpu", "cores", "platform", "environment"}
-    rows = {row["row"]: row for row in small["rows"]}
-    assert len(rows) == 7, "UfM, and three rows of UfM* for each backend"
-    plain, corners, posterior, reference = (
-        rows[f"UfM*-{name}"]
-        for name in ("DepthOnly", "DepthOnly (anchors corners)", "DepthOnly (anchors dense, posterior True)",
-                     "DepthOnly (backend torch)")
-    )  # fmt: skip
+def test_a_network_on_a_rendered_room(tmp_path, weights, capsys):
+    report = bench(tmp_path / "bench.json", weights, "--sequence", "tour:1?frames=5&size=96x128")
+    assert report["map"] == "224 x 224"
+    assert set(report["machine"]["versions"]) >= {"ufmstar_torch", "torch", "numba", "numpy", "python"}
+    assert set(report["machine"]["hardware"]) >= {"cpu", "cores", "platform", "environment"}
+    rows = {row["row"].partition("-DepthOnly")[::2]: row for row in report["rows"]}
+    plain, corners, posterior = (
+        rows["UfM*", setting] for setting in ("", " (anchors corners)", " (anchors dense, posterior True)")
+    )
+    assert len(rows) == 4, "UfM, and three rows of UfM*"
     for row in rows.values():
         assert row["latency"]["multiview"]["count"] == row["ratios_to_depth"]["multiview"]["count"] == 2
         assert row["latency"]["multiview"]["min_ms"] > 0
+    assert report["networks"]["depth_only"]["latency"]["once"]["count"] == 2
     assert plain["stages"].keys() == {"stages", "stages_total", "beyond_the_paper"}
     assert 0 < plain["stages"]["beyond_the_paper"]["median"] < 1
     assert plain["sample"]["ratio_to_step"]["count"] == plain["sample"]["latency"]["count"] == 2
     sizes = [row["memory"]["multiview"]["bytes_end"] for row in (plain, corners, posterior)]
     assert sizes == sorted(sizes), "landmarks and the posterior add to the mixture's memory"
-    assert reference["memory"]["multiview"] == plain["memory"]["multiview"], "the same mixture"
-    printed = capsys.readouterr()
-    assert "UfM*-DepthOnly (anchors corners)" in printed.out
-    assert "fastdepth 64 x 64, 4 frames" in printed.err
-    assert small["ratios"].keys() == {
-        *RATIOS,
-        *(f"{name} / network" for name in ("step", "step with corners", "default")),
-    }
-    for name, ratio in small["ratios"].items():
-        assert f"\n{name}: {ratio:.3f}\n" in printed.out
-    assert small["ratios"]["step / network"] == plain["ratios_to_depth"]["multiview"]["median"]
-    assert small["ratios"]["default / network"] == posterior["ratios_to_depth"]["multiview"]["median"]
-
-
-def test_each_size_has_its_table(tmp_path, capsys):
-    report = bench(tmp_path / "bench.json", "--sizes", "64", "96")
-    assert [result["map"] for result in report["results"]] == ["64 x 64", "96 x 96"]
-    assert "fastdepth 96 x 96, 4 frames" in capsys.readouterr().err
-
-
-def test_a_network_of_ones_own_on_a_recording(tmp_path):
-    path, _ = write_tum(tmp_path, frames=5)
-    weights = write_fastdepth(tmp_path / "net.onnx", small_network())
-    words = ["--sequence", str(path), "--weights", str(weights), "--runtime", "torch"]
-    (result,) = bench(tmp_path / "bench.json", *words)["results"]
-    assert result["map"] == "224 x 224"
-    assert result["sequence"]["layout"] == "tum"
-    assert result["networks"]["depth_only"]["latency"]["once"]["count"] == 2
-    overlapped = result["overlapped"]
+    overlapped = report["overlapped"]
     assert overlapped["latency"]["count"] == overlapped["ratio_to_network"]["count"] == 1, "nothing overlaps the last"
-    assert len(result["ratios"]) == 6
-    assert overlapped["ratio_to_network"]["median"] in result["ratios"].values()
-    assert cli.main(["bench", "--sequence", "nowhere"]) == 2
+    printed = capsys.readouterr().out
+    assert "UfM*-DepthOnly (anchors corners)" in printed
+    ratios = report["ratios"]
+    assert len(ratios) == 6
+    for name, ratio in ratios.items():
+        assert f"\n{name}: {ratio:.3f}\n" in printed
+    assert ratios["step / network"] == plain["ratios_to_depth"]["multiview"]["median"]
+    assert ratios["default / network"] == posterior["ratios_to_depth"]["multiview"]["median"]
+    assert overlapped["ratio_to_network"]["median"] in ratios.values()
 
 
-def test_the_processor_s_time_needs_one_thread_on_the_cpu():
-    assert BenchSettings(clock="cpu", threads=1).clock == "cpu"
-    for wrong in ({"threads": 2}, {}, {"threads": 1, "device": "cuda"}):
+def test_on_a_recording(tmp_path, weights):
+    path, _ = write_tum(tmp_path, frames=5)
+    report = bench(tmp_path / "bench.json", weights, "--sequence", str(path))
+    assert report["sequence"]["layout"] == "tum"
+    assert cli.main(["bench", "--model", "fastdepth", "--weights", weights, "--sequence", "nowhere"]) == 2
+
+
+def test_the_processor_s_time_needs_one_thread_on_the_cpu(weights):
+    network = ["--model", "fastdepth", "--weights", weights, "--clock", "cpu"]
+    assert read([*network, "--threads", "1"]).clock == "cpu"
+    for wrong in (["--threads", "2"], [], ["--threads", "1", "--device", "cuda"]):
         with pytest.raises(ValueError, match="--clock cpu needs --threads 1"):
-            BenchSettings(clock="cpu", **wrong)
+            read([*network, *wrong])

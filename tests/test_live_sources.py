@@ -32,7 +32,7 @@ from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.live import PoseFile, growing_folder, json_lines, replay
 from ufmstar_torch.eval.tour import export_tour
 from ufmstar_torch.files.write import hold
-from ufmstar_torch.frames.networks import NetworksInTurn
+from ufmstar_torch.frames.prediction import NetworksInTurn
 
 __all__ = ["stand_in"]
 

@@ -231,7 +231,7 @@ def _options_of(command: str) -> type:
     """The dataclass of a command's options."""
     module = import_module(f"ufmstar_torch.{COMMANDS[command][0]}")
     own = [kind for kind in vars(module).values() if dataclasses.is_dataclass(kind) and hasattr(kind, "__mro__")]
-    names = {"eval": "EvalOptions", "bench": "BenchSettings", "data": "CheckOptions"}
+    names = {"eval": "EvalOptions", "data": "CheckOptions"}
     expected = names.get(command, f"{command.capitalize()}Options")
     return next(kind for kind in own if kind.__name__ == expected)
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from ufmstar_torch.anchors.anchors import check_anchor_values as reference_check
+from ufmstar_torch.anchors.anchors import Anchors
+from ufmstar_torch.anchors.check import check_anchor_values as reference_check
 from ufmstar_torch.anchors.kernels.learn import check_anchor_values
 from ufmstar_torch.frames import frame as reference
-from ufmstar_torch.frames.frame import AnchorInput, check_frame
+from ufmstar_torch.frames.frame import check_frame
 from ufmstar_torch.gaussians.camera import inverse_intrinsics, rotation_deviation
 from ufmstar_torch.kernels.cpu import check
 from ufmstar_torch.posterior.correct import common_error, widened
@@ -70,10 +71,12 @@ def test_common_errors_are_added_as_stated(dtype):
     for value in (depth, variance, inlier):
         value[1, 2] = torch.nan
     nothing = torch.zeros(3, 1, dtype=torch.float64)
-    anchors = AnchorInput(
-        nothing[..., None].expand(3, 1, 2), nothing.long(), *(nothing,) * 4, nothing > 0, nothing[:, 0].long(),
-        torch.tensor([0.0, 0.3, 0.0], dtype=torch.float64), None,
-        torch.tensor([0.01, 0.0, torch.inf], dtype=torch.float64), torch.tensor([0.0, 0.02, 0.0], dtype=torch.float64),
+    contradiction, shared, scale = torch.tensor(
+        [[0.0, 0.3, 0.0], [0.01, 0.0, torch.inf], [0.0, 0.02, 0.0]], dtype=torch.float64
+    )
+    anchors = Anchors(
+        nothing[..., None].expand(3, 1, 2), nothing, nothing, nothing > 0, shared=shared, scale=scale,
+        contradiction=contradiction,
     )  # fmt: skip
     added = common_error(anchors, depth, 0.25) + depth.square() * anchors.contradiction[:, None, None].to(dtype)
     expected = [value.clamp_min(0.9) + added for value in (variance, inlier)]

@@ -8,12 +8,12 @@ import numpy as np
 import oracle_posterior as oracle
 import pytest
 import torch
+from backends import moved
 
 from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
-from ufmstar_torch.anchors.anchors import check_anchors
+from ufmstar_torch.anchors.check import check_anchors
 from ufmstar_torch.frames.frame import check_frame
-from ufmstar_torch.kernels.select import moved
 from ufmstar_torch.posterior import field
 from ufmstar_torch.posterior.distribution import divided
 from ufmstar_torch.posterior.running import FEATURES, SIZE, Running

@@ -18,6 +18,7 @@ from ufmstar_torch.anchors.pose_fit import UNCHANGED, ImageFit
 from ufmstar_torch.eval.check.depth_image_fit import DepthImageFit, depth_image_fit
 from ufmstar_torch.eval.check.image_fit import image_fit, track_corners
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.ground_truth import nearest_pixels, points_of
 from ufmstar_torch.frames.warnings import doubtful_centre
 from ufmstar_torch.gaussians.conventions import CONVENTIONS, OURS
 
@@ -86,14 +87,10 @@ def warp_error(pair: _Pair, poses: str, scale: float) -> float:
     ``scale``, which is equivalent to depth times ``scale`` and keeps the unit of the files."""
     convert = CONVENTIONS[poses].convert
     T_b_a = np.linalg.inv(convert(pair.T_world_b)) @ convert(pair.T_world_a)
-    x, y, z = T_b_a[:3, :3] @ pair.points + T_b_a[:3, 3:] / scale
-    front = z > 1e-6
-    z_safe = np.where(front, z, 1)
-    column = np.rint(pair.K_b[0, 0] * x / z_safe + pair.K_b[0, 2])
-    row = np.rint(pair.K_b[1, 1] * y / z_safe + pair.K_b[1, 2])
-    height, width = pair.depth_b.shape
-    inside = front & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    depth_there = pair.depth_b[row[inside].astype(int), column[inside].astype(int)]
+    points = T_b_a[:3, :3] @ pair.points + T_b_a[:3, 3:] / scale
+    u, v, z = pair.K_b @ points[:, points[2] > 1e-6]
+    index, inside = nearest_pixels(u / z, v / z, (pair.depth_b.shape[0], pair.depth_b.shape[1]))
+    depth_there = pair.depth_b.reshape(-1)[index[inside]]
     valid = depth_there > 0
     filled = np.count_nonzero(pair.depth_b > 0) / pair.depth_b.size
     if valid.sum() < max(1, _MIN_OVERLAP * filled * pair.points.shape[1]):
@@ -208,9 +205,8 @@ class _Check:
 def _pair(first: Frame, first_depth: np.ndarray, second: Frame, second_depth: np.ndarray) -> _Pair:
     v, u = np.nonzero(first_depth > 0)
     keep = np.unique(np.linspace(0, len(v) - 1, _POINTS).astype(int))
-    z = first_depth[v[keep], u[keep]].astype(np.float64)
     K_a, K_b = (f.intrinsics if f.depth_intrinsics is None else f.depth_intrinsics for f in (first, second))
-    points = np.linalg.inv(K_a) @ np.stack([u[keep] * z, v[keep] * z, z])
+    points = points_of(u[keep], v[keep], first_depth[v[keep], u[keep]], K_a).T
     return _Pair(points, first.T_world_cam, second.T_world_cam, K_b, second_depth)
 
 

@@ -19,6 +19,7 @@ from ufmstar_torch.anchors.pose_fit import (
     pose_fit,
 )
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.ground_truth import nearest_pixels
 
 _PLACES = 6  # number of start frames
 # Depth compared with that of corners: smallest number of pairs, and of corners of each; smallest shift along the line
@@ -85,11 +86,9 @@ def depth_at_pixels(
     depth: np.ndarray, valid: np.ndarray, K_map: np.ndarray, K_image: np.ndarray, pixel: np.ndarray
 ) -> np.ndarray:
     """[N] the depth of a map [H, W] at pixels [N, 2] of the image to which it belongs; 0 where it has none."""
-    u, v, _ = np.rint(K_map @ np.linalg.inv(K_image) @ np.vstack([pixel.T, np.ones(len(pixel))])).astype(int)
-    height, width = depth.shape
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    v, u = np.where(inside, v, 0), np.where(inside, u, 0)
-    return np.where(inside & valid[v, u], depth[v, u], 0.0)
+    u, v, _ = K_map @ np.linalg.inv(K_image) @ np.vstack([pixel.T, np.ones(len(pixel))])
+    index, inside = nearest_pixels(u, v, (depth.shape[0], depth.shape[1]))
+    return np.where(inside & valid.reshape(-1)[index], depth.reshape(-1)[index], 0.0)
 
 
 def depth_fit(

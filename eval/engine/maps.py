@@ -13,7 +13,7 @@ import torch
 
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.setting import CROP
-from ufmstar_torch.eval.sequences.depth_folder import DepthFolder, DepthMaps
+from ufmstar_torch.eval.sequences.depth_folder import DepthMaps, depth_maps
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
 from ufmstar_torch.eval.sequences.ground_truth import depth_camera, resample_nearest
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics, scale_intrinsics
@@ -71,7 +71,7 @@ def folder_source(
     size: Size | None = None,
     indices: Sequence[int] | None = None,
 ) -> MapSource:
-    """Maps that another program predicted for the frames of a sequence (see :class:`DepthFolder`).
+    """Maps that another program predicted for the frames of a sequence (see ``depth_maps``).
 
     Args:
         sequence: of the maps.
@@ -99,8 +99,9 @@ def folder_source(
     selected = [name for index in chosen if (name := sequence.names[index]) not in (run.skipped if run else ())]
     if not selected:
         raise ValueError(f"{folder}: none of the {len(chosen)} frames has a map")
-    found = DepthFolder(run.frames if run else folder, scale, variance, run.depth if run else "depth")
-    maps = found.for_frames(sequence.names, sequence.names_on_disk, selected)
+    how: dict[str, Any] = {"scale": scale, "variance": variance, "key": run.depth if run else "depth"}
+    how |= {"names_on_disk": sequence.names_on_disk, "selected": selected}
+    maps = depth_maps(run.frames if run else folder, sequence.names, **how)
     number = {name: i for i, name in enumerate(selected)}
     K_given = None if intrinsics is None else read_intrinsics(intrinsics)
 

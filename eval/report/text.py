@@ -14,7 +14,7 @@ from ufmstar_torch.eval.report.quantities import count
 from ufmstar_torch.eval.report.table import aligned
 from ufmstar_torch.eval.report.tables import main_table
 from ufmstar_torch.eval.report.write import Report
-from ufmstar_torch.eval.run.frame_record import NEAR_ZERO
+from ufmstar_torch.eval.run.run_folder import NEAR_ZERO
 
 # [nats] A larger mean NLL is dominated by a few pixels: sigma = .25 d in a room gives about 1.
 NLL_OF_FEW = 100.0

@@ -20,7 +20,7 @@ from ufmstar_torch.eval.run.colours import known_where
 from ufmstar_torch.eval.run.gaussians import vertex_table, world_offset, write_ply
 from ufmstar_torch.eval.run.writers import encode_length_png, fitting_unit, frame_file, read_frame
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
-from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
+from ufmstar_torch.eval.sequences.ground_truth import points_of, resample_nearest
 from ufmstar_torch.eval.sequences.intrinsics import pinhole_values
 from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
 from ufmstar_torch.gaussians.conventions import CONVENTIONS
@@ -228,12 +228,6 @@ def export_transforms(frames: Iterator[RunFrame], out: Path) -> str:
     }
     write_json_atomic(folder / "transforms.json", plain)
     return f"{folder / 'transforms.json'}: {len(listed)} frames"
-
-
-def points_of(u: NDArray[Any], v: NDArray[Any], depth: NDArray[Any], K: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[P, 3] points in the camera's axes [m] of pixels u, v [px] with a depth [m]."""
-    z, y = depth.astype(np.float64), (v - K[1, 2]) / K[1, 1]
-    return np.stack([(u - K[0, 2] - K[0, 1] * y) / K[0, 0] * z, y * z, z], axis=-1)
 
 
 def _voxels(

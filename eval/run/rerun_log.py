@@ -22,11 +22,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range
-from ufmstar_torch.eval.run.export import RunFrame, export_folder, points_of
+from ufmstar_torch.eval.run.export import RunFrame, export_folder
 from ufmstar_torch.eval.run.gaussians import RADIUS, Components, offset_text, world_offset
 from ufmstar_torch.eval.run.writers import fitting_unit
+from ufmstar_torch.eval.sequences.ground_truth import nearest_pixels, points_of
 from ufmstar_torch.files.read import read_npz_whole
 from ufmstar_torch.gaussians.mixture import GaussianMixture
+from ufmstar_torch.live import LiveResult
 from ufmstar_torch.runtime.optional import optional
 
 WORLD, CAMERA = "world", "world/camera"
@@ -99,13 +101,20 @@ class RerunLog:
         u, v, measured = anchors[:, 0], anchors[:, 1], anchors[:, 2]
         ends = points_of(u, v, measured, K)
         self._stream.log(f"{CAMERA}/anchors", rr.Points3D(ends, radii=rr.Radius.ui_points(3)))
-        height, width = frame.depth.shape
-        column, row = np.rint(u).astype(int).clip(0, width - 1), np.rint(v).astype(int).clip(0, height - 1)
-        depth = frame.depth[row, column]
+        depth = frame.depth.reshape(-1)[nearest_pixels(u, v, (frame.depth.shape[0], frame.depth.shape[1]))[0]]
         valid = np.isfinite(depth)
         lines = np.stack([ends, points_of(u, v, depth, K)], axis=1)[valid]
         colours = scale.rgb(np.abs(depth - measured)[valid])
         self._stream.log(f"{CAMERA}/residuals", rr.LineStrips3D(lines, colors=colours))
+
+
+def viewer_frame(result: LiveResult, number: int, figures: dict[str, float]) -> RunFrame:
+    """The result of an image of ``ufmstar live``, to be logged."""
+    out, valid = result.out, result.out.valid[0]
+    depth, sigma = (torch.where(valid, values[0], torch.nan).cpu().float().numpy() for values in (out.depth, out.std))
+    about = (f"{result.stamp:.6f}", number, result.stamp, result.T_world_cam)
+    K = out.intrinsics[0].cpu().double().numpy()
+    return RunFrame(*about, K, depth, sigma, figures=figures, image=np.asarray(result.image))
 
 
 def blueprint() -> Any:

@@ -37,11 +37,16 @@ def _source(mapping: bytes, size_from: Size, size: Size) -> tuple[NDArray[np.int
     is inside. ``mapping`` [3, 3] float64 maps pixels of the second camera to the first one."""
     M = np.frombuffer(mapping).reshape(3, 3)
     v, u = np.mgrid[0 : size[0], 0 : size[1]].astype(np.float64)
-    column = np.floor(M[0, 0] * u + M[0, 1] * v + M[0, 2] + 0.5 + _BORDER).astype(np.intp)
-    row = np.floor(M[1, 1] * v + M[1, 2] + 0.5 + _BORDER).astype(np.intp)
-    height, width = size_from
+    return nearest_pixels(M[0, 0] * u + M[0, 1] * v + M[0, 2], M[1, 1] * v + M[1, 2], size_from)
+
+
+def nearest_pixels(u: NDArray, v: NDArray, size: Size) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """For positions u, v [px] in an image of ``size`` (h, w), the flat index of the pixel that contains each, or of the
+    nearest one on the border, and True if the position is inside. NaN is outside, at index 0."""
+    (height, width), (column, row) = size, (np.floor(x + 0.5 + _BORDER) for x in (u, v))
     inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-    return row.clip(0, height - 1) * width + column.clip(0, width - 1), inside
+    row, column = np.nan_to_num(row).clip(0, height - 1), np.nan_to_num(column).clip(0, width - 1)
+    return (row * width + column).astype(np.intp), inside
 
 
 def depth_camera(frame: Frame) -> NDArray:
@@ -73,18 +78,22 @@ def register_depth(
     ``T_color_depth`` [4, 4] [m], and the nearest one is used (z-buffer). Each point fills one pixel, so pixels stay 0
     if the colour image is finer than the depth map."""
     v, u = np.nonzero(depth > 0)
-    z = depth[v, u].astype(np.float64)
-    points = np.linalg.inv(K_depth) @ np.stack([u * z, v * z, z])
+    points = points_of(u, v, depth[v, u], K_depth).T
     return project(T_color_depth[:3, :3] @ points + T_color_depth[:3, 3:], K_color, size)
+
+
+def points_of(u: NDArray, v: NDArray, depth: NDArray, K: NDArray) -> NDArray[np.float64]:
+    """[P, 3] points in the camera's axes [m] of pixels u, v [px] with a depth [m]."""
+    z, y = depth.astype(np.float64), (v - K[1, 2]) / K[1, 1]
+    return np.stack([(u - K[0, 2] - K[0, 1] * y) / K[0, 0] * z, y * z, z], axis=-1)
 
 
 def project(points: np.ndarray, K: np.ndarray, size: Size) -> np.ndarray:
     """The depth map of ``size`` (H, W) float32 along z [m] of points [3, N] [m] in the frame of a camera K [3, 3] [px]:
     the nearest point in each pixel, 0 = none."""
-    x, y, z = points[:, points[2] > 0]
-    column = np.rint((K[0, 0] * x + K[0, 1] * y) / z + K[0, 2])
-    row = np.rint(K[1, 1] * y / z + K[1, 2])
-    inside = (column >= 0) & (column < size[1]) & (row >= 0) & (row < size[0])
+    ahead = points[:, points[2] > 0]
+    u, v, z = K @ ahead
+    index, inside = nearest_pixels(u / z, v / z, size)
     depth = np.full(size, np.inf)
-    np.minimum.at(depth, (row[inside].astype(np.intp), column[inside].astype(np.intp)), z[inside])
+    np.minimum.at(depth.reshape(-1), index[inside], z[inside])
     return np.where(np.isfinite(depth), depth, 0).astype(np.float32)

@@ -10,7 +10,9 @@ sigma_w and sigma_s are learnt (EM). The error d of the newest pose has the prio
 variance c, so the mean of d^2 should be sigma^2 - c. Images determine independent errors. They hardly determine errors
 that successive poses share; the mean product of successive d estimates these. Errors of a late trajectory are
 proportional to the motion: ``time_offset`` estimates the offset, and the poses are corrected for it first. A single
-pose with a far larger error than the others starts another trajectory: SLAM has closed a loop.
+pose with a far larger error than the others starts another trajectory: SLAM has closed a loop. Tracks of things that
+move would turn the poses towards them: where many tracks fit the input poses much worse than the largest group, only
+the group refines them.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.anchors.epipolar import median
+from ufmstar_torch.anchors.epipolar import FAR, NEAR, median, off_lines, on_lines
 from ufmstar_torch.anchors.saved_state import SavedState
 from ufmstar_torch.anchors.time_offset import TimeOffset
 
@@ -35,6 +37,9 @@ _MEMORY = 0.8
 # and _TIMES the recent scores, and its shift of positions is clear (``kernels.bundle``). Otherwise the poses are
 # noisier than learnt so far.
 _SCORE, _TIMES = 60.0, 5.0
+# Least share of the tracks that do not fit the input poses, for them to be taken for tracks of things that move, which
+# the poses would follow; below .2 on recordings of still scenes. Least number of tracks that is judged.
+_MOVING, _FEWEST = 0.25, 8
 # Least number of views for a refinement.
 _VIEWS = 3
 
@@ -111,9 +116,11 @@ class PoseRefinement(SavedState):
         if len(views) < _VIEWS:
             return T_world_cam
         unit = np.array([[1], [depth]]) / K[0, 0]  # w [rad] and s [m] that shift a position by a pixel
-        given, prior = T_world_cam[views], np.tile(np.repeat(1 / (self._variance * unit[:, 0] ** 2), 3), len(views))
-        shift, most = self.offset.shift(given), max(_SCORE, _TIMES * self._recent_score)
-        result, score, self.jumped = refined(pixel[:, views], seen[:, views], given, K, depth, shift, prior, most)
+        stated, prior = T_world_cam[views], np.tile(np.repeat(1 / (self._variance * unit[:, 0] ** 2), 3), len(views))
+        shift, most = self.offset.shift(stated), max(_SCORE, _TIMES * self._recent_score)
+        pixel, seen = pixel[:, views], seen[:, views]
+        seen = seen & _static(pixel, seen, stated, K, depth)[:, None]
+        result, score, self.jumped = refined(pixel, seen, stated, K, depth, shift, prior, most)
         if score == score:
             self._recent_score = max(score, _MEMORY * self._recent_score)
         if result is None:
@@ -121,7 +128,7 @@ class PoseRefinement(SavedState):
         self.shared = median(result.depth_variance)
         self._offset_variance = float(np.square(shift[-1].reshape(2, 3) / unit).sum()) / 3
         self._learn(result.error[-6:].reshape(2, 3) / unit, result.covariance.diagonal()[-6:].reshape(2, 3) / unit**2)
-        self.offset.learn(given, prior, result.error, result.covariance)
+        self.offset.learn(stated, prior, result.error, result.covariance)
         poses = T_world_cam.copy()
         poses[views] = result.poses
         return poses
@@ -138,3 +145,25 @@ class PoseRefinement(SavedState):
         product = float((error * self._last_error).sum()) / 3
         self.correlated = max(_MEMORY * self.correlated + (1 - _MEMORY) * product, 0.0)
         self._last_error = error
+
+
+def _static(
+    pixel: NDArray[np.float64], seen: NDArray[np.bool_], T_world_cam: NDArray[np.float64], K: NDArray[np.float64],
+    depth: float,
+) -> NDArray[np.bool_]:  # fmt: skip
+    """Which tracks [N] refine the poses [W, 4, 4]: the largest group that fits them between its first view and the
+    newest. All, where few do not fit: their Student-t weights suffice. Arguments as in :meth:`PoseRefinement.refine`.
+    """
+    from ufmstar_torch.anchors.kernels.bundle import position_variance
+
+    tracks = np.flatnonzero(seen[:, -1] & (seen.sum(1) > 1))
+    result = np.ones(len(pixel), np.bool_)
+    if len(tracks) < _FEWEST:
+        return result
+    first, newest = seen[tracks].argmax(1), pixel[tracks, -1]
+    views = newest, pixel[tracks, first], T_world_cam[-1], T_world_cam[first]
+    distance, *_ = off_lines(*views, K, NEAR * depth, FAR * depth)
+    sigma = np.sqrt(position_variance(seen.shape[1] - 1 - first))
+    fits, _ = on_lines(distance / sigma, newest, 2 * K[:2, 2], 1.0)
+    result[tracks] = fits | bool(fits.mean() > 1 - _MOVING)
+    return result

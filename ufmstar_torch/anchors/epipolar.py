@@ -9,10 +9,19 @@ from ufmstar_torch.gaussians.camera import inverse_intrinsics
 
 # Least depth of a projected point, as a share of the median depth; the depth of nearer points is raised to it.
 NEAREST = 1e-3
+# Range of a scene's depths over the median, in which corners' points must lie. The upper limit is far above the median,
+# which is inaccurate at first.
+NEAR, FAR = 1 / 50, 10.0
+# Cells of the image per axis; matches of each cell have the same total weight.
+_CELLS = 6
 # Limit of the inverse depth, as a share of that at which a point reaches the earlier camera's focal plane.
 _AHEAD = 0.98
 # The median of the square of a standard normal variable.
 MEDIAN_SQUARE = 0.4549
+# The standard deviation of most matches is that by the quantile _MOST of their distances, _MOST_QUANTILE of a standard
+# normal one. Farther than _FARTHEST times it from their lines are matches on things that move, which leave their lines
+# as a group.
+_MOST, _MOST_QUANTILE, _FARTHEST = 0.3, 0.3853, 6.0
 
 
 def off_lines(
@@ -53,6 +62,27 @@ def off_lines(
     speed = b[:, :2] - before * b[:, 2:]
     rho = ((before * x[:, 2:] - x[:, :2]) * speed).sum(1) / np.maximum(np.square(speed).sum(1), 1e-12)
     return np.linalg.norm(offset, axis=1), rho, np.linalg.norm(shift, axis=1)
+
+
+def on_lines(
+    distance: NDArray[np.float64], pixel: NDArray[np.float64], size: tuple[float, float], least: float
+) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """The largest group of matches that lie on their epipolar lines: those nearer than six standard deviations of the
+    nearest 30 %, by area.
+
+    Args:
+        distance: [N] from the lines, over the standard deviation of tracking or in pixels.
+        pixel: [N, 2] (u, v).
+        size: width and height of the image [px].
+        least: of the standard deviation, in the unit of ``distance``.
+
+    Returns:
+        [N] True in the group; [N] weights by area, as a moving object may have most of the corners.
+    """
+    cell = (pixel * _CELLS / size).astype(np.int64).clip(0, _CELLS - 1) @ [1, _CELLS]
+    weight: NDArray[np.float64] = 1 / np.bincount(cell)[cell]
+    sigma = max(weighted_quantile(distance, weight, _MOST) / _MOST_QUANTILE, least)
+    return distance <= _FARTHEST * sigma, weight
 
 
 def median(values: NDArray[np.float64]) -> float:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.anchors.anchors import FARTHEST_OFF
+from ufmstar_torch.anchors.check import FARTHEST_OFF
 from ufmstar_torch.kernels.compile_cpu import cached
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.field import fast

@@ -11,8 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.frames.frame import AnchorInput, FrameInput
+from ufmstar_torch.frames.frame import FrameInput
 from ufmstar_torch.kernels.cpu.calls import array, each
 from ufmstar_torch.posterior import conformal
 from ufmstar_torch.posterior.running import restarted
@@ -55,7 +56,7 @@ def correct(
     return {"posterior": learnt, "intervals": intervals}, maps, counts
 
 
-def widened(posterior: Posterior, anchors: AnchorInput | None, limit: float, floor: float) -> Posterior:
+def widened(posterior: Posterior, anchors: Anchors | None, limit: float, floor: float) -> Posterior:
     """The posterior with variances of at least ``floor`` and the errors that all anchors of the frame share:
     :func:`common_error`, and where most anchors are off by a factor over 100, their mean squared error."""
     if posterior.depth.is_cpu:
@@ -71,13 +72,12 @@ def widened(posterior: Posterior, anchors: AnchorInput | None, limit: float, flo
     added = torch.zeros_like(posterior.variance)
     if anchors is not None:
         added = common_error(anchors, posterior.depth, limit)
-        if anchors.contradiction is not None:
-            added = added + posterior.depth.square() * anchors.contradiction[:, None, None].to(added.dtype)
+        added = added + posterior.depth.square() * anchors.contradiction[:, None, None].to(added.dtype)
     variance, inlier = (v.clamp_min(floor) + added for v in (posterior.variance, posterior.inlier))
     return replace(posterior, variance=variance, inlier=inlier)
 
 
-def common_error(anchors: AnchorInput, depth: Tensor, limit: float) -> Tensor:
+def common_error(anchors: Anchors, depth: Tensor, limit: float) -> Tensor:
     """Variance of the depth [B, H, W] from errors common to all anchors of the frame [m^2], which residuals do not
     show; at most ``limit`` times the squared depth."""
     zero = torch.zeros((), dtype=depth.dtype, device=depth.device)

@@ -77,7 +77,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.frames.frame import AnchorInput, FrameInput
+from ufmstar_torch.anchors.anchors import Anchors
+from ufmstar_torch.frames.frame import FrameInput
 from ufmstar_torch.kernels.cpu.calls import array, each
 from ufmstar_torch.posterior.cells import cell_means, features, read
 from ufmstar_torch.posterior.config import PosteriorConfig
@@ -135,7 +136,7 @@ class Posterior:
 
 
 def update(
-    packed: Tensor, frame: FrameInput, anchors: AnchorInput | None, claimed: Tensor, config: PosteriorConfig
+    packed: Tensor, frame: FrameInput, anchors: Anchors | None, claimed: Tensor, config: PosteriorConfig
 ) -> tuple[Tensor, Posterior]:
     """Process a frame of B streams, one after the other, on the CPU.
 
@@ -167,11 +168,11 @@ def update(
     return torch.from_numpy(memory).to(device), Posterior(**outputs, scores=scores)
 
 
-def _anchors(anchors: AnchorInput | None, streams: int) -> list[AnchorRows | None]:
+def _anchors(anchors: Anchors | None, streams: int) -> list[AnchorRows | None]:
     if anchors is None:
         return [None] * streams
     fields = [array(x) for x in (anchors.pixel, anchors.index, anchors.predicted, anchors.depth, anchors.variance)]
-    used, motion = array(anchors.valid), None if anchors.motion is None else array(anchors.motion)
+    used, motion = array(anchors.mask), None if anchors.motion is None else array(anchors.motion)
     rows = [AnchorRows(*(x[b][used[b]] for x in fields)) for b in range(streams)]
     return (
         list(rows)

@@ -54,6 +54,11 @@ class Refined(NamedTuple):
     depth_variance: NDArray[np.float64]
 
 
+def position_variance(views: NDArray[np.int64]) -> NDArray[np.float64]:
+    """[N] variance of a corner's position, seen some ``views`` [N] before the newest [px^2]."""
+    return np.asarray(_TRACKING**2 * (1 + _DRIFT * (views - 1)))
+
+
 def refined(
     pixel: NDArray[np.float64], seen: NDArray[np.bool_], T_world_cam: NDArray[np.float64], K: NDArray[np.float64],
     depth: float, shift: NDArray[np.float64], prior: NDArray[np.float64], most: float,
