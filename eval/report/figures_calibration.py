@@ -33,8 +33,6 @@ class Shares(NamedTuple):
 DELTA = Shares("ece_delta_confidence", "ece_delta_accuracy", "predicted share within 25 %", "true share")
 QUANTILE = Shares("ece_q_levels", "ece_q_observed", "predicted quantile", "share of truth below")
 INTERVAL = Shares("coverage_levels", "coverage_found", "stated probability of the interval", "share of truth in it")
-# Colours and markers, in order, for methods without a ``Method``.
-_BY_ORDER = (("#6b6b6b", "^"), ("#E69F00", "s"), ("#0072B2", "o"), ("#009E73", "D"), ("#CC79A7", "v"), ("#D55E00", "P"))
 
 
 def draw_calibration(results: Results, dataset: str) -> Any | None:
@@ -126,11 +124,13 @@ def write_curves(path: Path, curves: Mapping[str, Curves], *, title: str = "") -
     """Draw delta calibration, quantile calibration and sparsification (``SequenceMetrics.curves()`` by the name in the
     legend) side by side, and write the picture (PNG). Raises ValueError: there are no curves, or more than line
     styles."""
-    if not 1 <= len(curves) <= len(_BY_ORDER):
-        raise ValueError(f"curves must hold 1 to {len(_BY_ORDER)} methods, got {len(curves)}")
+    if not 1 <= len(curves) <= len(style.BY_ORDER):
+        raise ValueError(f"curves must hold 1 to {len(style.BY_ORDER)} methods, got {len(curves)}")
     figure = style.new_figure(12.6, 4.6, title)
     delta, quantiles, sparse = figure.subplots(1, 3)
-    lines = {LineStyle(name, *line_style): curves[name] for name, line_style in zip(curves, _BY_ORDER, strict=False)}
+    lines = {
+        LineStyle(name, *line_style): curves[name] for name, line_style in zip(curves, style.BY_ORDER, strict=False)
+    }
     _draw_shares(delta, DELTA, lines, "δ calibration")
     _draw_shares(quantiles, QUANTILE, lines, "quantile calibration")
     for line_style, values in lines.items():
