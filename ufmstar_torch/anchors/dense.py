@@ -347,7 +347,8 @@ class DenseEvidence(SavedState):
         matched.
         """
         from ufmstar_torch.anchors.kernels.check import confirmed
-        from ufmstar_torch.anchors.kernels.dense import MARGIN, Views, measure
+        from ufmstar_torch.anchors.kernels.dense import Views, measure
+        from ufmstar_torch.anchors.kernels.windows import MARGIN
 
         half, (views, _, images) = halved(small), compared
         H, b = _HALVED @ views.H @ _DOUBLED, views.b @ _HALVED.T
