@@ -41,8 +41,6 @@ OUTLIER = Shares(
     "outlier_predicted", "outlier_found", "posterior_outlier", "share beyond 3 σ of inliers", "outlier_pixels"
 )
 KINDS = DELTA, QUANTILE, INTERVAL, OUTLIER
-# Colours and markers, in order, for methods without a ``Method``.
-_BY_ORDER = (("#6b6b6b", "^"), ("#E69F00", "s"), ("#0072B2", "o"), ("#009E73", "D"), ("#CC79A7", "v"), ("#D55E00", "P"))
 
 
 def draw_calibration(results: Results, dataset: str) -> Any | None:
@@ -134,11 +132,13 @@ def write_curves(path: Path, curves: Mapping[str, Curves], *, title: str = "") -
     """Draw delta calibration, quantile calibration and sparsification (``SequenceMetrics.curves()`` by the name in the
     legend) side by side, and write the picture (PNG). Raises ValueError: there are no curves, or more than line
     styles."""
-    if not 1 <= len(curves) <= len(_BY_ORDER):
-        raise ValueError(f"curves must hold 1 to {len(_BY_ORDER)} methods, got {len(curves)}")
+    if not 1 <= len(curves) <= len(style.BY_ORDER):
+        raise ValueError(f"curves must hold 1 to {len(style.BY_ORDER)} methods, got {len(curves)}")
     figure = style.new_figure(12.6, 4.6, title)
     delta, quantiles, sparse = figure.subplots(1, 3)
-    lines = {LineStyle(name, *line_style): curves[name] for name, line_style in zip(curves, _BY_ORDER, strict=False)}
+    lines = {
+        LineStyle(name, *line_style): curves[name] for name, line_style in zip(curves, style.BY_ORDER, strict=False)
+    }
     _draw_shares(delta, DELTA, lines, "δ calibration")
     _draw_shares(quantiles, QUANTILE, lines, "quantile calibration")
     for line_style, values in lines.items():
