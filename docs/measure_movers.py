@@ -7,7 +7,8 @@ them; with --exact instead of --weights, a network of the true depth times 1.35.
 all moving pixels and for those that stand still: number of pixels; median ratio of posterior and true depth; root mean
 square z; the share of pixels beyond 4 sigma; the share with a stated sigma below a tenth of the depth and an error
 above half of the truth; delta1; NLL; and NLL of the mixture. The last row has the still pixels in the tours without
-things that move. The first frames are left out, because they have no parallax.
+things that move. The first frames are left out, because they have no parallax. A second table has the pixels of all
+tours by ``posterior_outlier``.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from __future__ import annotations
 import argparse
 from collections import defaultdict
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +35,7 @@ from ufmstar_torch.gaussians.camera import resize_intrinsics
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.network import DepthNetwork
 
+PROBABILITIES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 1.01)  # bounds of the table of outliers
 TOURS = tuple(zip(range(951, 961), ("home", "hall", "mixed", "blank", "scales") * 2, strict=True))
 SIZE, HALF, MOVERS, FIRST, STRIDE = (240, 320), (120, 160), 6, 5, 2
 # The exact network's error, and its depth over this error where nothing is [m].
@@ -97,6 +100,18 @@ def row(name: str, pixels: list[Array]) -> str:
     return f"| {name} | {len(d)} | " + " | ".join(figures) + " |"
 
 
+def outliers(pixels: Array) -> Iterator[str]:
+    """Rows by ``posterior_outlier``, of [P, 5] values: bounds, share of the pixels, mean probability, share beyond
+    three standard deviations of the inliers; and the mean probability beyond and within."""
+    d, _, v1, p, g = pixels.T
+    beyond = (g - d) ** 2 > 9 * v1
+    for low, high in pairwise(PROBABILITIES):
+        used = (p >= low) & (p < high)
+        figures = f"{used.mean():.2f} | {p[used].mean():.3f} | {beyond[used].mean():.3f}"
+        yield f"| {low:g} to {min(high, 1):g} | {figures} |"
+    yield f"mean probability {p[beyond].mean():.3f} beyond, {p[~beyond].mean():.3f} within"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     source = parser.add_mutually_exclusive_group(required=True)
@@ -133,6 +148,10 @@ def main() -> None:
     print(row("all moving", [pixels for rows in found.values() for pixels in rows]))
     print(row("still", still[0]))
     print(row("still, in the tours without", still[1]))
+    every = np.concatenate([pixels for rows in (*found.values(), *still) for pixels in rows])
+    print("\n| posterior_outlier | share | mean | beyond 3 sigma of the inliers |\n|---|---|---|---|")
+    print("\n".join(outliers(every)))
+    print("in the tours without:", *list(outliers(np.concatenate(still[1])))[-1:])
 
 
 if __name__ == "__main__":
