@@ -30,6 +30,7 @@ _PRIOR, _WINDOW = 1.0, 0.5
 # and tours without an offset it stays 0, also with noise of 1 and 2 degrees.
 _SIGNIFICANT = 2.0
 _LARGEST = 3.0  # [images]
+_MOST = 1.001 / _WINDOW**2 / (1 - _MEMORY)  # of the information, with rounding
 
 
 class TimeOffset(SavedState):
@@ -40,6 +41,10 @@ class TimeOffset(SavedState):
     """
 
     HELD: ClassVar = {"_sum": "lag_sum", "_information": "lag_information", "lag": "lag"}
+    # An information is at most 1 / _WINDOW^2; the sums are geometric.
+    RANGES: ClassVar = {
+        "_sum": (-_LARGEST * _MOST, _LARGEST * _MOST), "_information": (0.0, _MOST), "lag": (-_LARGEST, _LARGEST)
+    }  # fmt: skip
 
     def __init__(self) -> None:
         self.reset()
