@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ufmstar_torch.anchors.names import CORNERS, DENSE
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.predictions import FramePredictions, PredictionCache, sequence_digest
 from ufmstar_torch.eval.engine.progress import Progress, timed
@@ -55,12 +56,11 @@ def frame_results(
     *,
     cache: PredictionCache | None = None,
     device: torch.device = _CPU,
-    check: Callable[[Frame], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Generator[FrameResult]:
     """Yield the result of every frame, in order. A frame that no row selects is not decoded. If a frame cannot be read
-    or predicted from, or its pose or intrinsics are unusable, all rows skip it. Close the generator to end the thread
-    that reads ahead.
+    or predicted from, lacks what a row needs, or has an unusable pose or unusable intrinsics, all rows skip it, so that
+    their figures can be compared. Close the generator to end the thread that reads ahead.
 
     Args:
         sequence: posed frames.
@@ -68,7 +68,6 @@ def frame_results(
         rows: with different keys, in their initial state.
         cache: of predictions; None = compute all.
         device: of the rows' estimators and their maps.
-        check: raises ``FrameError`` for a frame that all rows must skip.
         stop: called before every frame.
 
     Raises:
@@ -95,7 +94,7 @@ def frame_results(
                 if active:
                     with timed(ms, "read", device):
                         predictions = next(reading).result()
-                        check(predictions.frame)
+                    _require_inputs(predictions.frame, rows)
                     predicted, truths = _predicted(predictions, active, ms, device)
                     frame = predictions.frame
                     results = {row.key: row.update(frame, predicted[row.key], truths[row.key]) for row in active}
@@ -104,6 +103,15 @@ def frame_results(
             now = perf_counter()
             ms["cycle"], last = 1000 * (now - last), now
             yield FrameResult(number, index, names[index], frame, results, skipped, ms)
+
+
+def _require_inputs(frame: Frame, rows: Sequence[RowRunner]) -> None:
+    """Raises FrameError: the frame lacks the image or the depth that a row needs."""
+    tracked = any(row.setting.anchors in (CORNERS, DENSE) for row in rows)
+    if frame.image is None and (tracked or any(row.source.needs_image for row in rows)):
+        raise FrameError(frame.name, "no image")
+    if frame.depth is None and any(row.source.is_truth for row in rows):
+        raise FrameError(frame.name, "no depth map")
 
 
 def _predicted(
