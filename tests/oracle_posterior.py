@@ -21,7 +21,7 @@ START = {
     "centre": (0.0, 0.0, -14.0, 14.0),
     "calibration": (0.0, 0.0, 0.0, 1e6),
 }
-PRIOR, DRIFT, MEMORY = np.array([0.5, 0.2, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
+PRIOR, DRIFT, MEMORY = np.array([0.5, 0.12, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
 REACH, RADIUS, NEAR, WEAK, CLIP, APART = 1.0, 0.15, 0.05, 0.25**2, 9.0, 0.5
 
 
@@ -91,7 +91,7 @@ def joint_prior(logs, state):
         for a, b, s in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
             Q[q + a, q + b] += s * w
     mean = np.zeros(q + n)
-    mean[:4] = T @ state["b"]
+    mean[:4] = T @ state["b"] + np.array([0, 0, *(0.2 * state["slopes"][1:] * (state["frames"] > 0))])
     return mean, Q
 
 
@@ -243,9 +243,9 @@ def at_nodes(state, after, size, logs, seen, fit, motion):
     alone, spread = np.array(alone), np.array(spread)
     beyond = np.maximum((spread - (1 - p) * alone) / np.maximum(p, 1e-12), alone)
     alone = np.minimum(alone, np.quantile(alone, 0.7))
-    p = np.maximum(p, np.clip((spread - alone) / np.maximum(np.maximum(beyond, 4 * alone) - alone, 1e-12), 0, 1))
+    p = np.maximum(p, np.clip((spread - alone) / np.maximum(np.maximum(beyond, 16 * alone) - alone, 1e-12), 0, 1))
     for k, x in enumerate(HX[:, 1:4]):
-        offset[k] += share[k] ** 2 / (share[k] ** 2 + 0.3**2) * (x @ (after["slopes"] - mean[1:4]))
+        offset[k] += share[k] ** 2 / (share[k] ** 2 + 0.5**2) * (x @ (after["slopes"] - mean[1:4]))
     return offset, alone, spread, p, share
 
 

@@ -177,8 +177,9 @@ class UncertainDepth(NetworksInTurn):
             TypeError, ValueError: see the class.
         """
         members = modules_of(networks)
-        shared = isinstance(preprocess, str) and preprocess == "own"
-        return members, shared_preprocess(members) if shared else preprocess
+        if isinstance(preprocess, str) and preprocess == "own":
+            return members, shared_preprocess(members)
+        return members, preprocess
 
     def forward(
         self,

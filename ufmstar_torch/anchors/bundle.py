@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.anchors.epipolar import FAR, NEAR, median, off_lines, on_lines
-from ufmstar_torch.anchors.saved_state import SavedState
+from ufmstar_torch.anchors.saved_state import POSITIVE, SavedState
 from ufmstar_torch.anchors.time_offset import TimeOffset
 
 # [px] Standard deviations of a position by errors of the poses: at first (best on tours whose poses err by .05 to .15
@@ -64,6 +64,7 @@ class PoseRefinement(SavedState):
         "shared": "remaining_pose_variance",
         "_offset_variance": "pose_variance_by_offset",
     }
+    RANGES: ClassVar = {"_variance": POSITIVE}
 
     def __init__(self) -> None:
         self.offset = TimeOffset()

@@ -27,7 +27,7 @@ TAIL = 1e-15
 # Quantile of the variance of inliers over the image that limits it.
 _TYPICAL = 0.7
 # Least ratio of the variances of another surface and of the evidence's.
-_APART = 4.0
+_APART = 16.0
 # Steps of the bisection: a bracket of 20 m shrinks to a micrometre.
 _BISECTIONS = 24
 
