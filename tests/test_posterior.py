@@ -14,10 +14,12 @@ from ufmstar_torch import PosteriorConfig
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.anchors.check import check_anchors
 from ufmstar_torch.frames.frame import check_frame
+from ufmstar_torch.kernels.compile_cpu import kernel
 from ufmstar_torch.posterior import field
-from ufmstar_torch.posterior.distribution import divided
+from ufmstar_torch.posterior.config import constants
+from ufmstar_torch.posterior.moments import divide, second_moments
 from ufmstar_torch.posterior.running import FEATURES, SIZE, Running
-from ufmstar_torch.posterior.scene import SIDE, elsewhere_variance, second_moments
+from ufmstar_torch.posterior.scene import SIDE, elsewhere_variance
 from ufmstar_torch.posterior.update import update
 
 MODEL = PosteriorConfig()
@@ -62,6 +64,9 @@ def test_values_against_the_oracle_over_frames():
         np.testing.assert_allclose(out.scores[0], np.array(state["scores"]), rtol=1e-6)
 
 
+solve, distance, divided = kernel(field.solve), kernel(field.distance), kernel(divide)
+
+
 @pytest.mark.parametrize(("rows", "cols"), [(5, 9), (3, 1), (1, 4), (30, 28)])
 def test_field_and_distance_against_dense_matrices_and_dijkstra(rows, cols):
     assert FEATURES < field.RIGHT
@@ -77,12 +82,12 @@ def test_field_and_distance_against_dense_matrices_and_dijkstra(rows, cols):
         A[[i, j], [i, j]] += links[i]
         A[[i, j], [j, i]] -= links[i]
     Y = rng.standard_normal((n, field.RIGHT))
-    solved, variance = field.solve(diagonal, right, down, Y, cols)
+    solved, variance = solve(diagonal, right, down, Y, cols)
     np.testing.assert_allclose(solved, np.linalg.solve(A, Y), rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(variance, np.linalg.inv(A).diagonal(), rtol=1e-10)
     source = rng.random(n) < 0.05
     expected = oracle.distances(logs, np.nonzero(source)[0])
-    np.testing.assert_allclose(field.distance(source, across, along, cols, oracle.REACH), expected, rtol=1e-13)
+    np.testing.assert_allclose(distance(source, across, along, cols, oracle.REACH), expected, rtol=1e-13)
 
 
 def streams_of(seeds, dtype, size=(36, 48)):
@@ -125,7 +130,9 @@ def test_streams_of_one_batch_equal_the_oracle_s(dtype, rtol):
             memory = Running.of(packed[i].numpy(), MODEL)
             np.testing.assert_allclose(memory.coefficients, states[i]["b"], rtol=100 * rtol, atol=rtol)
             np.testing.assert_allclose(memory.covariance, states[i]["C"], rtol=100 * rtol, atol=rtol)
-            assert memory.ratios == pytest.approx({name: oracle.ratio(states[i], name) for name in oracle.START}, rtol)
+            assert memory.ratios._asdict() == pytest.approx(
+                {name: oracle.ratio(states[i], name) for name in oracle.START}, rtol
+            )
         assert not bool(packed[2].any())
 
 
@@ -252,7 +259,7 @@ def test_outliers_do_not_widen_what_is_stated_of_the_other_pixels():
         packed, out = updated(depth, (pixel, g, (0.05 * g) ** 2), claimed, packed)
     seen = depth > 0
     error = np.log(out.depth[0].numpy() / (depth * factor))[seen]
-    assert Running.of(packed[0].numpy(), MODEL).ratios["inlier"] < 0.3
+    assert Running.of(packed[0].numpy(), MODEL).ratios.inlier < 0.3
     assert 0.22 < np.sqrt((error**2 / (out.inlier / out.depth.square())[0].numpy()[seen]).mean()) < 1
 
 
@@ -297,8 +304,8 @@ def test_errors_that_neighbouring_anchors_do_not_share_are_not_taken_for_the_net
     patches = np.kron(np.random.default_rng(4).normal(0, 0.3, (4, 4)), np.ones((7, 7)))
     shared, _ = wall(lambda rng: patches)
     independent, _ = wall(lambda rng: rng.permutation(patches.ravel()).reshape(28, 28))
-    assert shared["amplitude"] > 5 * independent["amplitude"]
-    assert shared["unseen"] > 2 * independent["unseen"]
+    assert shared.amplitude > 5 * independent.amplitude
+    assert shared.unseen > 2 * independent.unseen
 
 
 @pytest.mark.parametrize("p", [0.0, 0.5])
@@ -325,7 +332,7 @@ def test_more_regions_on_another_surface_make_it_more_probable():
         return wall(error)
 
     (few, calm), (many, rough) = spots(0.0), spots(0.15)
-    assert few["wrong"] < MODEL.wrong < many["wrong"]
+    assert few.wrong < MODEL.wrong < many.wrong
     assert rough.outlier.mean() > 2 * calm.outlier.mean()
 
 
@@ -338,7 +345,7 @@ def test_the_variance_is_the_second_moment_about_the_posterior_depth():
         for mean, variance in ((0.0, 0.3), (-np.clip(offset, -np.log(MODEL.farthest), np.log(MODEL.farthest)), wide)):
             n = rng.normal(mean, variance**0.5, size)
             within.append(((np.exp(n[np.abs(n) < np.log(MODEL.farthest)]) - 1) ** 2).mean())
-        total, inlier = second_moments(MODEL, *(np.array([x]) for x in (0.3, p, offset, wide)))
+        total, inlier = second_moments(constants(MODEL), 0.3, p, offset, wide)
         assert inlier == pytest.approx(within[0], rel=0.03)
         assert total == pytest.approx((1 - p) * within[0] + p * within[1], rel=0.03)
 
@@ -360,7 +367,8 @@ def test_one_anchor_that_is_off_by_a_factor_of_twenty_does_not_decide():
 def test_a_wide_distribution_is_divided_without_a_change_of_its_variance():
     inlier, p = np.array([1.0, 1, 1, 1, 1, 1, 1, 4]), np.full(8, 0.05)
     total = (1 - p) * inlier + p * 40
-    limited, share = divided(total, inlier, p)
+    limited, share = inlier.copy(), p.copy()
+    divided(total, limited, share)
     assert limited.max() < 2
     np.testing.assert_allclose(share[:-1], p[:-1])
     assert share[-1] > 2 * p[-1]
@@ -414,7 +422,8 @@ def test_far_from_evidence_the_variance_is_larger_and_never_below_what_ufm_star_
 def test_another_surface_is_less_certain_than_the_anchors_around_agree():
     arguments = np.array([0.0, 0.1, 3.0]), np.array([0.01, 0.02, 0.01])
     expected = [0.01 * MODEL.elsewhere, 0.1 + 0.02 * MODEL.elsewhere, MODEL.widest]
-    np.testing.assert_allclose(elsewhere_variance(MODEL, *arguments), expected)
+    found = [elsewhere_variance(constants(MODEL), *pair) for pair in zip(*arguments, strict=True)]
+    np.testing.assert_allclose(found, expected)
 
 
 def test_before_the_first_anchor_of_a_source_the_deviation_is_about_the_depth():
