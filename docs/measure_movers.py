@@ -3,10 +3,12 @@
     python docs/measure_movers.py --weights fastdepth_nyu.onnx
 
 runs FastDepth, dense anchors and the posterior on ten tours with six moving things each, and on the same tours without
-them. It prints, for each kind of motion, for all moving pixels and for those that stand still: number of pixels; median
-ratio of posterior and true depth; root mean square z; the share of pixels beyond 4 sigma; the share with a stated sigma
-below a tenth of the depth and an error above half of the truth; delta1; NLL; and NLL of the mixture. The last row has
-the still pixels in the tours without things that move. The first frames are left out, because they have no parallax.
+them; with --exact instead of --weights, a network of the true depth times 1.35. It prints, for each kind of motion, for
+all moving pixels and for those that stand still: number of pixels; median ratio of posterior and true depth; root mean
+square z; the share of pixels beyond 4 sigma; the share with a stated sigma below a tenth of the depth and an error
+above half of the truth; delta1; NLL; and NLL of the mixture. The last row has the still pixels in the tours without
+things that move. The first frames are left out, because they have no parallax. A second table has the pixels of all
+tours by ``posterior_outlier``.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from __future__ import annotations
 import argparse
 from collections import defaultdict
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -28,11 +31,15 @@ from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.eval.tour import make_movers, make_tour, tour_path, tour_sequence
 from ufmstar_torch.eval.tour.movers import Mover, with_movers
 from ufmstar_torch.eval.tour.view import cast, intrinsics
+from ufmstar_torch.gaussians.camera import resize_intrinsics
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.network import DepthNetwork
 
+PROBABILITIES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 1.01)  # bounds of the table of outliers
 TOURS = tuple(zip(range(951, 961), ("home", "hall", "mixed", "blank", "scales") * 2, strict=True))
-SIZE, MOVERS, FIRST, STRIDE = (240, 320), 6, 5, 2
+SIZE, HALF, MOVERS, FIRST, STRIDE = (240, 320), (120, 160), 6, 5, 2
+# The exact network's error, and its depth over this error where nothing is [m].
+OFF, NOWHERE = 1.35, 3.0
 Array = NDArray[np.float64]
 
 
@@ -54,16 +61,24 @@ def exists(mover: Mover, index: int) -> bool:
     return 0 <= index - mover.start < len(mover.position)
 
 
-def posterior(frames: list[Frame], network: DepthNetwork) -> Iterator[tuple[Array, NDArray[np.float64]]]:
+def prediction(frame: Frame, network: DepthNetwork | None) -> tuple[torch.Tensor, torch.Tensor]:
+    """Depth [1, h, w] and K [1, 3, 3]; without a network, ``OFF`` times the true depth at half of the image's size."""
+    if network is None:
+        K = resize_intrinsics(torch.from_numpy(frame.intrinsics), SIZE, HALF)
+        truth = truth_at(frame, K.numpy(), HALF)
+        return torch.from_numpy(np.where(truth > 0, OFF * truth, OFF * NOWHERE)).float()[None], K[None]
+    with torch.no_grad():
+        x, K = network.preprocess(image_tensor(frame), torch.from_numpy(frame.intrinsics)[None])
+        return network(x).depth.float(), K.double()
+
+
+def posterior(frames: list[Frame], network: DepthNetwork | None) -> Iterator[tuple[Array, NDArray[np.float64]]]:
     """For each frame, [h, w, 5] depth, variance, inlier variance, probability of an outlier and truth; and K [3, 3]."""
     source = landmark_source("dense")
     ufm = UfMStar(UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig()))
     for frame in frames:
         assert frame.image is not None
-        with torch.no_grad():
-            x, K = network.preprocess(image_tensor(frame), torch.from_numpy(frame.intrinsics)[None])
-            depth = network(x).depth.float()
-        K = K.double()
+        depth, K = prediction(frame, network)
         marks = source.update(frame.image, frame.T_world_cam, frame.intrinsics).anchors(frame.intrinsics, K)
         out = ufm(depth, torch.from_numpy(frame.T_world_cam)[None], K, anchors=marks)
         maps = out.depth, out.variance, out.posterior_inlier_variance, out.posterior_outlier
@@ -85,13 +100,27 @@ def row(name: str, pixels: list[Array]) -> str:
     return f"| {name} | {len(d)} | " + " | ".join(figures) + " |"
 
 
+def outliers(pixels: Array) -> Iterator[str]:
+    """Rows by ``posterior_outlier``, of [P, 5] values: bounds, share of the pixels, mean probability, share beyond
+    three standard deviations of the inliers; and the mean probability beyond and within."""
+    d, _, v1, p, g = pixels.T
+    beyond = (g - d) ** 2 > 9 * v1
+    for low, high in pairwise(PROBABILITIES):
+        used = (p >= low) & (p < high)
+        figures = f"{used.mean():.2f} | {p[used].mean():.3f} | {beyond[used].mean():.3f}"
+        yield f"| {low:g} to {min(high, 1):g} | {figures} |"
+    yield f"mean probability {p[beyond].mean():.3f} beyond, {p[~beyond].mean():.3f} within"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--weights", type=Path, required=True, help="FastDepth's")
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--weights", type=Path, help="FastDepth's")
+    source.add_argument("--exact", action="store_true", help="the true depth times 1.35 instead of a network")
     parser.add_argument("--frames", type=int, default=60, help="of a tour")
     parser.add_argument("--tours", type=int, default=len(TOURS), help="number of tours")
     arguments = parser.parse_args()
-    network = load_network("fastdepth", arguments.weights).eval()
+    network = None if arguments.exact else load_network("fastdepth", arguments.weights).eval()
     found: dict[str, list[Array]] = defaultdict(list)
     for seed, style in TOURS[: arguments.tours]:
         options = {"frames": arguments.frames, "size": SIZE, "style": style}
@@ -119,6 +148,10 @@ def main() -> None:
     print(row("all moving", [pixels for rows in found.values() for pixels in rows]))
     print(row("still", still[0]))
     print(row("still, in the tours without", still[1]))
+    every = np.concatenate([pixels for rows in (*found.values(), *still) for pixels in rows])
+    print("\n| posterior_outlier | share | mean | beyond 3 sigma of the inliers |\n|---|---|---|---|")
+    print("\n".join(outliers(every)))
+    print("in the tours without:", *list(outliers(np.concatenate(still[1])))[-1:])
 
 
 if __name__ == "__main__":

@@ -28,18 +28,18 @@ from torch.nn.functional import adaptive_avg_pool2d, interpolate
 
 from ufmstar_torch import PosteriorConfig, UfMStar
 from ufmstar_torch.anchors import landmark_source
-from ufmstar_torch.anchors.anchors import check_anchors
+from ufmstar_torch.anchors.anchors import Anchors
+from ufmstar_torch.anchors.check import check_anchors
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.eval.sequences.open import open_sequence
-from ufmstar_torch.frames.frame import AnchorInput, FrameInput, check_frame
+from ufmstar_torch.frames.frame import FrameInput, check_frame
 from ufmstar_torch.gaussians.camera import resize_intrinsics
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import load_trained
-from ufmstar_torch.posterior.correct import common_error
 from ufmstar_torch.posterior.running import SIZE
 from ufmstar_torch.posterior.update import update
 
@@ -64,7 +64,7 @@ class Prepared:
     """One frame's input of the posterior, its anchors by source of evidence, and the true depth [h, w] [m]."""
 
     frame: FrameInput
-    anchors: Mapping[str, AnchorInput]
+    anchors: Mapping[str, Anchors]
     claimed: Tensor
     truth: Tensor
 
@@ -122,9 +122,7 @@ def figures(prepared: list[Prepared], kind: str, config: PosteriorConfig) -> lis
     worse, outliers = [], []
     for one in prepared:
         packed, out = update(packed, one.frame, one.anchors[kind], one.claimed, config)
-        common = common_error(one.anchors[kind], out.depth, config.prior_sigma**2)
-        variances = (out.variance + common)[0], (out.inlier + common)[0]
-        maps = out.depth[0], variances[0], one.truth, one.frame.depth[0], variances[1], out.outlier[0]
+        maps = out.depth[0], out.variance[0], one.truth, one.frame.depth[0], out.inlier[0], out.outlier[0]
         depth, variance, truth, network, *mixture = (x[..., ::STRIDE, ::STRIDE] for x in maps)
         metrics.update(depth, variance, truth, mixture=(mixture[0], mixture[1]))
         measured = (truth > 0) & (network > 0)

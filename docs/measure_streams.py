@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from ufmstar_torch import UfMStar, UfMStarConfig
-from ufmstar_torch.eval.engine.clock import synchronize
+from ufmstar_torch.eval.engine.progress import synchronize
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.runtime.capture import Captured
 

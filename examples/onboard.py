@@ -28,9 +28,8 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.bench.energy import CPU, EnergyMeter
 from ufmstar_torch.eval.commands.terminal import Bars
 from ufmstar_torch.eval.engine.files import to_json, write_json_atomic
-from ufmstar_torch.eval.engine.progress import Progress
+from ufmstar_torch.eval.engine.progress import Progress, warm_up_command
 from ufmstar_torch.eval.engine.realtime import RealTime
-from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.report.style import save_figure
 from ufmstar_torch.eval.report.text import number, realtime_table
 from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range

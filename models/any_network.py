@@ -14,8 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from ufmstar_torch.frames.arguments import require_flag
-from ufmstar_torch.frames.networks import require_switchable
-from ufmstar_torch.frames.prediction import DepthPrediction, infer
+from ufmstar_torch.frames.prediction import DepthPrediction, infer, require_switchable
 from ufmstar_torch.frames.prediction import takes_intrinsics as declares_intrinsics
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.models.hugging_face import from_hugging_face, of_transformers

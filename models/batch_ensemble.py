@@ -18,8 +18,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.frames.networks import combine
-from ufmstar_torch.frames.prediction import DepthPrediction
+from ufmstar_torch.frames.prediction import DepthPrediction, combine
 from ufmstar_torch.models.batch_layer import BatchLayer, Selection
 from ufmstar_torch.models.distribution import DepthDistribution, images_of
 from ufmstar_torch.models.heads import UncertaintyNetwork

@@ -9,8 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.frames.networks import combine
-from ufmstar_torch.frames.prediction import DepthPrediction, infer
+from ufmstar_torch.frames.prediction import DepthPrediction, combine, infer
 from ufmstar_torch.models.distribution import DepthDistribution
 from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.network import DepthNetwork

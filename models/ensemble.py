@@ -11,8 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from ufmstar_torch.frames.networks import combine
-from ufmstar_torch.frames.prediction import DepthPrediction, infer, takes_intrinsics
+from ufmstar_torch.frames.prediction import DepthPrediction, combine, infer, takes_intrinsics
 from ufmstar_torch.models.checkpoints import CheckpointError
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.preprocess import Preprocess

@@ -11,8 +11,13 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.frames.networks import require_switchable
-from ufmstar_torch.frames.prediction import DepthPrediction, stated_range, states_confidence, takes_intrinsics
+from ufmstar_torch.frames.prediction import (
+    DepthPrediction,
+    require_switchable,
+    stated_range,
+    states_confidence,
+    takes_intrinsics,
+)
 from ufmstar_torch.models.preprocess import Preprocess
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor, nn
 
 from ufmstar_torch import uncertain_depth as pipeline
-from ufmstar_torch.frames import networks as networks_in_turn
+from ufmstar_torch.frames import prediction
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models.any_network import refuse_relative, wrap_network
 from ufmstar_torch.models.hugging_face import of_transformers
@@ -20,8 +20,8 @@ class UncertainDepth(pipeline.UncertainDepth):
     __doc__ = pipeline.UncertainDepth.__doc__
 
     def accepted(
-        self, networks: object, preprocess: networks_in_turn.Preprocess | Literal["own"] | None
-    ) -> tuple[list[nn.Module], networks_in_turn.Preprocess | None]:
+        self, networks: object, preprocess: prediction.Preprocess | Literal["own"] | None
+    ) -> tuple[list[nn.Module], prediction.Preprocess | None]:
         """See the base class. Wraps functions, and models and pipelines of ``transformers``, whose ``preprocess`` may
         be a ``Preprocess`` or an image processor."""
         members: list[Any] = [networks]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from ufmstar_torch.kernels.cpu import regress as regress_cpu
 from ufmstar_torch.kernels.cpu import rigid as rigid_cpu
 from ufmstar_torch.kernels.cpu import segment as segment_cpu
 from ufmstar_torch.kernels.cpu import stream as stream_cpu
-from ufmstar_torch.kernels.select import moved, select_frame, select_kernels
+from ufmstar_torch.kernels.select import select_frame, select_kernels
 from ufmstar_torch.steps.correspond import Correspondence
 from ufmstar_torch.steps.step import REFERENCE, Kernels
 
@@ -93,6 +93,17 @@ def compiled(part: Callable[..., Any]) -> Callable[..., Any]:
 
     call.__qualname__ = part.__qualname__  # the name of the files in the cache
     return kernel(call)
+
+
+def moved(value: Any, device: torch.device | str) -> Any:
+    """The same value with its tensors on a device: a tensor, a tuple, or a dataclass with tensors in its fields."""
+    if isinstance(value, torch.Tensor):
+        return value.to(device)
+    if isinstance(value, tuple):
+        return tuple(moved(part, device) for part in value)
+    if not is_dataclass(value) or isinstance(value, type):
+        return value
+    return replace(value, **{f.name: moved(getattr(value, f.name), device) for f in fields(value)})
 
 
 def _on(device: str, kernel: Callable[..., Any]) -> Any:

@@ -22,7 +22,7 @@ MAX_WORKERS = 4  # each takes up to 3 GB
 COMPILE = Path(__file__).with_name("compile_kernels.py")
 COMPILERS: pytest.StashKey[list[subprocess.Popen[bytes]]] = pytest.StashKey()
 
-settings.register_profile("fast", deadline=None, max_examples=25)
+settings.register_profile("fast", deadline=None, max_examples=10)
 settings.register_profile("thorough", deadline=None, max_examples=50, print_blob=True)
 settings.register_profile("few", deadline=None, max_examples=3)
 # --hypothesis-profile=thorough loads another one.

@@ -14,7 +14,7 @@ from ufmstar_torch.eval.engine.maps import own_depth
 from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.frames.networks import NetworksInTurn
+from ufmstar_torch.frames.prediction import NetworksInTurn
 from ufmstar_torch.models import Preprocess
 
 CONFIG = UfMStarConfig(on_bad_frame="skip")

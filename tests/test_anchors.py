@@ -13,7 +13,6 @@ import scenes
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.evidence import Evidence, inliers, means, observe
-from ufmstar_torch.frames.frame import AnchorInput
 
 HEIGHT, WIDTH = 48, 64
 ON = UfMStarConfig(anchors=AnchorConfig(), unmeasured="paper")  # evidence alone
@@ -61,12 +60,16 @@ def test_a_common_bias_is_measured_and_counted_once():
 
 
 def rows(values, valid=None, pixel=None):
-    """AnchorInput of one stream from (predicted, depth, variance, own variance) tuples, in a line 5 px apart."""
+    """Checked anchors of a stream, in a line 5 px apart, by (predicted, depth, variance, network's variance)."""
     columns = torch.tensor(values, dtype=torch.float64).T[:, None]
     n = len(values)
     ok = torch.ones(1, n, dtype=torch.bool) if valid is None else torch.tensor([valid])
     line = [[5.0 * i, 0.0] for i in range(n)] if pixel is None else pixel
-    return AnchorInput(torch.tensor([line]), torch.zeros(1, n, dtype=torch.int64), *columns, ok)
+    predicted, depth, variance, network_variance = columns
+    return Anchors(
+        torch.tensor([line]), depth, variance, ok, index=torch.zeros(1, n, dtype=torch.int64), predicted=predicted,
+        network_variance=network_variance,
+    )  # fmt: skip
 
 
 @given(st.integers(0, 10**6), st.floats(0.5, 1.0), st.floats(0.5, 20.0))

@@ -14,7 +14,6 @@ import scenes
 from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.evidence import Evidence, inliers, observe
-from ufmstar_torch.frames.frame import AnchorInput
 
 H, W = 48, 64
 ON = UfMStarConfig(anchors=AnchorConfig())
@@ -115,9 +114,12 @@ def test_no_weighted_claim_exceeds_the_other_anchors_errors():
         for _ in range(30):
             d = np.full(n, 3.0)
             rows = stream(np.stack([5.0 * np.arange(n), np.zeros(n)], -1), rng.normal(0.1, 0.01, n), n)
-            network_variance = torch.tensor(10.0 ** rng.uniform(-6, 12, n))[None]
+            variance = torch.tensor(10.0 ** rng.uniform(-6, 12, n))[None]
             spoilt = replace(
-                rows, predicted=rows.predicted * torch.tensor(d), depth=rows.depth * 3, own_variance=network_variance
+                rows,
+                predicted=rows.predicted * torch.tensor(d),
+                depth=rows.depth * 3,
+                network_variance=variance,
             )
             evidence = Evidence(torch.zeros(1, 1, 3, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64))
             sums, _ = observe(evidence, spoilt, lambda values: values.sum(1, keepdim=True), 1.0)
@@ -132,7 +134,8 @@ def stream(pixel, log_ratio, padded):
     fields[1] += 1
     fields[2][0, n:] = 1
     index, valid = torch.zeros(1, padded, dtype=torch.int64), torch.arange(padded)[None] < n
-    return AnchorInput(fields[0], index, *fields[1:], valid)
+    pixel, predicted, depth, variance, network_variance = fields
+    return Anchors(pixel, depth, variance, valid, index=index, predicted=predicted, network_variance=network_variance)
 
 
 def test_padding_does_not_decide_which_neighbours_are_asked():

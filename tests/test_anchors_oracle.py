@@ -13,11 +13,12 @@ from walks import HEIGHT, SPGF, WIDTH, oracle_settings
 
 import scenes
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
-from ufmstar_torch.anchors.anchors import Anchors, check_anchors
+from ufmstar_torch.anchors.anchors import Anchors
+from ufmstar_torch.anchors.check import check_anchors
 from ufmstar_torch.anchors.evidence import Evidence, inliers
 from ufmstar_torch.anchors.kernels import learn as anchors_cpu
 from ufmstar_torch.anchors.learn import Learnt, learn
-from ufmstar_torch.frames.frame import AnchorInput, check_frame
+from ufmstar_torch.frames.frame import check_frame
 from ufmstar_torch.kernels.cpu.regress import regress_maps, views_of
 from ufmstar_torch.steps.regress import distribute
 
@@ -104,7 +105,7 @@ def test_the_compiled_support_is_the_references_own(seed):
     n = (1, 2, 3, 4, 5, 9, 12, 40, 100, 300, 301, 1500)[seed]
     pixel, predicted, depth, variance, chance = drawn(seed, 2, n)
     valid = chance < (0.9 if seed % 3 else 0.5)
-    anchors = AnchorInput(pixel, pixel[..., 0].long(), predicted, depth, variance, 0 * depth, valid)
+    anchors = Anchors(pixel, depth, variance, valid, index=pixel[..., 0].long(), predicted=predicted)
     expected = inliers(anchors)
     assert torch.equal(anchors_cpu.inliers(anchors), expected)
     if n >= 40:
@@ -120,7 +121,7 @@ def test_neighbours_of_anchors_that_lie_together(where):
         pixel[..., 0] = 3.0
     if where == "two points":
         pixel[:, ::3] = 190.0
-    anchors = AnchorInput(pixel, pixel[..., 0].long(), predicted, depth, variance, 0 * depth, depth > 0)
+    anchors = Anchors(pixel, depth, variance, depth > 0, index=pixel[..., 0].long(), predicted=predicted)
     assert torch.equal(anchors_cpu.inliers(anchors), inliers(anchors))
 
 
@@ -152,7 +153,7 @@ def test_what_is_checked_of_strange_anchors():
             assert bool(found.valid[b, i]) == near
             if near:
                 claimed = sum(float(one[b, int(v), int(u)]) for one in variance_maps)
-                mine = [float(x[b, i]) for x in (found.predicted, found.depth, found.variance, found.own_variance)]
+                mine = [float(x[b, i]) for x in (found.predicted, found.depth, found.variance, found.network_variance)]
                 np.testing.assert_allclose(mine, [d, g, s2, claimed], rtol=5e-7)
                 assert int(found.index[b, i]) == v * size[1] + u
         assert 100 < found.valid.sum() < 2 * n

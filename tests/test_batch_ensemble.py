@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from ufmstar_torch import UncertainDepth
-from ufmstar_torch.frames.networks import combine
+from ufmstar_torch.frames.prediction import combine
 from ufmstar_torch.models import (
     Backbone,
     BatchEnsemble,

@@ -8,8 +8,7 @@ import time
 import pytest
 from layouts import write_generic
 
-from ufmstar_torch.eval.engine.stream import read_ahead
-from ufmstar_torch.eval.engine.writer_thread import WriterThread
+from ufmstar_torch.eval.engine.threads import call_behind, read_ahead
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
 
 FRAMES = 9
@@ -32,11 +31,11 @@ class Slow:
 
 def write_all(slow, fail_at=None, error=None):
     """Write the frames in a thread; the loop itself may fail at a frame."""
-    with WriterThread() as thread:
+    with call_behind() as call:
         for number in range(FRAMES):
             if number == fail_at:
                 raise error
-            thread.call(slow.write, number)
+            call(slow.write, number)
 
 
 def test_every_frame_is_written_in_order_by_another_thread():
@@ -66,9 +65,9 @@ def test_whatever_ends_the_loop_all_frames_that_were_computed_are_through(error)
 def test_only_a_few_frames_wait():
     """The loop waits for slow writers, so that memory is bounded."""
     slow, behind_by = Slow(), []
-    with WriterThread() as thread:
+    with call_behind() as call:
         for number in range(FRAMES):
-            thread.call(slow.write, number)
+            call(slow.write, number)
             behind_by.append(number + 1 - len(slow.numbers))
     assert max(behind_by) <= 6  # 5 queued, and one being written
 

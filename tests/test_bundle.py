@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.anchors.bundle import PoseRefinement
 from ufmstar_torch.anchors.dense import DenseEvidence
-from ufmstar_torch.anchors.kernels.bundle import equations, inverse_depths, moved
+from ufmstar_torch.anchors.kernels.bundle import between, equations, inverse_depths, move
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 
 K = np.array([[260.0, 0, 160], [0, 260, 120], [0, 0, 1]])
@@ -29,6 +29,20 @@ def scene(rng, views=8, tracks=120, noise=0.0):
     cam = (point[:, None] - poses[:, :3, 3])[:, :, None] @ poses[:, :3, :3]
     seen_at = (cam @ K.T)[:, :, 0]
     return poses, seen_at[..., :2] / seen_at[..., 2:] + rng.normal(0, noise, (tracks, views, 2))
+
+
+def moved(poses, error):
+    result = poses.copy()
+    move(error, result)
+    return result
+
+
+def relative(poses):
+    """Buffers of :func:`between`, filled."""
+    views = len(poses)
+    result = np.zeros((views - 1, 3, 3)), np.zeros((views - 1, 3)), np.zeros((views, 3, 3))
+    between(poses, *result)
+    return result
 
 
 def turned(rng, poses, degrees):
@@ -54,7 +68,10 @@ def test_a_step_is_that_of_the_dense_problem(seed):
     ray = (pixel - K[:2, 2]) / K[0, 0]
     precision = rng.uniform(1e5, 1e6, (9, 3)) * (rng.random((9, 3)) < 0.8)
     rho, prior = rng.uniform(0.25, 1, 9), rng.uniform(1e2, 1e4, 24)
-    A, b, by_error, alone = equations(ray, precision, poses, rho, 0.5, 4.0)
+    A, b, by_error, alone = np.zeros((24, 24)), np.zeros(24), np.zeros((9, 24)), np.zeros(9)
+    buffers = np.zeros((9, 24)), np.zeros((2, 2, 6))
+    equations(ray, precision, *relative(poses), rho, 0.5, 4.0, A, b, by_error, alone, *buffers)
+    A = np.tril(A) + np.tril(A, -1).T
     error = np.linalg.solve(0.3 * A + np.diag(prior), 0.3 * b)
     expected = oracle_bundle.step(ray, precision, poses, rho, 0.5, 4.0, 0.3, prior)
     scale = np.abs(expected).max()
@@ -66,7 +83,8 @@ def test_a_step_is_that_of_the_dense_problem(seed):
 def test_inverse_depths_alone_are_those_of_the_scene():
     poses, pixel = scene(np.random.default_rng(0))
     ray = (pixel - K[:2, 2]) / K[0, 0]
-    rho = inverse_depths(ray, np.full((len(ray), len(poses) - 1), 1e8), poses, 0.5, 4.0, 20)
+    rho, (rotation, translation, _) = np.zeros(len(ray)), relative(poses)
+    inverse_depths(ray, np.full((len(ray), len(poses) - 1), 1e8), rotation, translation, 0.5, 4.0, 20, rho)
     for positions, q in zip(ray, rho, strict=True):
         again = [oracle_bundle.projected(positions[-1], q, poses[-1], view) for view in poses[:-1]]
         np.testing.assert_allclose(again, positions[:-1], atol=1e-6)

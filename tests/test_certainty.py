@@ -17,8 +17,7 @@ from ufmstar_torch.eval.engine.estimators import make_estimator
 from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.frames.networks import NetworksInTurn
-from ufmstar_torch.frames.prediction import DepthPrediction
+from ufmstar_torch.frames.prediction import DepthPrediction, NetworksInTurn
 from ufmstar_torch.models import Ensemble, wrap_network
 from ufmstar_torch.models.alignment import AlignedNetwork, Alignment
 from ufmstar_torch.runtime.checked import flat

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
@@ -61,28 +62,24 @@ def test_help_lists_the_commands(ufmstar):
 HEAVY = ("torch", "numba", "scipy", "cv2", "PIL", "pandas", "matplotlib", "onnx", "transformers", "lightning")
 
 
-@pytest.mark.parametrize("words", [*([name, "--help"] for name in cli.COMMANDS), ["eval", "--list"]], ids=" ".join)
-def test_help_imports_no_heavy_package(words):
-    # the options of train contain settings from modules that import torch
-    heavy = [name for name in HEAVY if words[0] != "train" or name != "torch"]
+def test_help_imports_no_heavy_package():
+    """Of all commands in one process; train is the last, since its options contain settings from modules that import
+    torch."""
+    commands = [*sorted(cli.COMMANDS, key="train".__eq__), None]
+    words = [["eval", "--list"], *([name, "--help"] for name in commands[:-1])]
     program = (
-        "import contextlib, io, sys; from ufmstar_torch.cli import main\n"
-        f"with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit): main({words!r})\n"
-        f"print(len(out.getvalue()) > 200, [name for name in {heavy!r} if name in sys.modules])"
+        "import contextlib, io, sys; import ufmstar_torch; before = set(sys.modules)\n"
+        "from ufmstar_torch.cli import main\n"
+        f"for words in {[['--help'], *words]!r}:\n"
+        "    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit): main(words)\n"
+        "    new = {name.partition('.')[0] for name in set(sys.modules) - before}\n"
+        "    new -= {'ufmstar_torch', *sys.stdlib_module_names}\n"
+        f"    print(*words, len(out.getvalue()) > 200, *(new if words == ['--help'] else new & {set(HEAVY)!r}))\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert (done.stdout, done.stderr) == ("True []\n", "")
-
-
-@pytest.mark.slow
-def test_help_loads_nothing_beyond_the_package():
-    code = (
-        "import sys, ufmstar_torch; before = set(sys.modules); from ufmstar_torch.cli import main; "
-        "main(['--help']); new = {name.partition('.')[0] for name in set(sys.modules) - before}; "
-        "print(sorted(new - set(sys.stdlib_module_names)), 'torch' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "['ufmstar_torch'] False"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    *others, train = done.stdout.splitlines()
+    assert (others, done.stderr) == ([" ".join(one) + " True" for one in [["--help"], *words[:-1]]], "")
+    assert train in ("train --help True", "train --help True torch")
 
 
 NETWORK = "--model fastdepth --weights {path}/K.txt"
@@ -212,8 +209,11 @@ def test_debug_shows_the_traceback(ufmstar, tmp_path):
     assert "Traceback" in err
 
 
-@pytest.mark.parametrize("unbuffered", ["", "1"])
-@pytest.mark.parametrize("words", [["--help"], ["eval", "--list"], ["run", "--help"], ["data", "check", "{path}"]])
+@pytest.mark.parametrize(
+    ("words", "unbuffered"),
+    [(["--help"], ""), (["--help"], "1"), (["run", "--help"], "1"), (["eval", "--list"], ""),
+     (["data", "check", "{path}"], "")],
+)  # fmt: skip
 def test_a_reader_that_closes_the_output_ends_the_command_quietly(words, unbuffered, path):
     """As ``ufmstar eval --list | head -1`` does."""
     command = [sys.executable, "-m", "ufmstar_torch.cli", *(word.format(path=path) for word in words)]
@@ -233,18 +233,23 @@ def test_a_process_without_an_output_runs_a_command():
     assert (ended.returncode, ended.stderr) == (0, "")
 
 
-def test_messages_do_not_depend_on_the_encoding_of_the_terminal(tmp_path, path):
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [(["run", "x", "--poses", "foo"], "invalid choice 'foo' for argument '--poses'"),
+     (["data", "check", "grün \udcff"], "gr\\xfcn \\udcff")],
+)  # fmt: skip
+def test_messages_do_not_depend_on_the_encoding_of_the_terminal(words, expected, tmp_path, path, monkeypatch):
     """Also an option's error, which tyro frames in other letters; a file's name that it cannot show is escaped."""
-    command = [sys.executable, "-m", "ufmstar_torch.cli"]
-    odd = tmp_path / "grün \udcff"
-    shutil.copytree(path, odd)
-    for words, expected in ((("run", "x", "--poses", "foo"), "invalid choice 'foo' for argument '--poses'"),
-                            (("data", "check", str(odd)), "gr\\xfcn \\udcff")):  # fmt: skip
-        environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
-        ended = subprocess.run([*command, *words], capture_output=True, text=True, env=environment, check=False)
-        assert expected in ended.stdout + ended.stderr
-        assert ended.returncode in (0, 1, 2)
-        assert "Error:" not in ended.stderr
+    shutil.copytree(path, tmp_path / "grün \udcff")
+    monkeypatch.chdir(tmp_path)
+    output = io.BytesIO()
+    for name, errors in (("stdout", "strict"), ("stderr", "backslashreplace")):  # as Python opens them
+        stream = io.TextIOWrapper(output, "ascii", errors, write_through=True)
+        monkeypatch.setattr(sys, name, stream)
+    assert cli.main(words) in (cli.OK, cli.FAILED, cli.USAGE)
+    text = output.getvalue().decode("ascii")
+    assert expected in text
+    assert "Error:" not in text
 
 
 # ---- options ----
@@ -385,14 +390,13 @@ def test_an_error_inside_a_network(ufmstar, path, tmp_path, brightness):
 
 
 @pytest.mark.slow
-def test_fastdepth_on_a_real_sequence(tmp_path):
+def test_fastdepth_on_a_real_sequence(ufmstar, tmp_path):
     sequence = require_shared("data/rgbd_dataset_freiburg1_xyz")
     weights = require_shared("weights/fastdepth_nyu.onnx")
-    command = [sys.executable, "-m", "ufmstar_torch.cli", "run", sequence, "--model", "fastdepth", "--weights", weights]
-    command += ["--plain", "--frames", "0:3", "--distortion", "none", "--threads", "1", "--out", tmp_path / "out"]
-    done = subprocess.run([str(word) for word in command], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "Warning" not in done.stderr
+    words = ("--plain", "--frames", "0:3", "--distortion", "none", "--threads", "1", "--out", tmp_path / "out")
+    code, _, err = ufmstar("run", sequence, "--model", "fastdepth", "--weights", weights, *words)
+    assert code == 0, err
+    assert "Warning" not in err
     summary = read_summary(tmp_path / "out")
     assert summary["frames"]["done"] == summary["frames"]["with_ground_truth"] == 3
     assert summary["prediction"]["size"] == [224, 224]

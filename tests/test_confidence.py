@@ -33,7 +33,7 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics.recalibration import figures_of_samples, fit_confidence
 from ufmstar_torch.eval.tour import tour_sequence
-from ufmstar_torch.frames.networks import NetworksInTurn
+from ufmstar_torch.frames.prediction import NetworksInTurn
 from ufmstar_torch.models import Ensemble, OutputSpec, Preprocess, wrap_network
 from ufmstar_torch.models.onnx_network import OnnxNetwork
 

@@ -14,7 +14,7 @@ from torch import nn
 
 from ufmstar_torch import AnchorConfig, ConfidenceConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch import uncertain_depth as pipeline
-from ufmstar_torch.frames.networks import combine
+from ufmstar_torch.frames.prediction import combine
 from ufmstar_torch.gaussians.camera import crop_intrinsics, resize_intrinsics
 from ufmstar_torch.models import Preprocess, load_network, save_checkpoint, wrap_network
 from ufmstar_torch.posterior.recalibrate import Recalibration

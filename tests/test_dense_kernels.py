@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.anchors.kernels import dense as dense_cpu
 from ufmstar_torch.anchors.kernels.dense import Search, Views, best_pixels, measure
-from ufmstar_torch.anchors.kernels.landmarks import patches, sight
+from ufmstar_torch.anchors.kernels.landmarks import Columns, sight, store
 
 K = np.array([[90.0, 0, 47.5], [0, 90.0, 35.5], [0, 0, 1]])
 SEARCH = Search(start=0.5, low=-0.01, high=2.0, sigmas=3.5, least_score=0.85, rival=1.2, match=1.0)
@@ -176,22 +176,56 @@ def test_the_best_pixel_of_a_cell_has_the_largest_gradient():
             assert (strength[j, i], *pixel[j, i]) in inside
 
 
+def stored(image, pixel):
+    """Landmarks at pixels [n, 2] of an image, on the plane, in a memory of three."""
+    shapes = (3, 3), (3, 4, 4), 3, (3, 8, 8), 3, 3, 3, 3
+    kinds = float, float, float, np.float32, bool, int, int, int
+    landmarks = Columns(*map(np.zeros, shapes, kinds))
+    count = len(pixel)
+    store(landmarks, np.arange(count), 1, image, pixel, np.full(count, 0.5), np.full(count, 0.005**2), np.eye(4), K)
+    return landmarks
+
+
 def test_a_landmark_is_sighted_where_it_projects_and_not_behind_something(scene):
     image, _, others = scene
     pixel = np.array([[40.0, 30.0], [60.0, 44.0]])
     point = np.concatenate([pixel, np.ones((2, 1))], 1) @ np.linalg.inv(K).T * 2.0
-    landmarks = (point, np.tile(np.eye(4), (2, 1, 1)), np.full(2, 0.01), patches(image, pixel), np.ones(2, np.bool_))
+    landmarks = stored(image, pixel)
+    np.testing.assert_allclose(landmarks.point[:2], point, atol=1e-12)
+    np.testing.assert_allclose(np.square(landmarks.patch[:2]).sum((1, 2)), 1, atol=1e-6)
     for view, T in zip(others, MOVED, strict=True):
-        result, depth, spread, shown = sight(view, *landmarks, T, K)
+        seen = sight(landmarks, 2, view, T, K, 8)
         cam = (point - T[:3, 3]) @ T[:3, :3]
-        np.testing.assert_allclose(result, cam[:, :2] / cam[:, 2:] * 90 + K[:2, 2], atol=1e-9)
-        np.testing.assert_allclose(depth, cam[:, 2], atol=1e-12)
-        np.testing.assert_allclose(spread, 0.01 * np.abs(point @ T[:3, 2]), atol=1e-12)
-        assert shown.tolist() == [1, 1]
+        np.testing.assert_allclose(seen.pixel[:2], cam[:, :2] / cam[:, 2:] * 90 + K[:2, 2], atol=1e-9)
+        np.testing.assert_allclose(seen.depth[:2], cam[:, 2], atol=1e-12)
+        np.testing.assert_allclose(seen.spread[:2], 0.01 * np.abs(point @ T[:3, 2]), atol=1e-12)
+        assert seen.shown.tolist() == [1, 1, 0]
+        assert seen.slot.tolist() == [0, 1]
+        assert seen.due.tolist() == [np.linalg.norm(T[:3, 3]) >= 0.04 * z for z in cam[:, 2]]
     hidden = others[0].copy()
     hidden[20:60, 30:50] = plane(9, np.eye(4))[20:60, 30:50]
-    assert sight(hidden, *landmarks, MOVED[0], K)[3].tolist() == [-1, 1]
-    assert sight(others[0], *landmarks, pose(turned=(0, np.pi, 0)), K)[3].tolist() == [0, 0], "behind the camera"
+    assert sight(landmarks, 3, hidden, MOVED[0], K, 8).shown.tolist() == [-1, 1, 0]
+    assert landmarks.failed.tolist() == [1, 0, 0]
+    assert landmarks.seen.tolist() == [2, 3, 0]
+    turned = sight(landmarks, 4, others[0], pose(turned=(0, np.pi, 0)), K, 8)
+    assert turned.shown.tolist() == [0, 0, 0], "behind the camera"
+    for frame in range(5, 9):
+        sight(landmarks, frame, hidden, MOVED[0], K, 8)
+    assert landmarks.used.tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize("better", ["confirmed", "sigma"])
+def test_a_cell_keeps_the_landmark_that_is_known_best(scene, better):
+    image, _, others = scene
+    landmarks = stored(image, np.array([[40.0, 30.0], [42.0, 31.0]]))
+    if better == "confirmed":
+        landmarks.confirmed[1] = 1
+    else:
+        landmarks.sigma[1] /= 2
+    seen = sight(landmarks, 2, others[0], MOVED[0], K, 48)
+    assert seen.shown.tolist() == [1, 1, 0]
+    assert seen.slot.tolist() == [1]
+    assert landmarks.used.tolist() == [False, True, False]
 
 
 def test_a_search_along_the_last_row_reads_nothing_beyond_the_image():

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from ufmstar_torch.anchors.dense_poses import PoseErrors
 from ufmstar_torch.anchors.kernels.check import check_anchors, confirmed, farther
 from ufmstar_torch.anchors.kernels.dense import Measured, Views
-from ufmstar_torch.anchors.kernels.poses import Shown, linearised, solved
+from ufmstar_torch.anchors.kernels.poses import linearised, rotated, solve
 
 K = np.array([[250.0, 0, 159.5], [0, 252.0, 119.5], [0, 0, 1]])
 SHARES = np.arange(3)
@@ -49,7 +49,7 @@ def measured(pixel, rho, views, error, noise, rng):
     value, same = rho[:, None] + (off * along).sum(-1) / speed, np.full(speed.shape, noise**2)
     n = len(rho)
     return Measured(
-        value.mean(1), np.ones(n), np.full(n, 3), np.zeros(n, np.int64), value, same, along, speed,
+        value.mean(1), np.ones(n), np.full(n, 3), *np.zeros((2, n), np.int64), value, same, along, speed,
         np.zeros(speed.shape), (off * normal).sum(-1), same, np.zeros((n, 2)),
     )  # fmt: skip
 
@@ -58,9 +58,12 @@ def test_derivatives_agree_with_differences():
     pixel, rho, views = scene(0, 12)
     along, _ = lines(pixel, rho, views)
     slope = np.random.default_rng(1).normal(0, 0.5, along.shape[:2])
-    on_line, across = linearised(pixel, rho, along, slope, views, K)
-    for n in range(12):
-        for k in range(3):
+    R, t, change, on_line, across = np.zeros((3, 3)), np.zeros(3), np.zeros((2, 10)), *np.zeros((2, 12, 3, 10))
+    for k in range(3):
+        rotated(views.H[k], views.b[k], K, np.linalg.inv(K), R, t)
+        for n in range(12):
+            each = along[n, k], slope[n, k], R, t, K, change, on_line[n, k], across[n, k]
+            linearised(pixel[n], rho[n], *each)
             J = oracle_dense.by_errors(pixel[n], rho[n], views.H[k], views.b[k], K)
             e, p = along[n, k], np.array([-along[n, k, 1], along[n, k, 0]])
             np.testing.assert_allclose(across[n, k], p @ J, rtol=1e-5, atol=1e-5)
@@ -79,12 +82,18 @@ def test_errors_and_depths_agree_with_the_whole_system(seed):
     root = rng.normal(size=(22, 22))
     measurements = change, value, variance, across_change, across, across_variance
     prior = root @ root.T + np.eye(22), rng.normal(size=22)
-    solution = solved(Shown(*measurements), *prior)
-    error, covariance, rho, spread = oracle_dense.errors_and_depths(*measurements, *prior)
-    np.testing.assert_allclose(solution.error, error, rtol=1e-8, atol=1e-10)
-    np.testing.assert_allclose(solution.covariance, covariance, rtol=1e-7, atol=1e-10)
-    np.testing.assert_allclose(solution.rho, rho, rtol=1e-8, atol=1e-10)
-    assert (solution.common <= spread).all(), "the rest comes from the match alone"
+    rho, error, covariance, mean_change = np.zeros(n), np.zeros(22), np.zeros((22, 22)), np.zeros((22, n))
+    buffers = (np.zeros(shape) for shape in ((2, 10, n), (4, n), (22, 22), 22, (22, n)))
+    weights = change, value, 1 / variance, across_change, across, 1 / across_variance
+    by_view = (np.moveaxis(x, 0, -1) for x in weights)
+    results = error, covariance, mean_change, rho, *np.zeros((2, 3, n))
+    assert solve(*by_view, prior[0], prior[0] @ prior[1], *results, *buffers)
+    common = (mean_change * (covariance @ mean_change)).sum(0)
+    expected_error, expected_covariance, expected_rho, spread = oracle_dense.errors_and_depths(*measurements, *prior)
+    np.testing.assert_allclose(error, expected_error, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(covariance, expected_covariance, rtol=1e-7, atol=1e-10)
+    np.testing.assert_allclose(rho, expected_rho, rtol=1e-8, atol=1e-10)
+    assert (common <= spread).all(), "the rest comes from the match alone"
 
 
 def filtered(frames=1, seed=0, noise=0.05, **wrong):
@@ -97,7 +106,7 @@ def filtered(frames=1, seed=0, noise=0.05, **wrong):
         error[:, :6] = rng.normal(0, 1, (3, 6)) * np.repeat([wrong.get("turned", 0), wrong.get("moved", 0)], 3)
         found = measured(pixel, rho, views, error, noise, rng)
         errors.positions(K, 320, 2.0)
-        fit = errors.corrected(pixel, found, SHARES, views, K, 2.0)
+        fit = errors.corrected(pixel, np.arange(len(pixel)), found, SHARES, views, K, 2.0)
     return errors, found, fit, rho
 
 
@@ -123,7 +132,7 @@ def test_what_remains_of_wrong_poses_is_stated_beyond_first_order():
         errors._variance[:], errors._unexplained[:] = np.square([0.002, 0.008]), 0
         errors._covariance *= 1e-4
         found = measured(pixel, rho, views, error, 0.02, rng)
-        fit = errors.corrected(pixel, found, SHARES, views, K, 2.0)
+        fit = errors.corrected(pixel, np.arange(len(pixel)), found, SHARES, views, K, 2.0)
         sizes.append(np.abs(fit.rho - rho) / np.sqrt(fit.variance))
     assert 0.65 < np.median(sizes) / 0.674 < 1.3
     assert np.quantile(sizes, 0.9) / 1.645 < 1.5
@@ -140,7 +149,7 @@ def test_frames_that_contradict_their_poses_teach_nothing_of_the_camera():
     errors, found, *_ = filtered(3, camera=np.array([0.004, 1.0, -0.8, 0.0]))
     pixel, _, views = scene(5)
     before = errors.camera(K)
-    errors.corrected(pixel, found, SHARES, views, K, 2.0, trusted=False)
+    errors.corrected(pixel, np.arange(len(pixel)), found, SHARES, views, K, 2.0, trusted=False)
     np.testing.assert_array_equal(errors.camera(K), before)
 
 
@@ -150,7 +159,7 @@ def test_nothing_measured_leaves_what_is_believed_of_the_poses():
     empty = Measured(*(np.full_like(x, np.nan) if x.dtype == float and x.ndim > 1 else np.zeros_like(x)
                        for x in vars(found).values()))  # fmt: skip
     before = errors.positions(K, 320, 2.0)
-    fit = errors.corrected(pixel, empty, SHARES, views, K, 2.0)
+    fit = errors.corrected(pixel, np.arange(len(pixel)), empty, SHARES, views, K, 2.0)
     assert np.isinf(fit.variance).all()
     np.testing.assert_allclose(errors.positions(K, 320, 2.0), before, rtol=1e-6)
 
@@ -198,7 +207,7 @@ def test_matches_of_one_view_hold_where_the_oracle_finds_support():
         variance = np.square(rho * rng.choice([0.01, 0.05, 0.3], n, p=[0.5, 0.48, 0.02]))
         agreed, contradicted = rng.choice([0, 1, 1, 2, 3], n), rng.choice([0, 0, 0, 0, 1], n)
         each = np.full((n, 3), np.nan)
-        result = confirmed(pixel, Measured(rho, variance, agreed, contradicted, *[each] * 8), 10)
+        result = confirmed(pixel, Measured(rho, variance, agreed, contradicted, agreed, *[each] * 8), 10)
         expected = oracle_dense.confirmed(pixel, rho, variance, agreed, contradicted, 10)
         np.testing.assert_array_equal(result, expected)
         seen.append([np.mean(result[agreed == 1]), np.mean(~result[(agreed == 1) & (contradicted == 0)])])
@@ -215,5 +224,5 @@ def test_pixels_far_from_all_others(count):
 
 def test_nothing_is_confirmed_where_nothing_was_measured():
     none = np.zeros(0)
-    empty = Measured(none, none, none.astype(int), none.astype(int), *[np.zeros((0, 3))] * 8)
+    empty = Measured(none, none, *[none.astype(int)] * 3, *[np.zeros((0, 3))] * 8)
     assert len(confirmed(np.zeros((0, 2)), empty, 10)) == 0

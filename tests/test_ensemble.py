@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import nn
 
-from ufmstar_torch import DepthPrediction, UfMStarConfig, UncertainDepth
+from ufmstar_torch import DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.models import CheckpointError, DepthNetwork, LazyMember, Preprocess
 
 INPUT = Preprocess(size=(8, 10))
@@ -59,11 +59,18 @@ def image(batch=2):
 
 @pytest.mark.parametrize("options", [{}, {"offload": True}])
 def test_images_follow_members_that_are_not_loaded_to_their_device(options):
-    config = UfMStarConfig(max_components=64, initial_capacity=64, on_bad_frame="skip")
-    model = UncertainDepth(lazy(1.0, 1.1, **options)[0], config, posterior=False).to("meta")
+    model = UncertainDepth(lazy(1.0, **options)[0], posterior=False).to("meta")
     picture = np.zeros((8, 10, 3), np.uint8)  # not a tensor, whose device is the caller's choice
-    for _ in range(3):
-        assert model(picture, POSE, K).depth.is_meta
+    with pytest.raises(ValueError, match="device 'meta' needs max_components <= initial_capacity"):  # of UfM*'s state
+        model(picture, POSE, K)
+
+
+def test_a_step_on_device_meta_has_maps_without_values():
+    """Each of torch's operations takes a millisecond there: two rows suffice."""
+    config = UfMStarConfig(max_components=8, initial_capacity=8, on_bad_frame="skip")
+    out = UfMStar(config, device="meta")(torch.ones(1, 2, 3, device="meta"), POSE, K)
+    assert out.depth.is_meta
+    assert out.variance.shape == (1, 2, 3)
 
 
 def test_only_the_members_in_turn_are_loaded_each_once():

@@ -18,9 +18,8 @@ from ufmstar_torch import SPGFConfig, UfMStar
 from ufmstar_torch.frames import frame
 from ufmstar_torch.kernels import select
 from ufmstar_torch.kernels.cpu import check as check_cpu
+from ufmstar_torch.kernels.cpu import segment as segment_cpu
 from ufmstar_torch.kernels.cpu import step as step_cpu
-from ufmstar_torch.kernels.select import moved, on_host
-from ufmstar_torch.steps.regress import Regression
 from ufmstar_torch.steps.step import REFERENCE
 
 pytestmark = pytest.mark.numerics
@@ -84,13 +83,17 @@ def test_several_threads_at_once():
             assert all(same(mine, theirs) for mine, theirs in zip(out, alone, strict=True))
 
 
-def test_tensors_move_and_nothing_else_is_copied():
-    regression, limits = Regression(torch.ones(1, 2), torch.ones(1, 2, 3)), SPGFConfig()
-    (on_meta, same), number = moved(((regression, limits), 3), "meta")
-    assert number == 3
-    assert on_meta.disagreement.device.type == on_meta.features.device.type == "meta"
-    assert same is limits
-    assert torch.equal(on_host(lambda x, y: x + y)(torch.ones(2), 2), torch.full((2,), 3.0))
+def test_the_segmentation_on_the_host_is_that_of_the_cpu():
+    depth, _, K = input_frame(0)
+    limits = SPGFConfig().scaled_to(*depth.shape[1:])
+    features = depth[:, None] / 2
+    (mixture, labels), (expected, expected_labels) = (
+        segment(depth, K.expand(len(depth), 3, 3).double(), limits, features)
+        for segment in (select.select_kernels("auto", "mps").spgf, segment_cpu.segment)
+    )
+    assert mixture.components.min() > 0
+    assert torch.equal(labels, expected_labels)
+    assert all(torch.equal(value, expected.tensors()[name]) for name, value in mixture.tensors().items())
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ from ufmstar_torch.anchors.pose_fit import UNCHANGED, CornerTrack
 from ufmstar_torch.eval.check.depth_image_fit import depth_image_fit, image_at_map, part_of_image
 from ufmstar_torch.eval.check.image_fit import depth_fit, image_fit, track_corners
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.eval.sequences.frame import check_intrinsics
+from ufmstar_torch.eval.sequences.frame import check_intrinsics, in_memory
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
 from ufmstar_torch.models import load_network
 
@@ -167,6 +167,8 @@ MISTAKES = {
     "depth in millimetres": (same, lambda d: 1000 * d, "not in metres"),
     "inverse depth": (same, lambda d: 1 / np.maximum(d, 1e-3) * (d > 0), "is it inverse depth"),
 }
+# Those of poses and intrinsics that a few frames can show.
+CAMERAS = [name for name in MISTAKES if re.search("world-to|OpenGL|1.5|[.]7|late", name)]
 # The lowest number of six tours in which the mistake is found; on some tours the motion is so even that poses of
 # another frame fit as well.
 LATE = {"trajectory 1 frame late": 2, "trajectory 2 frames late": 3, "trajectory 3 frames late": 4}
@@ -175,7 +177,7 @@ LATE = {"trajectory 1 frame late": 2, "trajectory 2 frames late": 3, "trajectory
 @cache
 def followed(name):
     """A sequence, corners in it, and its depth at them."""
-    sequence = open_sequence(name if name.startswith("tour:") else require_shared(f"data/{name}"))
+    sequence = in_memory(open_sequence(name if name.startswith("tour:") else require_shared(f"data/{name}")))
     corners = track_corners(sequence)
     depth = {}
     for one in corners:
@@ -276,28 +278,28 @@ def print_row(mistake, found):
 
 
 @pytest.mark.slow
-def test_in_how_many_clips_each_mistake_is_named():
+@pytest.mark.parametrize("mistake", ["none", *MISTAKES])
+def test_in_how_many_clips_a_mistake_is_named(mistake):
     """The table of docs/results/mistakes.md (``-s`` prints it)."""
-    for mistake, (change, spoil, words) in {"none": (same, same, "."), **MISTAKES}.items():
-        found = [sum(bool(re.search(words, problems(n, change, spoil))) for n in part) for part in (RECORDINGS, TOURS)]
-        print_row(mistake, found)
+    change, spoil, words = MISTAKES.get(mistake, (same, same, "."))
+    found = [sum(bool(re.search(words, problems(n, change, spoil))) for n in part) for part in (RECORDINGS, TOURS)]
+    print_row(mistake, found)
 
 
 @pytest.mark.slow
-def test_in_how_many_clips_the_first_images_show_each_mistake(caplog):
+@pytest.mark.parametrize("mistake", ["none", *CAMERAS])
+def test_in_how_many_clips_the_first_images_show_a_mistake(mistake, caplog):
     """As ``UncertainDepth`` compares them, image by image; ``-s`` prints the table of docs/results/mistakes.md."""
-    cameras = [name for name in MISTAKES if re.search("world-to|OpenGL|1.5|[.]7|late", name)]
-    for mistake in ("none", *cameras):
-        change, _, words = MISTAKES.get(mistake, (same, same, "."))
-        found = [0, 0]
-        for name in (*RECORDINGS, *TOURS):
-            caplog.clear()
-            check, sequence = PoseCheck(40, CONFIG.rotation_tolerance), change(followed(name)[0])
-            for frame in islice(sequence, 40):
-                image = torch.from_numpy(frame.image).permute(2, 0, 1)[None]
-                check.compare(image, torch.from_numpy(frame.T_world_cam), torch.from_numpy(frame.intrinsics))
-            found[name in TOURS] += any(re.search(words, text) for text in caplog.messages)
-        print_row(mistake, found)
+    change, _, words = MISTAKES.get(mistake, (same, same, "."))
+    found = [0, 0]
+    for name in (*RECORDINGS, *TOURS):
+        caplog.clear()
+        check, sequence = PoseCheck(40, CONFIG.rotation_tolerance), change(followed(name)[0])
+        for frame in islice(sequence, 40):
+            image = torch.from_numpy(frame.image).permute(2, 0, 1)[None]
+            check.compare(image, torch.from_numpy(frame.T_world_cam), torch.from_numpy(frame.intrinsics))
+        found[name in TOURS] += any(re.search(words, text) for text in caplog.messages)
+    print_row(mistake, found)
 
 
 @pytest.mark.slow

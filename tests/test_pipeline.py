@@ -14,7 +14,7 @@ import scenes
 from ufmstar_torch import DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.sequences.frame import Frame
-from ufmstar_torch.frames.networks import NetworksInTurn, combine, weights_mark
+from ufmstar_torch.frames.prediction import NetworksInTurn, combine, weights_mark
 from ufmstar_torch.models import Preprocess
 
 H, W = 30, 40

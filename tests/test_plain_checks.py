@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from ufmstar_torch.anchors.anchors import check_anchor_values as reference_check
+from ufmstar_torch.anchors.check import check_anchor_values as reference_check
 from ufmstar_torch.anchors.kernels.learn import check_anchor_values
 from ufmstar_torch.frames import frame as reference
-from ufmstar_torch.frames.frame import AnchorInput, check_frame
+from ufmstar_torch.frames.frame import check_frame
 from ufmstar_torch.gaussians.camera import inverse_intrinsics, rotation_deviation
 from ufmstar_torch.kernels.cpu import check
-from ufmstar_torch.posterior.correct import common_error, widened
-from ufmstar_torch.posterior.update import Posterior
+from ufmstar_torch.posterior.cells import finish
 
 K = torch.tensor([[40.0, 0, 31.5], [0, 42.0, 23.5], [0, 0, 1]])
 NAMES = ("pixel", "index", "predicted", "depth", "variance", "valid", "rejected", "contradiction")
@@ -64,20 +63,20 @@ def test_the_inverse_of_intrinsics():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_common_errors_are_added_as_stated(dtype):
+@pytest.mark.parametrize(
+    ("shared", "scale", "contradiction"), [(0.0, 0.0, 0.0), (0.01, 0.02, 0.3), (torch.inf, 0.0, 0.0)]
+)
+def test_common_errors_are_added_as_stated(dtype, shared, scale, contradiction):
+    """max(V, floor) + d^2 (contradiction + min(d^2 shared + scale, limit)) of the corrected depth d."""
     generator = torch.Generator().manual_seed(1)
-    depth, variance, inlier = (torch.rand(3, 9, 7, generator=generator, dtype=dtype) + 0.5 for _ in range(3))
-    for value in (depth, variance, inlier):
-        value[1, 2] = torch.nan
-    nothing = torch.zeros(3, 1, dtype=torch.float64)
-    anchors = AnchorInput(
-        nothing[..., None].expand(3, 1, 2), nothing.long(), *(nothing,) * 4, nothing > 0, nothing[:, 0].long(),
-        torch.tensor([0.0, 0.3, 0.0], dtype=torch.float64), None,
-        torch.tensor([0.01, 0.0, torch.inf], dtype=torch.float64), torch.tensor([0.0, 0.02, 0.0], dtype=torch.float64),
-    )  # fmt: skip
-    added = common_error(anchors, depth, 0.25) + depth.square() * anchors.contradiction[:, None, None].to(dtype)
-    expected = [value.clamp_min(0.9) + added for value in (variance, inlier)]
-    start = Posterior(depth, variance.clone(), nothing[:, 0], nothing[:, 0], depth, inlier.clone())
-    found = widened(start, anchors, 0.25, 0.9)
-    for value, other in zip((found.variance, found.inlier), expected, strict=True):
-        torch.testing.assert_close(value, other, rtol=8 * torch.finfo(dtype).eps, atol=0, equal_nan=True)
+    network, factor, variance, inlier = (torch.rand(9, 7, generator=generator, dtype=dtype) + 0.5 for _ in range(4))
+    for value in (factor, variance, inlier):
+        value[2] = torch.nan
+    depth, limit, floor = network * factor, 0.25, 0.9
+    square = depth.double().square()
+    added = square * (contradiction + (square * shared + scale).clamp(max=limit))
+    expected = [(value.double() * factor.double().square()).clamp_min(floor) + added for value in (variance, inlier)]
+    maps = factor.clone(), variance.clone(), inlier.clone()
+    finish(network.numpy(), *(x.numpy() for x in maps), (shared, scale, contradiction, limit), floor)
+    for value, other in zip(maps, (depth, *expected), strict=True):
+        torch.testing.assert_close(value, other.to(dtype), rtol=8 * torch.finfo(dtype).eps, atol=0, equal_nan=True)

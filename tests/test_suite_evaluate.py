@@ -18,7 +18,7 @@ from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
-from ufmstar_torch.frames.networks import combine
+from ufmstar_torch.frames.prediction import combine
 from ufmstar_torch.models import load_trained
 from ufmstar_torch.models.dropout import set_sampling
 from ufmstar_torch.models.inference import Inference

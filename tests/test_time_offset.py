@@ -6,6 +6,7 @@ import logging
 from itertools import islice
 
 import numpy as np
+import oracle_bundle
 import pytest
 import torch
 from landmark_runs import long_walks, true_depth, walk
@@ -13,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from shared_data import require_shared
 
 from ufmstar_torch.anchors.dense import DenseEvidence
-from ufmstar_torch.anchors.kernels.bundle import moved
 from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.anchors.time_offset import TimeOffset
 from ufmstar_torch.eval.sequences.open import open_sequence
@@ -27,6 +27,10 @@ def path(times):
     T[:, :3, 3] = np.stack([np.sin(times / 4), np.cos(times / 5), times / 20], 1)
     T[:, :3, :3] = Rotation.from_rotvec(np.stack([np.sin(times / 6), times / 30, 0 * times], 1)).as_matrix()
     return T
+
+
+def moved(poses, error):
+    return np.stack([oracle_bundle.moved(p, e) for p, e in zip(poses, error.reshape(-1, 6), strict=True)])
 
 
 def errors_shown(truth, poses, precision):

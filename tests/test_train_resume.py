@@ -1,4 +1,4 @@
-"""A stopped or failed training continues from its last epoch, with all finished results (killed: test_kills.py)."""
+"""A stopped or failed training continues from its last epoch, with all finished results."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from torch import nn
 
 from ufmstar_torch import UncertainDepth, cli
 from ufmstar_torch.eval.run.writers import read_frame
-from ufmstar_torch.frames.networks import combine
+from ufmstar_torch.frames.prediction import combine
 from ufmstar_torch.models import (
     BatchEnsemble,
     CheckpointError,

@@ -20,7 +20,7 @@ from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.figures_calibration import write_curves
 from ufmstar_torch.eval.sequences import FrameSequence, open_sequence
-from ufmstar_torch.frames.networks import NetworksInTurn
+from ufmstar_torch.frames.prediction import NetworksInTurn
 from ufmstar_torch.models.any_network import wrap_network
 from ufmstar_torch.models.network import DepthNetwork, in_eval_mode
 from ufmstar_torch.models.preprocess import Preprocess

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, cast
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.anchors import Anchors, check_anchors
-from ufmstar_torch.anchors.doubts import AnchorDoubts
+from ufmstar_torch.anchors.anchors import Anchors
+from ufmstar_torch.anchors.check import AnchorDoubts, check_anchors
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.arguments import Array, CameraLike, as_device, as_tensor, require_flag, require_kind
 from ufmstar_torch.frames.frame import FrameInput, as_confidence, check_frame, raise_faults

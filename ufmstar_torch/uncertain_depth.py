@@ -7,7 +7,6 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain
 from types import NoneType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -15,11 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.anchors import landmarks
 from ufmstar_torch.anchors.anchors import Anchors, require_anchors
-from ufmstar_torch.anchors.pose_check import PoseCheck
-from ufmstar_torch.anchors.streams import SourceLike, StreamLandmarks, as_bytes
-from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
+from ufmstar_torch.anchors.streams import StreamLandmarks
+from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.arguments import (
     Array,
     CameraLike,
@@ -33,9 +30,12 @@ from ufmstar_torch.frames.arguments import (
     require_kind,
     require_whole,
 )
-from ufmstar_torch.frames.image_check import ImageCheck, warn_of_range
-from ufmstar_torch.frames.networks import (
+from ufmstar_torch.frames.image_check import warn_of_range
+from ufmstar_torch.frames.image_evidence import ImageEvidence, Source, with_evidence
+from ufmstar_torch.frames.output import FrameStatistics, MeanUncertainty, UncertaintyOutput
+from ufmstar_torch.frames.prediction import (
     SAMPLES,
+    DepthPrediction,
     NetworksInTurn,
     Preprocess,
     in_unit_range,
@@ -43,18 +43,15 @@ from ufmstar_torch.frames.networks import (
     shared_preprocess,
     weights_mark,
 )
-from ufmstar_torch.frames.output import FrameStatistics, MeanUncertainty, UncertaintyOutput
-from ufmstar_torch.frames.prediction import DepthPrediction, copied
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.posterior.recalibrate import Recalibration
 from ufmstar_torch.runtime.stateful import OneCaller, one_caller
-from ufmstar_torch.runtime.warm_up import along_wall, camera_of, require_size, warm_up
+from ufmstar_torch.runtime.warm_up import along_wall, require_size, warm_up
 from ufmstar_torch.ufmstar import UfMStar
 
 # Keys of a stream's state, or prefixes of keys: of UfM*, of the anchors' source, the number of processed images, and a
 # checksum of the networks' weights.
 _UFM, _LANDMARKS, _INDEX, _MARK = "ufm.", "landmarks.", "image_index", "weights_mark"
-_MISSED = "UfM* alone, without anchors and the depth that the posterior corrects with them: %s"
 
 
 @dataclass(frozen=True)
@@ -150,7 +147,7 @@ class UncertainDepth(NetworksInTurn):
         posterior: bool = True,
         samples: int | None = None,
         preprocess: Preprocess | Literal["own"] | None = "own",
-        anchors: SourceLike | list[SourceLike] | tuple[SourceLike, ...] | None = None,
+        anchors: Source | None = None,
         recalibration: Recalibration | None = None,
         check_poses: int = 40,
         multiview_device: torch.device | str | None = None,
@@ -161,19 +158,13 @@ class UncertainDepth(NetworksInTurn):
         self._caller, self.mode = OneCaller(), mode
         require_kind("config", config, (UfMStarConfig, NoneType), "a UfMStarConfig or None")
         require_kind("recalibration", recalibration, (Recalibration, NoneType), "a Recalibration or None")
-        config, source = _with_evidence(
-            config or UfMStarConfig(), networks, require_flag("posterior", posterior), anchors
-        )
+        posterior = require_flag("posterior", posterior)
+        config, source = with_evidence(config or UfMStarConfig(), networks, posterior, anchors)
         self.ufm = UfMStar(config.within(self.max_depth, self.states_confidence), recalibration=recalibration)
-        self.landmarks = None if source is None else StreamLandmarks(source)
-        self._by_default = source is not None and anchors is None
-        self._unsearchable = False  # whether an image could not be searched for anchors
-        self._searched = False  # whether the source of anchors has processed the current image
-        # A source that searches the images compares their poses itself, but does not name the mistake.
-        searching = self.landmarks is not None and self.landmarks.searching and not self._by_default
-        images = require_whole("check_poses", check_poses, 0)
-        self._pose_check = PoseCheck(0 if searching else images, self.ufm.config.rotation_tolerance)
-        self._image_check = ImageCheck()
+        self._evidence = ImageEvidence(
+            source, by_default=anchors is None, check_poses=require_whole("check_poses", check_poses, 0),
+            rotation_tolerance=self.ufm.config.rotation_tolerance,
+        )  # fmt: skip
         self.multiview_device = None if multiview_device is None else as_device("multiview_device", multiview_device)
         self._next = 0  # number of processed images
 
@@ -186,9 +177,9 @@ class UncertainDepth(NetworksInTurn):
             TypeError, ValueError: see the class.
         """
         members = modules_of(networks)
-        if isinstance(preprocess, str) and preprocess != "own":
-            raise TypeError(f"preprocess must be a Preprocess, a function or None, got {preprocess!r}")
-        return members, shared_preprocess(members) if isinstance(preprocess, str) else preprocess
+        if isinstance(preprocess, str) and preprocess == "own":
+            return members, shared_preprocess(members)
+        return members, preprocess
 
     def forward(
         self,
@@ -219,6 +210,109 @@ class UncertainDepth(NetworksInTurn):
 
     if TYPE_CHECKING:
         __call__ = forward
+
+    def _predicted(
+        self,
+        image: ImageLike,
+        pose: CameraLike,
+        intrinsics: CameraLike,
+        features: Array | None = None,
+        *,
+        ahead: bool = False,
+    ) -> _Predicted:
+        """The prediction for the next image, or, with ``ahead``, for the one after that."""
+        return self._predict(image, pose, intrinsics, features, number=self._next + ahead)
+
+    def _predict(
+        self,
+        image: ImageLike,
+        pose: CameraLike,
+        intrinsics: CameraLike,
+        features: Array | None = None,
+        *,
+        number: int,
+    ) -> _Predicted:
+        """The prediction for the image of an index."""
+        if not self.networks:
+            raise ValueError("UncertainDepth(None) has no networks: pass predictions to update")
+        picture, T, K_image = as_image(image), as_pose(pose), as_intrinsics(intrinsics)
+        if number == 0:
+            warn_of_range(picture)
+        if not isinstance(image, Tensor):  # a tensor's device is the caller's choice
+            picture = picture.to(self.device or picture.device)
+        member = None if self.mode == "full" else self.turn(number)
+        with torch.no_grad():
+            x, K = self.prepare(picture, K_image.expand(len(picture), 3, 3))
+            prediction = self.every(x, K) if member is None else self.member(x, K, member)
+        index = 0 if member is None else number % SAMPLES if self.stochastic else member
+        prediction = replace(prediction, member=index)
+        tensors = {name: value for name, value in vars(prediction).items() if isinstance(value, Tensor)}
+        if features is not None:
+            tensors["features"] = as_tensor("features", features)
+        there, ready = _copied(tensors, self.multiview_device)
+        H = there.pop("features", None)
+        return _Predicted(picture, T, K_image, replace(prediction, **there), member, H, ready)
+
+    def _fused(
+        self, predicted: _Predicted, valid: Array | None = None, anchors: Anchors | None = None
+    ) -> UncertaintyOutput:
+        with self._anchored(predicted, anchors) as (found, p):
+            out = self.update(p, predicted.pose, p.K, valid, features=predicted.features, anchors=found)
+        self._undo(out.statistics)
+        return replace(out, member=predicted.member)
+
+    @contextmanager
+    def _anchored(
+        self, predicted: _Predicted, anchors: Anchors | None, *, search: bool = True
+    ) -> Iterator[tuple[Anchors | None, DepthPrediction]]:
+        """The image's anchors at pixels of the depth map, and the prediction with whether the image shows something.
+        Waits for the prediction's copies. Errors as :meth:`ImageEvidence.next_image`."""
+        if predicted.ready is not None:
+            predicted.ready.synchronize()
+        p, K, skip = predicted.prediction, predicted.intrinsics, self.ufm.config.on_bad_frame == "skip"
+        with self._evidence.next_image(
+            predicted.image, predicted.pose, K, anchors, p.depth.device, search=search, skip=skip
+        ) as (found, informative):
+            if found is not None and self.preprocess not in (None, in_unit_range):
+                found = require_anchors(found).moved(K, p.K)
+            yield found, replace(p, informative=informative)
+
+    def _undo(self, statistics: FrameStatistics) -> None:
+        """Undo the updates by the image for streams that skipped it."""
+        # Reading the faults synchronises with an accelerator.
+        can_skip = self.ufm.config.on_bad_frame == "skip" and not statistics.fault.is_meta
+        self._evidence.undo(statistics.fault.nonzero().flatten().tolist() if can_skip else [])
+
+    def update(
+        self,
+        prediction: DepthPrediction,
+        pose: CameraLike,
+        intrinsics: CameraLike,
+        valid: Array | None = None,
+        *,
+        features: Array | None = None,
+        anchors: Anchors | None = None,
+    ) -> UncertaintyOutput:
+        """Process an existing prediction, for example a cached one, as :meth:`forward` does after its networks.
+
+        Args:
+            prediction: [B, h, w].
+            pose: as in :meth:`forward`.
+            intrinsics: as in :meth:`forward`, of the depth map [px].
+            valid, features: as in :meth:`forward`.
+            anchors: [B, N] at pixels of the depth map, with ``config.anchors``; None = no anchors, even with a source.
+
+        Raises:
+            ValueError, TypeError: as :meth:`UfMStar.forward`; the image is then not counted.
+        """
+        require_kind("prediction", prediction, DepthPrediction, "a DepthPrediction")
+        maps = prediction.arguments(confidence=self.ufm.uses_confidence)
+        out = self.ufm(pose=pose, intrinsics=intrinsics, valid=valid, features=features, anchors=anchors, **maps)
+        self._next += 1
+        if prediction.intrinsics is None:
+            K = as_intrinsics(intrinsics)
+            prediction = replace(prediction, intrinsics=K.expand(len(prediction.depth), 3, 3))
+        return replace(out, prediction=prediction)
 
     def stream(
         self, frames: Iterable[tuple[ImageLike, CameraLike, CameraLike]]
@@ -272,39 +366,8 @@ class UncertainDepth(NetworksInTurn):
     def _networks_on_cpu(self) -> bool:
         """True if :meth:`stream` runs the networks in a thread of their own. An accelerator needs no thread to work
         beside the CPU, and autocast is valid in the caller's thread alone."""
-        device = self._device()
+        device = self.device
         return (device is None or device.type == "cpu") and not torch.is_autocast_enabled("cpu")
-
-    def update(
-        self,
-        prediction: DepthPrediction,
-        pose: CameraLike,
-        intrinsics: CameraLike,
-        valid: Array | None = None,
-        *,
-        features: Array | None = None,
-        anchors: Anchors | None = None,
-    ) -> UncertaintyOutput:
-        """Process an existing prediction, for example a cached one, as :meth:`forward` does after its networks.
-
-        Args:
-            prediction: [B, h, w].
-            pose: as in :meth:`forward`.
-            intrinsics: as in :meth:`forward`, of the depth map [px].
-            valid, features: as in :meth:`forward`.
-            anchors: [B, N] at pixels of the depth map, with ``config.anchors``; None = no anchors, even with a source.
-
-        Raises:
-            ValueError, TypeError: as :meth:`UfMStar.forward`; the image is then not counted.
-        """
-        require_kind("prediction", prediction, DepthPrediction, "a DepthPrediction")
-        maps = prediction.arguments(confidence=self.ufm.uses_confidence)
-        out = self.ufm(pose=pose, intrinsics=intrinsics, valid=valid, features=features, anchors=anchors, **maps)
-        self._next += 1
-        if prediction.intrinsics is None:
-            K = as_intrinsics(intrinsics)
-            prediction = replace(prediction, intrinsics=K.expand(len(prediction.depth), 3, 3))
-        return replace(out, prediction=prediction)
 
     def mean_uncertainty(
         self,
@@ -321,8 +384,8 @@ class UncertainDepth(NetworksInTurn):
         average: bool = False,
     ) -> MeanUncertainty:
         """Like :meth:`forward`, but computes the average of V per image, for active learning. The default source of
-        anchors is not asked: V has B only from a source that the constructor was passed, or from earlier calls of
-        :meth:`forward`.
+        anchors does not search the image: V has B only from a source that the constructor was passed, or from earlier
+        calls of :meth:`forward`.
 
         Args:
             image, pose, intrinsics, valid, features, anchors: as in :meth:`forward`.
@@ -332,7 +395,7 @@ class UncertainDepth(NetworksInTurn):
             ValueError, TypeError: as :meth:`UfMStar.mean_uncertainty`; alternation and landmarks then do not advance.
         """
         predicted = self._predicted(image, pose, intrinsics, features)
-        with self._anchored(predicted, anchors, search=not self._by_default) as (found, p):
+        with self._anchored(predicted, anchors, search=not self._evidence.by_default) as (found, p):
             maps = p.arguments(confidence=self.ufm.uses_confidence)
             mean = self.ufm.mean_uncertainty(
                 pose=predicted.pose, intrinsics=p.K, valid=valid, features=predicted.features, anchors=found,
@@ -364,136 +427,9 @@ class UncertainDepth(NetworksInTurn):
         require_size(size, streams)
         searching = () if self.landmarks is None else self.landmarks.searching
         if self.networks:
-            size = self._tried(size, streams)
+            size = self.run_on_noise(size, streams)
         ufm = UfMStar(self.ufm.config, dtype=self.ufm.mean.dtype, device=self.ufm.mean.device)
         warm_up(ufm, size, streams, progress, [partial(along_wall, kind()) for kind in searching])
-
-    def _tried(self, size: tuple[int, int], streams: int) -> tuple[int, int]:
-        """Run every network twice on noise in images of ``size``; the size of their depth maps."""
-        device = self._device() or torch.device("cpu")
-        floats = (t.dtype for t in self._tensors() if t.is_floating_point() and t.element_size() > 1)
-        with torch.no_grad(), torch.random.fork_rng([device] if device.type == "cuda" else []):
-            noise = torch.randint(0, 256, (streams, 3, *size), dtype=torch.uint8, device=device)
-            image = (noise / 255).to(next(floats, torch.float32)) if self.preprocess is None else noise
-            x, K = self.prepare(image, camera_of(size).to(torch.float64).expand(streams, 3, 3))
-            for _ in range(2):
-                maps = [self.member(x, K, n) for n in range(len(self.networks))]
-        height, width = maps[0].depth.shape[1:]
-        return height, width
-
-    def _fused(
-        self, predicted: _Predicted, valid: Array | None = None, anchors: Anchors | None = None
-    ) -> UncertaintyOutput:
-        with self._anchored(predicted, anchors) as (found, p):
-            out = self.update(p, predicted.pose, p.K, valid, features=predicted.features, anchors=found)
-        self._undo(out.statistics)
-        return replace(out, member=predicted.member)
-
-    @contextmanager
-    def _anchored(
-        self, predicted: _Predicted, anchors: Anchors | None, *, search: bool = True
-    ) -> Iterator[tuple[Anchors | None, DepthPrediction]]:
-        """The image's anchors, from the caller or the source, at pixels of the depth map, and the prediction with
-        whether the image shows something. Waits for the prediction's copies. An error in the context undoes the updates
-        by the image.
-
-        Raises:
-            ValueError: anchors from both the caller and a source, or as :meth:`StreamLandmarks.update`.
-        """
-        if predicted.ready is not None:
-            predicted.ready.synchronize()
-        K = predicted.intrinsics
-        self._pose_check.compare(predicted.image, predicted.pose, K)
-        if anchors is not None and self.landmarks is not None and not self._by_default:
-            raise ValueError("anchors come from the source that UncertainDepth was made with: pass none")
-        self._searched = search and anchors is None and self._searchable(predicted.image)
-        if self._searched and self.landmarks is not None:
-            config = self.ufm.config
-            skip = config.on_bad_frame == "skip"
-            anchors = self.landmarks.update(predicted.image, predicted.pose, K, config.rotation_tolerance, skip=skip)
-            anchors = anchors.to(predicted.prediction.depth.device)  # UfM*'s may be another than the image's
-        try:
-            moved = anchors is not None and self.preprocess not in (None, in_unit_range)
-            found = require_anchors(anchors).moved(K, predicted.prediction.K) if moved else anchors
-            informative = self._image_check.informative(predicted.image, predicted.pose)
-            yield found, replace(predicted.prediction, informative=informative)
-        except BaseException:
-            self._image_check.undo()
-            if self.landmarks is not None and self._searched:
-                self.landmarks.undo()
-            raise
-
-    def _searchable(self, image: Tensor) -> bool:
-        """False where the default source cannot search the image: it is neither of bytes nor of floats in [0, 1]."""
-        if not self._by_default or image.is_meta:
-            return not image.is_meta
-        try:
-            as_bytes(image)
-        except ValueError:
-            if not self._unsearchable:
-                LOGGER.warning(_MISSED, "the images must be bytes, or floats in [0, 1] (logged once)")
-            self._unsearchable = True
-            return False
-        return True
-
-    def _undo(self, statistics: FrameStatistics) -> None:
-        """Undo the updates by the image for streams that skipped it."""
-        # Reading the faults synchronises with an accelerator.
-        can_skip = self.ufm.config.on_bad_frame == "skip" and not statistics.fault.is_meta
-        skipped = statistics.fault.nonzero().flatten().tolist() if can_skip else []
-        self._image_check.undo(skipped)
-        if self.landmarks is not None and self._searched:
-            self.landmarks.undo(skipped)
-
-    def _predicted(
-        self,
-        image: ImageLike,
-        pose: CameraLike,
-        intrinsics: CameraLike,
-        features: Array | None = None,
-        *,
-        ahead: bool = False,
-    ) -> _Predicted:
-        """The prediction for the next image, or, with ``ahead``, for the one after that."""
-        return self._predict(image, pose, intrinsics, features, number=self._next + ahead)
-
-    def _predict(
-        self,
-        image: ImageLike,
-        pose: CameraLike,
-        intrinsics: CameraLike,
-        features: Array | None = None,
-        *,
-        number: int,
-    ) -> _Predicted:
-        """The prediction for the image of an index."""
-        if not self.networks:
-            raise ValueError("UncertainDepth(None) has no networks: pass predictions to update")
-        picture, T, K_image = as_image(image), as_pose(pose), as_intrinsics(intrinsics)
-        if number == 0:
-            warn_of_range(picture)
-        if not isinstance(image, Tensor):  # a tensor's device is the caller's choice
-            picture = picture.to(self._device() or picture.device)
-        member = None if self.mode == "full" else self.turn(number)
-        with torch.no_grad():
-            x, K = self.prepare(picture, K_image.expand(len(picture), 3, 3))
-            prediction = self.every(x, K) if member is None else self.member(x, K, member)
-        index = 0 if member is None else number % SAMPLES if self.stochastic else member
-        prediction = replace(prediction, member=index)
-        tensors = {name: value for name, value in vars(prediction).items() if isinstance(value, Tensor)}
-        if features is not None:
-            tensors["features"] = as_tensor("features", features)
-        there, ready = copied(tensors, self.multiview_device)
-        H = there.pop("features", None)
-        return _Predicted(picture, T, K_image, replace(prediction, **there), member, H, ready)
-
-    def _tensors(self) -> Iterator[Tensor]:
-        """The networks' parameters and buffers. A ``LazyMember`` has a buffer alone, on its device."""
-        return chain(self.networks.parameters(), self.networks.buffers())
-
-    def _device(self) -> torch.device | None:
-        """The networks' device; None if they have no tensors."""
-        return next((tensor.device for tensor in self._tensors()), None)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Move the networks; UfM* stays on ``multiview_device`` unless that is None."""
@@ -502,23 +438,24 @@ class UncertainDepth(NetworksInTurn):
             self.ufm.to(self.multiview_device)
         return self
 
+    @property
+    def image_index(self) -> int:
+        """The number of processed images, i of the next one."""
+        return self._next
+
+    @property
+    def landmarks(self) -> StreamLandmarks | None:
+        """The sources of anchors of all streams; None without a source."""
+        return self._evidence.landmarks
+
     def reset(self, streams: Sequence[int] | Tensor | None = None, *, keep_evidence: bool = False) -> None:
         """Reset UfM* (:meth:`UfMStar.reset`) and the landmarks; resetting all streams also restarts the alternation."""
         self.ufm.reset(streams, keep_evidence=keep_evidence)
         b = self.ufm.mean.shape[0]
         chosen = None if streams is None else self.ufm._chosen(streams, b).nonzero().flatten().tolist()
-        if self.landmarks is not None:
-            self.landmarks.reset(chosen)
+        self._evidence.reset(chosen)
         if chosen is None:
             self._next = 0
-        self._image_check.reset(chosen)
-        if chosen is None or 0 in chosen:
-            self._pose_check.reset()
-
-    @property
-    def image_index(self) -> int:
-        """The number of processed images, i of the next one."""
-        return self._next
 
     def stream_state(self) -> dict[str, Tensor]:
         """Everything of a video on which the next results depend, but the networks' weights: the state of UfM*, the
@@ -563,7 +500,23 @@ class UncertainDepth(NetworksInTurn):
         if int(counts[_MARK]) != weights_mark(self.networks):
             LOGGER.warning("the state was saved with other networks: it holds their disagreement; reset() begins anew")
         self._next = int(counts[_INDEX])
-        self._image_check.reset()
+        self._evidence.images.reset()
+
+
+def _copied(values: dict[str, Tensor], device: torch.device | None) -> tuple[dict[str, Any], torch.cuda.Event | None]:
+    """Copy the values to ``device`` (None: no copy). Copies from CUDA to the CPU are asynchronous, into pinned memory,
+    and return an event to wait for."""
+    if device is None:
+        return values, None
+    source = values["depth"].device
+    if source.type != "cuda" or device.type != "cpu":
+        return {name: value.to(device, non_blocking=True) for name, value in values.items()}, None
+    copies = {name: torch.empty(value.shape, dtype=value.dtype, pin_memory=True) for name, value in values.items()}
+    for name, value in values.items():
+        copies[name].copy_(value.detach(), non_blocking=True)
+    ready = torch.cuda.Event()
+    ready.record(torch.cuda.current_stream(source))
+    return copies, ready
 
 
 def _require_passes(members: Sequence[nn.Module], mode: object, samples: object) -> None:
@@ -577,33 +530,6 @@ def _require_passes(members: Sequence[nn.Module], mode: object, samples: object)
         raise ValueError("mode 'full' needs several networks, or samples for a stochastic one")
     if len({id(member) for member in members}) < len(members):
         raise ValueError("networks must differ, got one of them twice: for passes of a stochastic one set samples")
-
-
-def _with_evidence(config: UfMStarConfig, networks: object, posterior: bool, anchors: Any) -> tuple[UfMStarConfig, Any]:
-    """The config with the sections ``anchors`` and ``posterior`` that are used, and the source of anchors, or None.
-    Logs a warning if the default source cannot serve."""
-    if posterior and anchors is None and (missed := _missed(networks)):
-        posterior = config.anchors is not None
-        if networks is not None or not posterior:
-            LOGGER.warning(_MISSED, missed)
-    elif posterior and anchors is None:
-        anchors = "dense"
-    if posterior or anchors is not None:
-        config = config.replace(anchors=config.anchors or AnchorConfig())
-    if posterior:
-        config = config.replace(posterior=config.posterior or PosteriorConfig())
-    return config, anchors
-
-
-def _missed(networks: object) -> str:
-    """Why no image can be searched for anchors; "" if images can be."""
-    if networks is None:
-        return "UncertainDepth(None) sees no images"
-    try:
-        landmarks.opencv()
-    except ImportError as error:
-        return str(error)
-    return ""
 
 
 def _require_count(value: object, name: str) -> None:

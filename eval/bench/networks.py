@@ -16,8 +16,7 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import OF_NETWORK
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
-from ufmstar_torch.frames.networks import NetworksInTurn
-from ufmstar_torch.frames.prediction import DepthPrediction, infer
+from ufmstar_torch.frames.prediction import DepthPrediction, NetworksInTurn, infer
 from ufmstar_torch.models.batch_ensemble import BatchEnsembleMember
 from ufmstar_torch.models.dropout import SAMPLES, DecoderDropout, MonteCarloDropout
 from ufmstar_torch.models.ensemble import LazyMember

@@ -20,8 +20,8 @@ from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork
 from ufmstar_torch.eval.bench.timing import Clock, StagedStep
-from ufmstar_torch.eval.engine.clock import synchronize
 from ufmstar_torch.eval.engine.estimators import Gaussians, Pointwise, make_estimator
+from ufmstar_torch.eval.engine.progress import synchronize
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.sequences.frame import Frame
@@ -147,6 +147,21 @@ def _staged(rows: Iterable[Row], device: torch.device, clock: Clock) -> dict[str
     }
 
 
+def _inferences(
+    networks: Mapping[str, TimedNetwork],
+    forms: Mapping[str, Collection[str]],
+    prepared: Mapping[str, tuple[Tensor, Tensor]],
+    turn: int,
+) -> dict[Part, Callable[[], DepthPrediction]]:
+    """The forms of inference of every base on its prepared input."""
+    return {
+        (base, form): partial(networks[base].predict, form, *prepared[base], turn=turn)
+        for base, needed in forms.items()
+        for form in (DEPTH, ONCE, EVERY)
+        if form in needed
+    }
+
+
 def _inputs(
     rows: Iterable[Row], frame: Frame, maps: Mapping[Part, DepthPrediction], cameras: Mapping[str, torch.Tensor],
     device: torch.device,
@@ -208,28 +223,20 @@ def time_parts(
     sizes: dict[str, list[float]] = {label: [] for label in steps}
     for number, frame in enumerate(frames):
         turn = number - warm_up if restart and number >= warm_up else number
-        repeated = not restart or number >= warm_up
+        repeated, first = not restart or number >= warm_up, turn == 0
         prepared = {base: networks[base].prepare(frame, device) for base in forms}
-        inferences: dict[Part, Callable[[], DepthPrediction]] = {
-            (base, form): partial(networks[base].predict, form, *prepared[base], turn=turn)
-            for base, needed in forms.items()
-            for form in (DEPTH, ONCE, EVERY)
-            if form in needed
-        }
+        inferences = _inferences(networks, forms, prepared, turn)
         keep = repeated and turn < _INFERENCES and bool({DEPTH, ONCE, EVERY} & set(metered))
         maps = parts.run(number, inferences, device, keep=keep)
         cameras = {base: K.cpu().double() for base, (_, K) in prepared.items()}
         inputs = _inputs(rows, frame, maps, cameras, multiview_device)
-        multiview: dict[Part, Callable[[], Any]] = {
-            (label, MULTIVIEW): partial(step, *inputs[label], first=turn == 0) for label, step in steps.items()
-        }
-        multiview |= {
-            (label, SAMPLE): partial(step.sample, *inputs[label][1:], first=turn == 0)
-            for label, step in sampled.items()
-        }
+        multiview: dict[Part, Callable[[], Any]]
+        multiview = {(label, MULTIVIEW): partial(step, *inputs[label], first=first) for label, step in steps.items()}
+        for label, step in sampled.items():
+            multiview[label, SAMPLE] = partial(step.sample, *inputs[label][1:], first=first)
         parts.run(number, multiview, multiview_device, keep=repeated and MULTIVIEW in metered)
         for label, staged in parts.staged.items():
-            staged(*inputs[label], first=turn == 0)
+            staged(*inputs[label], first=first)
         if number >= warm_up:
             for label, step in steps.items():
                 sizes[label].append(step.memory()["bytes_end"])

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from ufmstar_torch import UfMStar
-from ufmstar_torch.eval.engine.clock import synchronize
+from ufmstar_torch.eval.engine.progress import synchronize
 from ufmstar_torch.eval.run.machine import available_cores
 
 # Seconds since an arbitrary moment: wall-clock time, or the processor's time for this process.

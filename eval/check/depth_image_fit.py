@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from ufmstar_torch.eval.sequences.ground_truth import nearest_pixels
+from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
 
 # A pixel is a depth edge if its inverse depth exceeds the mean of its neighbours on both sides by this share. Planes
 # are linear in inverse depth, so a slanted plane has no edge.
@@ -84,9 +84,7 @@ def image_at_map(image: np.ndarray, K_image: np.ndarray, K_map: np.ndarray, size
     H_image_map = K_image @ np.linalg.inv(K_map)
     blur = 0.5 * max(H_image_map[0, 0], H_image_map[1, 1])  # pixels of the image within one of the map
     grey = gaussian_filter(image.astype(np.float32).mean(axis=2), blur)
-    v, u = np.mgrid[: size[0], : size[1]]
-    x, y, _ = H_image_map @ np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
-    return grey.reshape(-1)[nearest_pixels(x, y, (grey.shape[0], grey.shape[1]))[0]].reshape(*size, 1)
+    return resample_nearest(grey, K_image, K_map, size)[..., None]
 
 
 def depth_edges(depth: np.ndarray) -> np.ndarray:

@@ -33,27 +33,18 @@ SECTIONS = ("anchors", "confidence", "posterior", "merge")
 
 
 @dataclass(frozen=True, kw_only=True)
-class NetworkOptions:
-    """Depth from networks.
+class InferenceOptions:
+    """Running of networks.
 
     Attributes:
-        model: The network is a fastdepth, monodepth2, trained, depth_anything, huggingface, onnx, torchscript or
-            exported.
-        weights: The file of its weights (depth_anything, huggingface: directory); several are an ensemble's members.
-        mode: Run one member of an ensemble per image in turn, or all on every image.
-        samples: Run an mc_dropout network this many times per image in mode full (default: 10).
-        offload: Keep the weights of a trained ensemble in host memory, only the member in turn on the device.
+        samples: Run an mc_dropout network this many times per image, where all passes are needed (default: 10).
         spec: This JSON file declares what the weights do not say: inputs, outputs, an alignment.
-        trust_code: Let an exported or torchscript file run its code; only for files whose origin you trust.
+        trust_code: Let exported and torchscript files run their code; only for files whose origin you trust.
         runtime: Use torch or ONNX Runtime (auto: ONNX Runtime for weights in ONNX files).
         precision: Run the networks in this precision; bf16 is torch's autocast.
     """
 
-    model: Text = None
-    weights: Texts = ()
-    mode: Literal["alternate", "full"] = "alternate"
     samples: Count = None
-    offload: Flag = False
     spec: Text = None
     trust_code: Flag = False
     runtime: Literal["auto", "torch", "onnx"] = "auto"
@@ -61,6 +52,32 @@ class NetworkOptions:
 
     def __post_init__(self) -> None:
         require_least(self, samples=2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WeightsOptions:
+    """The files of networks.
+
+    Attributes:
+        model: The network is a fastdepth, monodepth2, trained, depth_anything, huggingface, onnx, torchscript or
+            exported.
+        weights: The file of its weights (depth_anything, huggingface: directory); several are an ensemble's members.
+        mode: Run one member of an ensemble per image in turn, or all on every image.
+        offload: Keep the weights of a trained ensemble in host memory, only the member in turn on the device.
+    """
+
+    model: Text = None
+    weights: Texts = ()
+    mode: Literal["alternate", "full"] = "alternate"
+    offload: Flag = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkOptions(InferenceOptions, WeightsOptions):  # the help lists the last base's options first
+    """Depth from networks."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         if self.model is not None and not self.weights:
             raise ValueError(f"--model {self.model} needs --weights FILE")
         for name in ("weights", "spec", "samples", "offload"):

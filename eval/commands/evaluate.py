@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
+from ufmstar_torch.eval.commands.depth import InferenceOptions
 from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import Recording
 from ufmstar_torch.eval.commands.options import (
@@ -50,13 +51,8 @@ class SuiteOptions:
         base: A figure or ablation is about this network instead of the paper's: depth_only, ...
         ufm_preset: All rows of UfM* start from the paper's settings (UfMStarConfig.paper) or ours, not the suite's.
         network: Name a network for every base as BASE=MODEL:FILE[,FILE...]; rows without one are left out; repeatable.
-            A FILE.json is its spec. With paper-table-1, -2 and -4 a base may have a second one, whose time, energy and
-            memory are measured as well.
-        spec: This JSON file declares what the weights of networks without a spec do not say, as for ufmstar run.
-        trust_code: Let exported and torchscript files run their code; only for files whose origin you trust.
-        samples: Run MC-Dropout this many times in a row that needs all passes (default: 10).
-        runtime: Use torch or ONNX Runtime (auto: ONNX Runtime for weights in ONNX files).
-        precision: Run the networks in this precision; bf16 is torch's autocast.
+            A FILE.json is its spec, --spec that of all others. With paper-table-1, -2 and -4 a base may have a second
+            one, whose time, energy and memory are measured as well.
         recalibration: Judge the row of this file of `ufmstar recalibrate` also under it, as a row of its own, on
             sequences other than those that it was fitted to; repeatable.
         list: Show the suites and stop.
@@ -66,16 +62,8 @@ class SuiteOptions:
     base: Text = None
     ufm_preset: Literal["paper", "default"] | None = None
     network: Words = ()
-    spec: Text = None
-    trust_code: Flag = False
-    samples: Count = None
-    runtime: Literal["auto", "torch", "onnx"] = "auto"
-    precision: Literal["float32", "bf16"] = "float32"
     recalibration: Words = ()
     list: Flag = False
-
-    def __post_init__(self) -> None:
-        require_least(self, samples=2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,6 +138,7 @@ class EvalOptions(MachineOptions):
     scheduler: Text = None
     dry_run: Flag = False
     what: Annotated[SuiteOptions, arg(name="suite")]
+    inference: InferenceOptions
     data: DataOptions
     opening: Recording
     output: EvalOutputOptions
@@ -196,7 +185,7 @@ def job_from(options: EvalOptions) -> EvalJob:
     require_methods(suite, options.opening.plugin)
     architectures: list[dict[str, NetworkChoice]] = [{}]
     for text in joined(what.network):  # a base's n-th network belongs to the n-th architecture
-        choice = replace(NetworkChoice.parse(text).with_spec(what.spec), trust_code=what.trust_code)
+        choice = replace(NetworkChoice.parse(text).with_spec(values["spec"]), trust_code=values["trust_code"])
         number = sum(choice.base in architecture for architecture in architectures)
         architectures += [{}] if number == len(architectures) else []
         architectures[number][choice.base] = choice
@@ -223,7 +212,7 @@ def job_from(options: EvalOptions) -> EvalJob:
 
 
 def _evaluate(options: EvalOptions) -> int:
-    from ufmstar_torch.eval.engine.warm_up import warm_up_command
+    from ufmstar_torch.eval.engine.progress import warm_up_command
     from ufmstar_torch.eval.suite.tasks import evaluate_suite, executor_of
 
     how: dict[str, Any] = {"resume": options.output.resume, "overwrite": options.output.overwrite}

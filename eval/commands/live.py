@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import dataclass
-from functools import partial
 from time import monotonic
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -62,8 +61,8 @@ class LiveOptions(MachineOptions):
         max_wait: An image waits at most this long for a pose after it [s].
         state: Save the state to this file, from which the next command continues.
         save_every: Save the state at this interval [s].
-        out: Write realtime.json to this folder and, for each image, a .npz with depth and variance (corrected unless
-            --plain), those before the correction, disagreement, pose and intrinsics.
+        out: Write realtime.json to this folder and, for each image, a .npz of maps, pose and intrinsics, as `ufmstar
+            run` does.
         overwrite: Replace the results in --out.
         view: Show the images, depth and plots in rerun, on this computer alone.
         json: Print a line of JSON per image instead of the status.
@@ -122,7 +121,6 @@ def main(options: LiveOptions) -> int:
     from ufmstar_torch.eval.engine.realtime import RealTime
     from ufmstar_torch.eval.report.text import realtime_table
     from ufmstar_torch.eval.run.folder import FolderKind, output_folder
-    from ufmstar_torch.eval.run.live_output import ARRAYS
     from ufmstar_torch.eval.run.machine import share_threads
     from ufmstar_torch.eval.run.rerun_log import RerunLog, open_viewer
     from ufmstar_torch.eval.run.writers import is_frame
@@ -130,8 +128,7 @@ def main(options: LiveOptions) -> int:
 
     if options.threads is None:
         share_threads()
-    ours = {"*.npz": partial(is_frame, names=ARRAYS)}
-    kind = FolderKind("ufmstar live", "live run", _SUMMARY, ("*.npz",), recognise=ours, lock=".lock")
+    kind = FolderKind("ufmstar live", "live run", _SUMMARY, ("*.npz",), recognise={"*.npz": is_frame}, lock=".lock")
     started = {"state": "started"}  # a later run may replace finished results only
     with ExitStack() as stack:
         with usage_errors(ImportError, OSError, ValueError):
@@ -165,12 +162,14 @@ def _shown_by(
     options: LiveOptions, live: LiveDepth, times: RealTime, view: RerunLog | None
 ) -> Callable[[LiveResult], None]:
     """A function that writes and shows the result of an image."""
-    from ufmstar_torch.eval.run.live_output import figures_of, viewer_frame, write_result
+    from ufmstar_torch.eval.engine.realtime import figures_of
+    from ufmstar_torch.eval.run.rerun_log import viewer_frame
+    from ufmstar_torch.eval.run.writers import output_arrays, write_frame
 
     def on_result(result: LiveResult) -> None:
         times.take(result)
         if options.out is not None:
-            write_result(options.out, result)
+            write_frame(options.out / f"{result.stamp:.6f}.npz", output_arrays(result.out, result.T_world_cam))
         figures = figures_of(result, live.statistics)
         if view is not None:
             view.add(viewer_frame(result, len(times.latency), figures))
@@ -232,7 +231,7 @@ def _model(options: LiveOptions) -> UncertainDepth:
     """The networks with UfM*, warmed up; errors as ``NetworkChoice.load``."""
     from ufmstar_torch.anchors.sources import DENSE
     from ufmstar_torch.eval.engine.anchors import landmarks_of
-    from ufmstar_torch.eval.engine.warm_up import warm_up_command
+    from ufmstar_torch.eval.engine.progress import warm_up_command
     from ufmstar_torch.uncertain_depth import UncertainDepth
 
     chosen, source = options.network, options.network.load(options)

@@ -88,11 +88,10 @@ def main(options: RankOptions) -> int:
 
 def _scores(options: RankOptions) -> ImageScores:
     """Stream the sequences."""
-    from ufmstar_torch.eval.engine.progress import frame_progress
-    from ufmstar_torch.eval.engine.stream import Stopped, frame_results
-    from ufmstar_torch.eval.run.depth_check import DepthCheck
+    from ufmstar_torch.eval.engine.stream import Stopped, frame_progress, frame_results
     from ufmstar_torch.eval.run.rank import ImageScores, require_part
     from ufmstar_torch.eval.run.run import warm_up_job
+    from ufmstar_torch.eval.run.run_folder import FirstMaps, fitted_depth, keep_first_map
     from ufmstar_torch.frames.warnings import LOGGER
 
     scores, source = ImageScores(options.by, options.measured), None
@@ -107,16 +106,16 @@ def _scores(options: RankOptions) -> ImageScores:
             source, scores.sequence = job.source, path
             if job.image_fit is not None and job.image_fit.problem:
                 LOGGER.warning("%s: %s", path, job.image_fit.problem)
-            check, shown = DepthCheck(job), frame_progress(bars.show, len(job.indices))
+            shown, maps = frame_progress(bars.show, len(job.indices)), FirstMaps()
             try:
                 with closing(frame_results(job.sequence, job.indices, [job.row()[0]], stop=stop)) as results:
                     for result in results:
                         scores.add(result)
-                        check.add(result)
+                        keep_first_map(job, result, maps)
                         shown(result)
             except Stopped:
                 raise KeyboardInterrupt from None
-            if (fit := check.fit()) is not None and fit.problem:
+            if (fit := fitted_depth(job, maps)) is not None and fit.problem:
                 LOGGER.warning("%s: %s", path, fit.problem)
     return scores
 

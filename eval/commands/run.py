@@ -121,14 +121,13 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
     import torch
 
     from ufmstar_torch.anchors.sources import DENSE
-    from ufmstar_torch.eval.engine.anchors import sensor_of
     from ufmstar_torch.eval.run.job import RunJob
     from ufmstar_torch.eval.run.scale import network_scale, require_metric
     from ufmstar_torch.eval.sequences.open import open_sequence, scale_poses
 
     sequence = open_sequence(path, **options.opening.changed())
     options = _without_posterior(options, sequence)
-    ufm = options.uncertainty
+    ufm, config = options.uncertainty, options.config
     if not sequence.posed:
         raise ValueError(f"{sequence.name!r} holds single images without poses, which UfM* needs to compare views")
     indices = range(len(sequence))[parse_slice(options.frames)]
@@ -136,15 +135,8 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
         raise ValueError(f"--frames {options.frames} selects none of the {len(sequence)} frames")
     if ufm.scale_from is None:
         require_metric(sequence)
-    source: DepthSource
-    if options.network.model is not None:
-        source = options.network.load(options) if networks is None else networks
-    else:
-        source = options.maps.source(sequence, indices)
-    sensor = sensor_of(ufm.anchors, sequence) if options.config.anchors else None
-    if sensor is not None and source.is_truth:
-        raise ValueError("--anchors sensor goes with the depth of a network: with --depth self, nothing is to correct")
-    scale = None
+    source = _source(options, sequence, indices, networks)
+    sensor, scale = _sensor(options, sequence, source), None
     if ufm.scale_from is not None:
         scale = network_scale(sequence, source, indices, options.opening.of_reader.model_index)
         sequence = scale_poses(sequence, scale.metres)
@@ -152,15 +144,34 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
         sequence=sequence,
         indices=indices,
         source=source,
-        config=options.config.within(source.max_depth, source.states_confidence),
-        recalibration=ufm.load_recalibration(options.config, options.network.weights, source),
+        config=config.within(source.max_depth, source.states_confidence),
+        recalibration=ufm.load_recalibration(config, options.network.weights, source),
         device=torch.device(options.device),
         settings=options.settings(),
         every=options.network.mode == "full",
-        landmarks=DENSE if options.config.anchors is None else _landmarks(ufm.anchors or DENSE, sequence),
+        landmarks=DENSE if config.anchors is None else _landmarks(ufm.anchors or DENSE, sequence),
         sensor=sensor,
         scale=scale,
     )
+
+
+def _source(
+    options: StreamOptions, sequence: FrameSequence, indices: range, networks: DepthSource | None
+) -> DepthSource:
+    """The networks of the options (``networks`` if they are loaded), or the maps of the sequence."""
+    if options.network.model is not None:
+        return options.network.load(options) if networks is None else networks
+    return options.maps.source(sequence, indices)
+
+
+def _sensor(options: StreamOptions, sequence: FrameSequence, source: DepthSource) -> str | None:
+    """The kind of depth camera whose depth serves as anchors, or None. Raises ValueError: that depth is predicted."""
+    from ufmstar_torch.eval.engine.anchors import sensor_of
+
+    sensor = sensor_of(options.uncertainty.anchors, sequence) if options.config.anchors else None
+    if sensor is not None and source.is_truth:
+        raise ValueError("--anchors sensor goes with the depth of a network: with --depth self, nothing is to correct")
+    return sensor
 
 
 def _without_posterior(options: Stream, sequence: FrameSequence) -> Stream:

@@ -18,7 +18,8 @@ from ufmstar_torch.eval.methods.method import ALONE, RELATIVE, RHO, UFM, UFM_STA
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import configured
 from ufmstar_torch.eval.methods.ufm import UfM
-from ufmstar_torch.frames.output import EVERY_FRAME, FrameStatistics, UncertaintyOutput
+from ufmstar_torch.eval.methods.ufm import output_of as output_of
+from ufmstar_torch.frames.output import UncertaintyOutput
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.posterior.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar
@@ -99,17 +100,6 @@ def ufm_star_config(row: Row) -> UfMStarConfig:
     return config.replace(segment=replace(config.segment, scale_with_image=False)) if row.method.fixed_param else config
 
 
-def output_of(depth: Tensor, variance: Tensor | None, valid: Tensor, **maps: Tensor | None) -> UncertaintyOutput:
-    """The output of a method other than UfM*, from maps [1, h, w]: NaN where not valid; all counts but that of the
-    valid pixels are 0. ``variance``: None = the method states none."""
-    variance = torch.full_like(depth, torch.nan) if variance is None else variance
-    none = torch.zeros(len(depth), dtype=torch.int64)
-    counts = dict.fromkeys(EVERY_FRAME, none)
-    statistics = FrameStatistics({**counts, "valid_pixels": valid.sum((1, 2)).cpu()})
-    named = {name: value for name, value in maps.items() if value is not None}
-    return UncertaintyOutput(depth, torch.where(valid, variance, torch.nan), valid, named, statistics)
-
-
 class Alone(Estimator):
     """The network's variance, A + E as far as it predicts them; none without ``uses_variances``."""
 
@@ -149,9 +139,7 @@ class Pointwise(Estimator):
         self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None
     ) -> UncertaintyOutput:
         used = self.used(prediction)
-        a, e = used.aleatoric_variance, used.epistemic_variance
-        out = self.ufm(used.depth, T_world_cam, prediction.K, a, e)
-        return output_of(used.depth, out.variance, out.valid, aleatoric=a, epistemic=e)
+        return self.ufm(used.depth, T_world_cam, prediction.K, used.aleatoric_variance, used.epistemic_variance)
 
     def memory(self) -> dict[str, float]:
         """Bytes and number of the points."""

@@ -40,13 +40,21 @@ class SequenceError(Exception):
     """A sequence cannot be used as a whole: no frame can be read, or there is no ground truth."""
 
 
-def metrics_of(metrics: dict[str, SequenceMetrics], key: str, **how: Any) -> SequenceMetrics:
-    """The metrics of a key, created (see ``SequenceMetrics``) if there are none."""
+def add_to(
+    metrics: dict[str, SequenceMetrics], key: str, row: RowResult, maps: tuple[Tensor, Tensor | None],
+    valid: Tensor | None = None, mixture: tuple[Tensor, Tensor] | None = None, level: Tensor | None = None, **how: Any,
+) -> None:  # fmt: skip
+    """Add a row's frame with ground truth to the metrics of a key, and of "key.moving" and "key.still" where it is
+    known what moves (``RowResult.parts``); they are created with the arguments ``how`` of ``SequenceMetrics``. The
+    other arguments, with depth and variance in ``maps``, are those of ``SequenceMetrics.update``."""
     from ufmstar_torch.eval.metrics import SequenceMetrics
 
-    if key not in metrics:
-        metrics[key] = SequenceMetrics(**how)
-    return metrics[key]
+    assert row.truth is not None
+    masks = {f"{key}.{part}": mask if valid is None else valid & mask for part, mask in row.parts.items()}
+    for name, mask in ({key: valid} | masks).items():
+        if name not in metrics:
+            metrics[name] = SequenceMetrics(**how)
+        metrics[name].update(*maps, torch.from_numpy(row.truth), mask, mixture, level)
 
 
 class RunMetrics:
@@ -65,19 +73,15 @@ class RunMetrics:
         """Add a frame; ignored without ground truth."""
         if row.truth is None:
             return
-        target = torch.from_numpy(row.truth)
         depth = row.prediction.depth[0]
         maps: dict[str, tuple[Tensor, Tensor | None]] = {UFM: (depth, row.map("ufm_variance"))}
         maps |= {} if row.network_variance is None else {ALONE: (depth, row.network_variance)}
         if row.corrected:
             maps[POSTERIOR] = row.depth, row.variance
         corrected = POSTERIOR if row.corrected else UFM
-        for name, (depth, variance) in maps.items():
+        for name, stated in maps.items():
             mixture, level = row.mixture if name == POSTERIOR else None, row.level if name == corrected else None
-            masks = {name: row.valid, **{f"{name}.{part}": row.valid & mask for part, mask in row.parts.items()}}
-            for key, valid in masks.items():
-                metrics = metrics_of(self._metrics, key, plugins=self._plugins)
-                metrics.update(depth, variance, target, valid, mixture, level)
+            add_to(self._metrics, name, row, stated, row.valid, mixture, level, plugins=self._plugins)
 
 
 class RowJudge:
@@ -125,12 +129,9 @@ class RowJudge:
         depth, variance, target = (
             torch.where(result.valid, result.depth, torch.nan), result.variance, torch.from_numpy(result.truth)
         )  # fmt: skip
-        how = {"with_variance": variance is not None, "bins": self._bins, "plugins": self._plugins}
-        mixture = result.mixture
+        how: dict[str, Any] = {"with_variance": variance is not None, "bins": self._bins, "plugins": self._plugins}
         level = None if variance is None else result.level
-        metrics_of(self._metrics, METRICS, **how).update(depth, variance, target, mixture=mixture, level=level)
-        for part, mask in result.parts.items():
-            metrics_of(self._metrics, part, **how).update(depth, variance, target, mask, mixture, level)
+        add_to(self._metrics, METRICS, result, (depth, variance), mixture=result.mixture, level=level, **how)
         if variance is None:
             return
         if self._multiview and (confidence := result.prediction.confidence) is not None:
@@ -170,7 +171,7 @@ class RowJudge:
 
     def _parts(self) -> dict[str, float]:
         """The figures of what moves and what stands still, "moving.delta1" and so on; {} without masks."""
-        parts = {part: metrics for part, metrics in self._metrics.items() if part != METRICS}
+        parts = {key.removeprefix(f"{METRICS}."): metrics for key, metrics in self._metrics.items() if key != METRICS}
         return {f"{part}.{name}": value for part, m in parts.items() for name, value in m.compute().items()}
 
     def _state(self) -> dict[str, float]:

@@ -17,7 +17,7 @@ from ufmstar_torch.eval.engine.networks import NetworkSource, stochastic
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.method import BASES
 from ufmstar_torch.eval.sequences.frame import Size, parse_size
-from ufmstar_torch.frames.networks import NetworksInTurn
+from ufmstar_torch.frames.prediction import NetworksInTurn
 from ufmstar_torch.models.any_network import PROGRAMS
 from ufmstar_torch.models.dropout import SAMPLES
 from ufmstar_torch.models.inference import Inference, runtime_of

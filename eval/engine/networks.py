@@ -12,13 +12,12 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.eval.engine.clock import timed
 from ufmstar_torch.eval.engine.predictions import DepthSource
+from ufmstar_torch.eval.engine.progress import timed
 from ufmstar_torch.eval.methods.setting import CROP, OF_NETWORK, RESIZE
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
-from ufmstar_torch.frames.networks import NetworksInTurn
-from ufmstar_torch.frames.prediction import DepthPrediction
+from ufmstar_torch.frames.prediction import DepthPrediction, NetworksInTurn
 from ufmstar_torch.models.dropout import MonteCarloDropout, set_sampling
 from ufmstar_torch.models.ensemble import LazyMember
 from ufmstar_torch.models.inference import BF16, runtime_of

@@ -21,8 +21,7 @@ from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.files.read import read_npz_whole
 from ufmstar_torch.files.write import write_atomic
 from ufmstar_torch.frames.image_check import reduced, shows_something
-from ufmstar_torch.frames.networks import SAMPLES, combine
-from ufmstar_torch.frames.prediction import DepthPrediction
+from ufmstar_torch.frames.prediction import SAMPLES, DepthPrediction, combine
 from ufmstar_torch.models.network import DepthNetwork
 
 _SHOWN = 16  # hex digits of a digest in the name of a folder: 64 bits

@@ -1,11 +1,17 @@
-"""The progress of a command, for a terminal."""
+"""The progress of a command and the time of its stages, and the compilation before its first frame."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 
-from ufmstar_torch.eval.engine.stream import FrameResult
+import torch
+
+from ufmstar_torch.anchors.names import CORNERS, DENSE
+from ufmstar_torch.config import UfMStarConfig
 
 
 @dataclass(frozen=True)
@@ -19,16 +25,31 @@ class Progress:
     skipped: int = 0  # number of frames skipped so far
 
 
-def frame_progress(show: Callable[[Progress], object], total: int) -> Callable[[FrameResult], None]:
-    """Show the progress over ``total`` frames: at the start, and by the returned function after every frame."""
-    skipped = 0
+def warm_up_command(
+    config: UfMStarConfig, show: Callable[[Progress], object], anchors: Collection[object] = ()
+) -> None:
+    """Compile UfM* and the sources of ``anchors`` that are named in it ("corners", "dense"), or load them from disk."""
+    from ufmstar_torch.anchors.dense import DenseEvidence
+    from ufmstar_torch.anchors.tracker import LandmarkTracker
+    from ufmstar_torch.runtime.warm_up import along_wall, warm_up
+    from ufmstar_torch.ufmstar import UfMStar
 
-    def shown(result: FrameResult) -> None:
-        nonlocal skipped
-        skipped += bool(result.skipped)
-        each = (int(row.out.statistics.components[0]) for row in result.rows.values())
-        components = next((count for count in each if count), None)
-        show(Progress("frames", result.number + 1, total, components, skipped))
+    searching = {CORNERS: LandmarkTracker, DENSE: DenseEvidence}
+    also = [partial(along_wall, kind()) for name, kind in searching.items() if name in anchors]
+    warm_up(UfMStar(config), (32, 32), 1, lambda done, total: show(Progress("kernels", done, total)), also)
 
-    show(Progress("frames", 0, total))
-    return shown
+
+@contextmanager
+def timed(ms: dict[str, float], stage: str, device: torch.device) -> Iterator[None]:
+    """Record the time of a block, with the work that it queues on a device, as ``ms[stage]`` [ms], unless it raises."""
+    synchronize(device)
+    started = time.perf_counter()
+    yield
+    synchronize(device)
+    ms[stage] = 1000 * (time.perf_counter() - started)
+
+
+def synchronize(device: torch.device) -> None:
+    """Wait for the work that is queued on a device."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)

@@ -87,3 +87,17 @@ def resident_bytes() -> int | None:
     import resource
 
     return int(_STATM.read_text().split()[1]) * resource.getpagesize() if _STATM.exists() else None
+
+
+def figures_of(result: LiveResult, counts: LiveStatistics) -> dict[str, float]:
+    """The figures of an image, and the counts so far."""
+    depth, std = result.out.depth, result.out.std
+    return {
+        "stamp": round(result.stamp, 6),
+        "latency_ms": round(1000 * result.latency, 2),
+        "depth_m": round(float(depth.nanmedian()), 3),
+        "sigma_m": round(float(std.nanmedian()), 3),
+        "components": int(result.out.statistics.components[0]),
+        "dropped": sum(counts.dropped.values()),
+        "skipped": sum(counts.skipped.values()),
+    }

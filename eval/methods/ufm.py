@@ -11,23 +11,26 @@ inferences.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.methods.ufm_cloud import Cloud, View, take_in
 from ufmstar_torch.frames.frame import check_frame, raise_faults
+from ufmstar_torch.frames.output import EVERY_FRAME, FrameStatistics, UncertaintyOutput
 from ufmstar_torch.gaussians.camera import relative_pose
 from ufmstar_torch.runtime.stateful import full_precision, outliving
 
 
-class UfMOutput(NamedTuple):
-    """The variance of one frame."""
-
-    variance: Tensor  # [B, H, W] S_zz of the newest point at each pixel, s^2 without a point [m^2]; NaN: not valid
-    valid: Tensor  # [B, H, W] True where the pixel was used
+def output_of(depth: Tensor, variance: Tensor | None, valid: Tensor, **maps: Tensor | None) -> UncertaintyOutput:
+    """The output of a method other than UfM*, from maps [1, h, w]: NaN where not valid; all counts but that of the
+    valid pixels are 0. ``variance``: None = the method states none."""
+    variance = torch.full_like(depth, torch.nan) if variance is None else variance
+    none = torch.zeros(len(depth), dtype=torch.int64)
+    counts = dict.fromkeys(EVERY_FRAME, none)
+    statistics = FrameStatistics({**counts, "valid_pixels": valid.sum((1, 2)).cpu()})
+    named = {name: value for name, value in maps.items() if value is not None}
+    return UncertaintyOutput(depth, torch.where(valid, variance, torch.nan), valid, named, statistics)
 
 
 class UfM:
@@ -64,8 +67,9 @@ class UfM:
         aleatoric: Tensor | None = None,
         epistemic: Tensor | None = None,
         valid: Tensor | None = None,
-    ) -> UfMOutput:
-        """Process one predicted depth map of each stream and return the variances.
+    ) -> UncertaintyOutput:
+        """Process one predicted depth map of each stream. The variance is S_zz of the newest point at a pixel; without
+        a point it is s^2.
 
         Args:
             depth: [B, H, W] metric depth along the optical axis [m]. Pixels that are NaN, infinite, zero or negative
@@ -97,4 +101,4 @@ class UfM:
             steps = [take_in(cloud, view, self.max_points) for cloud, view in zip(clouds, views, strict=True)]
             variance = torch.stack([variance for _, variance in steps]).to(frame.depth.dtype)
         self.clouds, self.T_world_first = tuple(cloud for cloud, _ in steps), first
-        return UfMOutput(variance, frame.valid)
+        return output_of(depth, variance, frame.valid, aleatoric=aleatoric, epistemic=epistemic)

@@ -16,7 +16,7 @@ from ufmstar_torch.eval.report import style
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.paper import PaperTable, paper_tables
 from ufmstar_torch.eval.report.quantities import count, row_labels
-from ufmstar_torch.eval.report.table import Table
+from ufmstar_torch.eval.report.table import Table, number
 from ufmstar_torch.eval.run.colours import INK, plain
 
 # Keys and words of ``efficiency.json``, as eval/bench writes them.
@@ -142,12 +142,12 @@ def _percent(value: float) -> str:
 
 
 def _printed(value: float, decimals: int) -> str:
-    return "<0.01" if 0 < value < _SMALLEST else f"{value:.{decimals}f}"
+    return "<0.01" if 0 < value < _SMALLEST else number(value, decimals)
 
 
 def _digits(value: float) -> str:
     """One decimal below 10, none above: the accuracy of times and energies."""
-    return f"{value:.0f}" if abs(value) >= 10 else f"{value:.1f}"
+    return number(value, 0 if abs(value) >= 10 else 1)
 
 
 def _notes(run: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], network: Mapping[str, Any]) -> list[str]:

@@ -14,7 +14,7 @@ from ufmstar_torch.eval.report.quantities import count
 from ufmstar_torch.eval.report.table import aligned
 from ufmstar_torch.eval.report.tables import main_table
 from ufmstar_torch.eval.report.write import Report
-from ufmstar_torch.eval.run.frame_record import NEAR_ZERO
+from ufmstar_torch.eval.run.run_folder import NEAR_ZERO
 
 # [nats] A larger mean NLL is dominated by a few pixels: sigma = .25 d in a room gives about 1.
 NLL_OF_FEW = 100.0
@@ -38,7 +38,7 @@ def summary(results: Results) -> str:
     shown = [None] if None in results.tabulated else results.tabulated
     parts = [main_table(results, dataset).text() for dataset in shown]
     if results.failed:
-        parts.append("failed:\n" + "\n".join(f"  {f.dataset}, {f.sequence}: {f.reason}" for f in results.failed))
+        parts.append("\n".join(["failed:", *(f"  {', '.join(key)}: {why}" for key, why in results.failed.items())]))
     if results.missing:
         counts = Counter((dataset, sequence) for dataset, sequence, _ in results.missing)
         lines = [f"  {dataset}, {sequence}: {rows} row(s)" for (dataset, sequence), rows in counts.items()]

@@ -28,6 +28,7 @@ from ufmstar_torch.eval.run.writers import fitting_unit
 from ufmstar_torch.eval.sequences.ground_truth import nearest_pixels, points_of
 from ufmstar_torch.files.read import read_npz_whole
 from ufmstar_torch.gaussians.mixture import GaussianMixture
+from ufmstar_torch.live import LiveResult
 from ufmstar_torch.runtime.optional import optional
 
 WORLD, CAMERA = "world", "world/camera"
@@ -105,6 +106,15 @@ class RerunLog:
         lines = np.stack([ends, points_of(u, v, depth, K)], axis=1)[valid]
         colours = scale.rgb(np.abs(depth - measured)[valid])
         self._stream.log(f"{CAMERA}/residuals", rr.LineStrips3D(lines, colors=colours))
+
+
+def viewer_frame(result: LiveResult, number: int, figures: dict[str, float]) -> RunFrame:
+    """The result of an image of ``ufmstar live``, to be logged."""
+    out, valid = result.out, result.out.valid[0]
+    depth, sigma = (torch.where(valid, values[0], torch.nan).cpu().float().numpy() for values in (out.depth, out.std))
+    about = (f"{result.stamp:.6f}", number, result.stamp, result.T_world_cam)
+    K = out.intrinsics[0].cpu().double().numpy()
+    return RunFrame(*about, K, depth, sigma, figures=figures, image=np.asarray(result.image))
 
 
 def blueprint() -> Any:

@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.engine.predictions import CacheError, PredictionCache
-from ufmstar_torch.eval.engine.progress import Progress, frame_progress
-from ufmstar_torch.eval.engine.stream import Stopped, frame_results
-from ufmstar_torch.eval.engine.warm_up import warm_up_command
-from ufmstar_torch.eval.engine.writer_thread import WriterThread
+from ufmstar_torch.eval.engine.progress import Progress, warm_up_command
+from ufmstar_torch.eval.engine.stream import Stopped, frame_progress, frame_results
+from ufmstar_torch.eval.engine.threads import call_behind
 from ufmstar_torch.eval.run.folder import output_folder
 from ufmstar_torch.eval.run.gaussians import write_mixture_npz, write_mixture_ply
 from ufmstar_torch.eval.run.job import RunJob
@@ -60,9 +59,9 @@ def run(
             warm_up_job(job, progress)
             shown = frame_progress(progress, len(job.indices))
             results = frame_results(job.sequence, job.indices, [row], cache=cache, stop=stop)
-            with closing(results), WriterThread() as writer:
+            with closing(results), call_behind() as call:
                 for result in results:  # read, predict, find anchors, update
-                    writer.call(folder.write, result)
+                    call(folder.write, result)
                     shown(result)
             _write_outputs(folder, ufm, progress, stop)
     return read_summary(path)

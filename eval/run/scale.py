@@ -9,6 +9,7 @@ import numpy as np
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.sequences.colmap import read_landmarks
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.ground_truth import nearest_pixels
 from ufmstar_torch.frames.prediction import DepthPrediction
 
 _MOST_FRAMES, _FEWEST_FRAMES = 24, 3
@@ -79,11 +80,9 @@ def _ratios(points: np.ndarray, T_world_cam: np.ndarray, prediction: DepthPredic
     """[M] predicted depth over the landmark's depth, for landmarks in the map."""
     T_cam_world = np.linalg.inv(T_world_cam)
     in_camera = points @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
-    in_camera = in_camera[in_camera[:, 2] > 0]
-    K, depth = prediction.K[0].numpy(), prediction.depth[0].detach().float().cpu().numpy()
-    pixel = np.rint((in_camera @ K.T)[:, :2] / in_camera[:, 2:])
-    inside = ((pixel >= 0) & (pixel < depth.shape[::-1])).all(axis=1)
-    column, row = pixel[inside].astype(int).T
-    predicted, z = depth[row, column], in_camera[inside, 2]
+    depth = prediction.depth[0].detach().float().cpu().numpy()
+    u, v, z = prediction.K[0].numpy() @ in_camera[in_camera[:, 2] > 0].T
+    index, inside = nearest_pixels(u / z, v / z, prediction.size)
+    predicted, z = depth.reshape(-1)[index[inside]], z[inside]
     usable = np.isfinite(predicted) & (predicted > 0)
     return np.asarray(predicted[usable] / z[usable])

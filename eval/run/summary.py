@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from ufmstar_torch.eval.check.depth_image_fit import image_at_map, part_of_image
-from ufmstar_torch.eval.check.image_fit import DepthFit, depth_at_pixels, depth_fit
+from ufmstar_torch.eval.check.image_fit import DepthFit
 from ufmstar_torch.eval.engine.files import to_json, write_json_atomic
 from ufmstar_torch.eval.engine.judge import ALONE, POSTERIOR, UFM
 from ufmstar_torch.eval.engine.maps import MapSource
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.machine import hardware, versions
-from ufmstar_torch.eval.run.run_folder import RUN, RunFolder
+from ufmstar_torch.eval.run.run_folder import RUN, RunFolder, fitted_depth
 from ufmstar_torch.eval.run.writers import frame_file, read_frame
 from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.eval.sequences.intrinsics import pinhole
@@ -71,7 +71,7 @@ def write_summary(folder: RunFolder, mixture: GaussianMixture, state: str, reaso
         "versions": versions(),
         "machine": hardware(),
     }
-    depth = None if job.image_fit is None or job.image_fit.problem else _depth_fit(folder, done)
+    depth = fitted_depth(job, folder.first_maps)
     summary |= {"image_fit": job.image_fit, "depth_fit": depth, "warnings": _warnings(folder, depth, done)}
     plain: dict[str, Any] = to_json(summary)
     write_json_atomic(folder.path / SUMMARY, plain)
@@ -97,20 +97,6 @@ def read_summary(out: Path) -> dict[str, Any]:
     if wrong := [field for field, right in fine.items() if not right]:
         raise ValueError(f"{out}/{SUMMARY} is not that of a run (its {wrong[0]})")
     return content
-
-
-def _depth_fit(folder: RunFolder, done: Records) -> DepthFit | None:
-    """Compare the maps of finished frames with the depth of corners tracked in their images."""
-    records, sequence = {record["index"]: record for record in done}, folder.job.sequence
-
-    def depth_at(index: int, pixel: np.ndarray) -> np.ndarray | None:
-        if index not in records:
-            return None
-        stored, K = _stored(folder, records[index]), pinhole(*records[index]["intrinsics"])
-        K_image = sequence.intrinsics_of(sequence.entries[index])
-        return depth_at_pixels(_of_network(stored), stored["valid"], K, K_image, pixel)
-
-    return depth_fit(sequence, folder.job.corners, depth_at)
 
 
 def _part_of_image(folder: RunFolder, done: Records) -> str:

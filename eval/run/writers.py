@@ -1,4 +1,4 @@
-"""The files of every frame of ``ufmstar run``: OUT/frames/NAME.npz, and 16-bit PNGs of depth and sigma.
+"""The files of every frame: OUT/frames/NAME.npz of ``ufmstar run``, OUT/STAMP.npz of ``ufmstar live``, and 16-bit PNGs.
 
 The npz has
 
@@ -17,7 +17,7 @@ are network_depth and the root of ufm_variance.
 from __future__ import annotations
 
 import io
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile, ZipFile
@@ -27,12 +27,14 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.eval.engine.files import write_atomic, write_bytes_atomic
 from ufmstar_torch.files.read import read_npz_whole
+from ufmstar_torch.frames.output import MAPS, UncertaintyOutput
 
 FRAMES = "frames"
 # Folders of the PNGs, and the arrays of the npz with a frame's depth and variance for them.
 _RESULT = ("depth", "sigma"), ("depth", "variance")
 _BEFORE = ("network_depth", "ufm_sigma"), ("network_depth", "ufm_variance")
 PNGS = (*_RESULT[0], *_BEFORE[0])
+_OF_NETWORK = ("aleatoric", "epistemic", "confidence", "features")  # maps that are not stored
 # Arrays of every frame, and the texts of every PNG.
 _NEEDED = ("depth", "variance", "disagreement", "valid", "T_world_cam", "intrinsics")
 _TEXTS = {"depth_scale", "unit", "quantity", "invalid", "saturated"}
@@ -43,6 +45,15 @@ def frame_file(out: Path, name: str) -> Path:
     if not name or name.startswith(".") or any(c in name for c in "/\\\0"):
         raise ValueError(f"name must be a plain file name without its ending, got {name!r}")
     return out / FRAMES / f"{name}.npz"
+
+
+def output_arrays(out: UncertaintyOutput, T_world_cam: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
+    """The maps of an output of one stream, its pose and its intrinsics, by name."""
+    left_out = _OF_NETWORK if out.posterior_outlier is not None else (*_OF_NETWORK, *_BEFORE[1])
+    maps = {name: value for name in MAPS if name not in left_out and (value := getattr(out, name)) is not None}
+    arrays = {name: value[0].cpu().numpy().astype(np.float32, copy=False) for name, value in maps.items()}
+    camera = {"T_world_cam": T_world_cam, "intrinsics": out.intrinsics[0].cpu().double().numpy()}
+    return {**arrays, "valid": out.valid[0].cpu().numpy(), **camera}
 
 
 def write_frame(file: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -92,11 +103,11 @@ def read_frame(path: str | Path) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def is_frame(path: Path, names: Collection[str] = _NEEDED) -> bool:
-    """True if a file is an npz with the arrays ``names``, by default those of every frame."""
+def is_frame(path: Path) -> bool:
+    """True if a file is an npz with the arrays of every frame."""
     try:
         with ZipFile(path) as archive:
-            return {f"{name}.npy" for name in names} <= set(archive.namelist())
+            return {f"{name}.npy" for name in _NEEDED} <= set(archive.namelist())
     except (OSError, BadZipFile, ValueError):
         return False
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from ufmstar_torch.runtime.optional import lazy_names
 
 if TYPE_CHECKING:
-    from ufmstar_torch.eval.sequences.depth_folder import DepthFolder as DepthFolder
+    from ufmstar_torch.eval.sequences.depth_folder import depth_maps as depth_maps
     from ufmstar_torch.eval.sequences.frame import Frame as Frame
     from ufmstar_torch.eval.sequences.frame import FrameError as FrameError
     from ufmstar_torch.eval.sequences.frame import FrameSequence as FrameSequence

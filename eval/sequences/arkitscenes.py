@@ -20,7 +20,7 @@ from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Skipped
 from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, depth_loader, list_files
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import associate, read_matrix, trajectory_of
+from ufmstar_torch.eval.sequences.poses import associate, numbers, read_matrix, trajectory_of
 from ufmstar_torch.gaussians.trajectory import Trajectory
 
 _IMAGES, _CAMERAS, _DEPTHS, _POSES = "lowres_wide", "lowres_wide_intrinsics", "lowres_depth", "lowres_wide.traj"
@@ -72,10 +72,10 @@ def _times(files: list[Path]) -> np.ndarray:
 
 
 def _lens(file: Path) -> Lens:
-    values = read_matrix(file).ravel()
-    if len(values) != 6 or not np.isfinite(values).all() or min(values) <= 0 or not (values[:2] % 1 == 0).all():
-        expected = "width height fx fy cx cy [px], the size in whole ones"
-        raise ValueError(f"{file}: expected {expected}, got {values.tolist()}")
+    error = f"{file}: expected width height fx fy cx cy [px], the size in whole ones"
+    values = numbers(read_matrix(file), (6,), error)
+    if min(values) <= 0 or not (values[:2] % 1 == 0).all():
+        raise ValueError(f"{error}, got {values.tolist()}")
     width, height, fx, fy, cx, cy = values.tolist()
     return Lens((fx, fy, cx, cy), (int(height), int(width)))
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from heapq import merge
@@ -241,13 +241,7 @@ def _choose(bag: Bag, options: Options) -> _Topics:
     unknown = [name for name in named if types.get(name) not in _TYPES]
     if unknown:
         raise ValueError(f"topics: {unknown[0]!r} cannot be used; {bag.path} has {_listing(types)}")
-    images: dict[str, str] = {}
-    depths: dict[str, str] = {}
-    for name in (name for name, kind in types.items() if kind in (_IMAGE, _COMPRESSED)):
-        first = next((message for _, message in bag.messages([name])), None)
-        if first is None:
-            raise FrameError(bag.path, f"{name} should have messages, but has none: the bag is damaged")
-        (depths if ros.is_depth(first) else images)[name] = ros.frame_name(first.header.frame_id)
+    images, depths = _image_topics(bag, types)
 
     def one(kind: str, candidates: Iterable[str]) -> str:
         listed = list(candidates)
@@ -264,22 +258,7 @@ def _choose(bag: Bag, options: Options) -> _Topics:
     info = "" if options.intrinsics is not None else one("the camera info", siblings or infos)
     if not info and options.intrinsics is None:
         raise ValueError(f"{bag.path} has no camera info: pass intrinsics")
-    same_view = [name for name, frame in depths.items() if frame == images[image]]
-    depth_named = [name for name in same_view if name in named or "depth" in name.lower()]  # not a map of sigma
-    predicted = [name for name in depth_named if name.rsplit("/", 1)[0] + "/sigma" in depths and name not in named]
-    if predicted:
-        LOGGER.warning("%s: no ground truth: %s is a prediction, with a sigma beside it", bag.path, predicted[0])
-        same_view = [name for name in same_view if name in named]
-        depths = {name: depths[name] for name in same_view}
-        depth_named = [name for name in depth_named if name not in predicted]
-    depth = one("the depth", depth_named or same_view)
-    other = [name for name in named if name in depths and name not in same_view]
-    if other:
-        view = f"({depths[other[0]]!r}, not {images[image]!r})"
-        raise ValueError(f"topics: {other[0]!r} shows another camera's view {view}")
-    if depths and not depth:
-        name, frame = next(iter(depths.items()))
-        LOGGER.warning("%s: no depth: %s is of %r and not registered to %r", bag.path, name, frame, images[image])
+    depth = one("the depth", _depths_of(bag, depths, images[image], named))
     pose = ""
     if options.trajectory is None:
         by_tf = [name for name in named if types[name] == _TF]
@@ -289,6 +268,36 @@ def _choose(bag: Bag, options: Options) -> _Topics:
         if not pose:
             raise ValueError(f"{bag.path} has no poses: pass trajectory")
     return _Topics(image, info, depth, pose, ros.frame_name(named.get(pose, "")))
+
+
+def _image_topics(bag: Bag, types: dict[str, str]) -> tuple[dict[str, str], dict[str, str]]:
+    """The topics of colour images and of depth maps, each with the frame of its first message. Raises FrameError: a
+    topic has no message."""
+    images, depths = dict[str, str](), dict[str, str]()
+    for name in (name for name, kind in types.items() if kind in (_IMAGE, _COMPRESSED)):
+        first = next((message for _, message in bag.messages([name])), None)
+        if first is None:
+            raise FrameError(bag.path, f"{name} should have messages, but has none: the bag is damaged")
+        (depths if ros.is_depth(first) else images)[name] = ros.frame_name(first.header.frame_id)
+    return images, depths
+
+
+def _depths_of(bag: Bag, depths: dict[str, str], view: str, named: Collection[str]) -> list[str]:
+    """The topics of ``depths`` whose maps are of the frame ``view`` and no prediction, unless the user ``named`` it.
+    Raises ValueError: a topic that the user named is of another frame."""
+    same_view = [name for name, frame in depths.items() if frame == view]
+    depth_named = [name for name in same_view if name in named or "depth" in name.lower()]  # not a map of sigma
+    predicted = [name for name in depth_named if name.rsplit("/", 1)[0] + "/sigma" in depths and name not in named]
+    if predicted:
+        LOGGER.warning("%s: no ground truth: %s is a prediction, with a sigma beside it", bag.path, predicted[0])
+        same_view = [name for name in same_view if name in named]
+        return [name for name in depth_named if name not in predicted] or same_view
+    if other := [name for name in named if name in depths and name not in same_view]:
+        raise ValueError(f"topics: {other[0]!r} shows another camera's view ({depths[other[0]]!r}, not {view!r})")
+    if depths and not same_view:
+        name, frame = next(iter(depths.items()))
+        LOGGER.warning("%s: no depth: %s is of %r and not registered to %r", bag.path, name, frame, view)
+    return depth_named or same_view
 
 
 def _without_transports(topics: list[str]) -> list[str]:

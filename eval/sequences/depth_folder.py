@@ -26,7 +26,7 @@ _VARIANCE_SUFFIXES = (".npy", ".npz", ".exr", ".tif", ".tiff")
 @dataclass(frozen=True)
 class DepthMaps:
     """Predicted depth of a sequence's frames, decoded lazily: ``maps[i]`` belongs to frame i. Scale [m per unit] and
-    key are those of :class:`DepthFolder`."""
+    key are those of :func:`depth_maps`."""
 
     depth_files: tuple[Path, ...]
     variance_files: tuple[Path, ...] = ()
@@ -48,54 +48,58 @@ class DepthMaps:
         return np.where(usable, depth, np.float32(0)), np.where(usable, variance, np.float32(0))
 
 
-class DepthFolder:
-    """A folder of predicted depth maps of one format: 16-bit PNG or TIFF, float TIFF, EXR, npy or npz.
+def depth_maps(
+    path: str | Path,
+    names: Sequence[str],
+    *,
+    scale: float | None = None,
+    variance: str | Path | None = None,
+    key: str = "depth",
+    names_on_disk: Sequence[str] = (),
+    selected: Sequence[str] | None = None,
+) -> DepthMaps:
+    """The maps of a sequence's frames in a folder of one format: 16-bit PNG or TIFF, float TIFF, EXR, npy or npz. They
+    are paired by stem, or by the numbers in the names, or else in sorted order if the number of maps is that of
+    ``names_on_disk``, ``names`` or ``selected``.
 
     Args:
         path: the folder.
+        names: of the sequence's frames.
         scale: metres per unit. None = by the text ``depth_scale`` of a PNG; other formats are in metres.
         variance: folder of variance maps [m^2] as npy, npz, EXR or float TIFF. It may be ``path`` if npz files have the
             keys ``depth`` and ``variance``.
         key: name of the depth in npz files with several arrays.
+        names_on_disk: of the frames, skipped ones included.
+        selected: the frames, in order, whose maps are returned; None = ``names``.
 
     Raises:
         NotADirectoryError: a folder does not exist.
-        ValueError: no map, maps of several formats, integers of unknown scale, or a scale that the first map
-            contradicts.
+        ValueError: no map, maps of several formats, integers of unknown scale, a scale that the first map contradicts,
+            or some frames have no map (they are listed).
     """
+    check_scale("scale", scale)
+    files = _maps(Path(path), DEPTH_SUFFIXES, "depth")
+    variances = [] if variance is None else _maps(Path(variance), _VARIANCE_SUFFIXES, "variance")
+    _require_scale(files, scale, key)
+    chosen = names if selected is None else selected
+    orders = (names_on_disk or names, names, chosen)
+    return DepthMaps(_paired(files, chosen, orders), _paired(variances, chosen, orders), scale, key)
 
-    def __init__(
-        self, path: str | Path, scale: float | None = None, variance: str | Path | None = None, key: str = "depth"
-    ) -> None:
-        check_scale("scale", scale)
-        self.key = key
-        self.path = Path(path)
-        self.scale = scale
-        self.files = _maps(self.path, DEPTH_SUFFIXES, "depth")
-        self.variance_files = [] if variance is None else _maps(Path(variance), _VARIANCE_SUFFIXES, "variance")
-        for file in self.files:
-            try:
-                values, stated = read_map(file, key=key)
-            except FrameError:  # counted when its turn comes
-                continue
-            if scale is None and stated is None and np.issubdtype(values.dtype, np.integer):
-                raise ValueError(f"scale: {file} holds integers and no text {SCALE_KEY!r}: pass metres per unit")
-            try:
-                require_scale(file, scale, stated)
-            except FrameError as error:
-                raise ValueError(f"scale: {error}") from error
-            break
 
-    def for_frames(
-        self, names: Sequence[str], names_on_disk: Sequence[str] = (), selected: Sequence[str] | None = None
-    ) -> DepthMaps:
-        """The maps of a sequence's frames (of ``selected`` ones, in order): by stem, or by the numbers in the names, or
-        else in sorted order if the number of maps is that of ``names_on_disk`` (skipped frames included), ``names`` or
-        ``selected``. Raises ValueError: some frames have no map (they are listed)."""
-        expected = names if selected is None else selected
-        orders = (names_on_disk or names, names, expected)
-        depth = _paired(self.files, expected, orders)
-        return DepthMaps(depth, _paired(self.variance_files, expected, orders), self.scale, self.key)
+def _require_scale(files: Sequence[Path], scale: float | None, key: str) -> None:
+    """Raises ValueError: the unit of the first map that can be read is unknown, or contradicts the scale."""
+    for file in files:
+        try:
+            values, stated = read_map(file, key=key)
+        except FrameError:  # counted when its turn comes
+            continue
+        if scale is None and stated is None and np.issubdtype(values.dtype, np.integer):
+            raise ValueError(f"scale: {file} holds integers and no text {SCALE_KEY!r}: pass metres per unit")
+        try:
+            require_scale(file, scale, stated)
+        except FrameError as error:
+            raise ValueError(f"scale: {error}") from error
+        break
 
 
 def _maps(folder: Path, suffixes: tuple[str, ...], what: str) -> list[Path]:

@@ -22,7 +22,7 @@ from ufmstar_torch.eval.sequences.frame import FrameSequence, Size
 from ufmstar_torch.eval.sequences.images import first_image_size, listed_file
 from ufmstar_torch.eval.sequences.lens import FISHEYE, Lens
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import csv_rows, number, read_matrix, trajectory_of
+from ufmstar_torch.eval.sequences.poses import csv_rows, number, numbers, read_matrix, trajectory_of
 from ufmstar_torch.gaussians.trajectory import Trajectory
 
 LOOKED_FOR = "mav0/cam0/data.csv and sensor.yaml (also in mav0, or in a camera's folder itself)"
@@ -80,12 +80,10 @@ def _trajectory(camera: Path) -> Trajectory:
 def _extrinsics(file: Path) -> np.ndarray:
     """T_BS [4, 4] of a sensor's file: sensor to body [m]; the identity if the file has none."""
     value = _yaml(file).get("T_BS", np.eye(4).tolist())
-    try:
-        T = np.array(value["data"] if isinstance(value, Mapping) else value, dtype=np.float64).reshape(4, 4)
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{file}: T_BS must be 4x4 numbers: {error}") from error
-    if not np.isfinite(T).all() or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3:
-        raise ValueError(f"{file}: T_BS must be a rotation and a position, got {T.tolist()}")
+    value, error = value.get("data") if isinstance(value, Mapping) else value, f"{file}: T_BS must be 4x4 numbers"
+    T = numbers(value, (4, 4), f"{error}, got {value!r:.80}")
+    if np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3:
+        raise ValueError(f"{error}, a rotation and a position, got {T.tolist()}")
     return T
 
 

@@ -34,7 +34,7 @@ from ufmstar_torch.eval.sequences.ground_truth import project
 from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size, list_files
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, resolve
-from ufmstar_torch.eval.sequences.poses import numbered_lines, read_matrix, read_trajectory
+from ufmstar_torch.eval.sequences.poses import numbered_lines, numbers, read_matrix, read_trajectory
 
 LOOKED_FOR = "data_2d_raw/DRIVE/image_00/data_rect (the root, the drive's folder or the camera's)"
 _RAW = "data_2d_raw"
@@ -221,9 +221,8 @@ def _T_rect0_rect(calibration: Path, camera: str) -> np.ndarray:
 
 def _T_rect_laser(calibration: Path, camera: str) -> np.ndarray:
     """[4, 4] from the laser into the rectified camera."""
-    values = read_matrix(calibration / _LASER)
-    if values.size != 12 or not np.isfinite(values).all():
-        raise ValueError(f"{calibration / _LASER}: expected the 12 numbers of a 3x4 matrix, got {values.size}")
+    file = calibration / _LASER
+    values = numbers(read_matrix(file), (12,), f"{file}: expected the 12 numbers of a 3x4 matrix")
     T_rect0_laser = _T_rect_mounted(calibration, "00") @ np.linalg.inv(_affine(values))
     return np.linalg.inv(_T_rect0_rect(calibration, camera)) @ T_rect0_laser
 
@@ -253,13 +252,8 @@ def _values(path: Path, key: str, count: int) -> np.ndarray:
         name, _, rest = line.partition(":")
         if name.strip() != key:
             continue
-        try:
-            values = np.array(rest.split(), dtype=np.float64)
-        except ValueError:
-            values = np.empty(0)
-        if len(values) != count or not np.isfinite(values).all():
-            raise ValueError(f"{path}:{number}: expected {count} numbers behind {key!r}, got {rest.strip()!r}")
-        return values
+        error = f"{path}:{number}: expected {count} numbers behind {key!r}, got {rest.strip()!r}"
+        return numbers(rest.split(), (count,), error)
     raise ValueError(f"{path}: no line {key!r}")
 
 

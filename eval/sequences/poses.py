@@ -15,7 +15,9 @@ All poses are camera-to-world. The number of columns of a line defines the forma
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -110,6 +112,16 @@ def read_matrix(path: str | Path, *, commas: bool = False) -> np.ndarray:
         if len(row) != len(rows[0]):
             raise ValueError(f"{where}: expected {len(rows[0])} numbers as in the first line, got {len(row)}")
     return np.array(rows, dtype=np.float64)
+
+
+def numbers(values: Any, shape: tuple[int, ...], error: str) -> np.ndarray:
+    """Nested finite numbers, as of JSON or YAML, as float64 of a shape (-1 = any length). Raises ValueError with the
+    text ``error``: they have another form."""
+    with suppress(TypeError, ValueError, OverflowError):
+        array = np.array(values, dtype=np.float64).reshape(shape)
+        if np.isfinite(array).all():
+            return array
+    raise ValueError(error)
 
 
 def read_pose(path: str | Path) -> np.ndarray:

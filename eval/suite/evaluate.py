@@ -20,6 +20,7 @@ from ufmstar_torch.eval.engine.stream import Stopped
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.run.machine import hardware, versions
+from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.suite.job import EvalJob
 from ufmstar_torch.eval.suite.work_items import TOUR, WorkItem
 from ufmstar_torch.frames.warnings import LOGGER
@@ -65,23 +66,18 @@ def evaluate_item(
     except (*BROKEN, OSError) as error:
         return folder.fail(item, error, missing)
     folder.require_same_sequence(item, made_of["sequence"], landmarks)
-    files = {row: row.setting.recalibration for row in job.suite.rows}
-    fitted = {row for row, file in files.items() if file and item.label in Recalibration.from_json(file).sequences}
-    possible = [row for row in files if row not in fitted and (sequence.posed or row.method.fusion == ALONE)]
+    possible = _possible(job.suite.rows, item, sequence)
     todo = [row for row in missing if row in possible]
     left_out = [row for row in missing if row not in possible]
     lines = []
     if todo:
-        examples = folder.sequence_folder(item) if job.stores_examples(item) else None
-        needed = with_references(todo, possible)
-
-        def shown(state: Progress) -> None:
-            progress(replace(state, stage=item.label))
-
+        how: dict[str, Any] = {"examples": folder.sequence_folder(item) if job.stores_examples(item) else None}
+        how |= {"stop": stop, "progress": lambda state: progress(replace(state, stage=item.label))}
         try:
-            for problem in check_sequence(sequence).problems if sequence.layout != TOUR else ():
-                LOGGER.warning("%s: %s (ufmstar data check)", item.label, problem)
-            records = evaluate_sequence(sequence, needed, judge, examples=examples, stop=stop, progress=shown)
+            if sequence.layout != TOUR:
+                for problem in check_sequence(sequence).problems:
+                    LOGGER.warning("%s: %s (ufmstar data check)", item.label, problem)
+            records = evaluate_sequence(sequence, with_references(todo, possible), judge, **how)
         except BROKEN as error:
             return folder.fail(item, error, missing)
         for record in records:
@@ -97,6 +93,14 @@ def evaluate_item(
     else:
         folder.succeeded(item)
     return "; ".join(lines)
+
+
+def _possible(rows: Sequence[Row], item: WorkItem, sequence: FrameSequence) -> list[Row]:
+    """The rows that can be judged on a sequence: without poses, no row that compares views; and no recalibration that
+    was fitted to it."""
+    files = {row: row.setting.recalibration for row in rows}
+    fitted = {row for row, file in files.items() if file and item.label in Recalibration.from_json(file).sequences}
+    return [row for row in rows if row not in fitted and (sequence.posed or row.method.fusion == ALONE)]
 
 
 def with_references(missing: Sequence[Row], rows: Sequence[Row]) -> list[Row]:

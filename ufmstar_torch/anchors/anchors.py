@@ -6,21 +6,16 @@ pixel. ``evidence`` describes how these errors are accumulated and spread over t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from ufmstar_torch.frames.arguments import require_float, require_mask
-from ufmstar_torch.frames.frame import AnchorInput, FrameInput
 from ufmstar_torch.gaussians.camera import focal_and_centre
 from ufmstar_torch.gaussians.fixed_order import apply
 
-# Largest factor between an anchor and the prediction. A single anchor beyond it would dominate the mean of all others,
-# and larger values overflow in the state. More than FEW such anchors, if they outnumber the valid ones, show that the
-# prediction is wrong.
-FARTHEST_OFF, FEW = 100.0, 3
+_UNCHECKED = torch.empty(0)
 
 
 @dataclass(frozen=True)
@@ -44,6 +39,18 @@ class Anchors:
             depths that matching of images has measured; NaN = unknown, None = the depths hold for moving things, too.
         moving: [B] int64, number of depths that were not used because the surface moves, or because views disagree;
             None = not counted.
+
+    The check of a frame (:func:`~ufmstar_torch.anchors.check.check_anchors`) converts them to float64, replaces values
+    where they are not valid (position 0, depth 1, variance 0), and adds what the frame has at their pixels, which is
+    empty before:
+
+    Attributes:
+        index: [B, N] int64 of the pixel in the flattened image.
+        predicted: [B, N] the network's depth at the pixel [m]; 1 where not valid.
+        network_variance: [B, N] variance that the network predicts at the pixel, A + E as far as they are used [m^2].
+        rejected: [B] number of anchors that only their ratio to the prediction makes invalid.
+        contradiction: [B] mean r^2 of the rejected anchors, r at most 100, where they outnumber the valid ones and
+            therefore measure the prediction's error; else 0.
     """
 
     pixel: Tensor
@@ -55,6 +62,11 @@ class Anchors:
     scale: Tensor | None = None
     motion: Tensor | None = None
     moving: Tensor | None = None
+    index: Tensor = _UNCHECKED
+    predicted: Tensor = _UNCHECKED
+    network_variance: Tensor = _UNCHECKED
+    rejected: Tensor = _UNCHECKED
+    contradiction: Tensor = _UNCHECKED
 
     @classmethod
     def from_points(
@@ -102,6 +114,11 @@ class Anchors:
             usable,
         )
 
+    @property
+    def mask(self) -> Tensor:
+        """[B, N] ``valid``, all True for None."""
+        return torch.ones_like(self.depth, dtype=torch.bool) if self.valid is None else self.valid
+
     def moved(self, K_from: Tensor, K_to: Tensor) -> Anchors:
         """Map the anchors to the pixels of a resized or cropped image of the same camera.
 
@@ -127,104 +144,11 @@ class Anchors:
         return replace(self, pixel=pixel * scale + offset, motion=motion)
 
     def to(self, device: torch.device | str) -> Anchors:
-        """Copy the anchors to another device."""
+        """The anchors on a device."""
+        if self.pixel.device == torch.device(device):
+            return self
         moved = {name: value.to(device) for name, value in vars(self).items() if value is not None}
         return replace(self, **moved)
-
-
-# Pixel, depth and variance, the mask of usable anchors, and the frame -> the first columns of ``AnchorInput``: pixel,
-# index, predicted, depth, variance, valid, rejected and contradiction.
-Checked = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
-CheckAnchors = Callable[[Tensor, Tensor, Tensor, Tensor | None, FrameInput], Checked]
-
-
-def check_anchor_values(
-    pixel: Tensor, depth: Tensor, variance: Tensor, mask: Tensor | None, frame: FrameInput
-) -> Checked:  # fmt: skip
-    """Check the values of anchors: pixel [B, N, 2] [px], depth [B, N] [m], variance [B, N] [m^2], all float64, and mask
-    [B, N] or None; the caller has checked shapes and dtypes."""
-    # Standard deviations are compared, as the square of a large depth overflows.
-    usable = (depth > 0) & (depth < torch.inf) & (variance >= 0) & (variance.sqrt() < depth) & inside(pixel, frame.size)
-    if mask is not None:
-        usable = usable & mask
-    one, zero = torch.ones_like(depth), torch.zeros_like(depth)
-    pixel = torch.where(usable[..., None], pixel, zero[..., None])
-    u, v = pixel.round().long().unbind(-1)
-    index = v * frame.size[1] + u
-    predicted = torch.gather(frame.depth.flatten(1), 1, index).double()
-    usable = usable & torch.gather(frame.valid.flatten(1), 1, index)
-    near = (depth <= FARTHEST_OFF * predicted) & (predicted <= FARTHEST_OFF * depth)
-    valid, far = usable & near, usable & ~near
-    rejected = far.sum(1)
-    square = torch.where(far, (depth / predicted - 1).clamp_max(FARTHEST_OFF).square(), zero).sum(1)
-    many = (rejected > FEW) & (rejected > valid.sum(1))
-    contradiction = torch.where(many, square / rejected.clamp_min(1), torch.zeros_like(square))
-    predicted, depth = torch.where(valid, predicted, one), torch.where(valid, depth, one)
-    return pixel, index, predicted, depth, torch.where(valid, variance, zero), valid, rejected, contradiction
-
-
-def check_anchors(
-    anchors: Anchors,
-    frame: FrameInput,
-    network_variances: Sequence[Tensor] = (),
-    kernel: CheckAnchors = check_anchor_values,
-) -> AnchorInput:
-    """Check the anchors of one frame and convert them to float64 on the depth's device.
-
-    An anchor is invalid if a value is impossible, if it lies outside the image or on a pixel without depth, if its
-    standard deviation reaches its depth, or if its depth differs from the prediction by more than a factor of 100.
-
-    Args:
-        anchors: see :class:`Anchors`.
-        frame: of the same B streams.
-        network_variances: the network's variances in use, of A and E, each [B, H, W] [m^2].
-        kernel: an implementation of :func:`check_anchor_values`.
-
-    Raises:
-        TypeError: ``anchors`` is no :class:`Anchors`, or a field is no tensor or has the wrong kind of dtype.
-        ValueError: a field has the wrong shape or device.
-    """
-    b = frame.depth.shape[0]
-    anchors = require_anchors(anchors)
-    pixel = require_float("anchors.pixel", anchors.pixel, like=frame.depth).detach().double()
-    if pixel.dim() != 3 or pixel.shape[0] != b or pixel.shape[2] != 2:
-        raise ValueError(f"anchors.pixel must be [{b}, N, 2], got {tuple(pixel.shape)}")
-    shape = [(b, pixel.shape[1])]
-    depth = require_float("anchors.depth", anchors.depth, shape, frame.depth).detach().double()
-    variance = require_float("anchors.variance", anchors.variance, shape, frame.depth).detach().double()
-    mask = anchors.valid
-    if mask is not None:
-        mask = require_mask("anchors.valid", mask, shape, frame.depth)
-    for name in ("pose_error", "shared", "scale"):
-        if (value := getattr(anchors, name)) is not None:
-            require_float(f"anchors.{name}", value, [(b,)], frame.depth)
-    motion = anchors.motion
-    if motion is not None:
-        motion = require_float("anchors.motion", motion, like=frame.depth).detach().double()
-        if motion.dim() != 3 or motion.shape[0] != b or motion.shape[2] != 3:
-            raise ValueError(f"anchors.motion must be [{b}, M, 3], got {tuple(motion.shape)}")
-    pixel, index, predicted, depth, variance, valid, rejected, contradiction = kernel(
-        pixel, depth, variance, mask, frame
-    )
-    predicted_variance = torch.zeros_like(depth)
-    if network_variances:
-        predicted_variance = torch.where(valid, _variance_at(network_variances, index), predicted_variance)
-    return AnchorInput(
-        pixel, index, predicted, depth, variance, predicted_variance, valid, rejected, contradiction,
-        pose_error=anchors.pose_error,
-        shared=anchors.shared,
-        scale=anchors.scale,
-        motion=motion,
-        moving=anchors.moving,
-    )  # fmt: skip
-
-
-def _variance_at(network_variances: Sequence[Tensor], index: Tensor) -> Tensor:
-    """[B, N] float64 sum of the maps ``network_variances`` [B, H, W] at pixels ``index``."""
-    total, *others = (torch.gather(value.detach().flatten(1), 1, index) for value in network_variances)
-    for other in others:
-        total = total + other
-    return total.double()
 
 
 def require_anchors(anchors: object) -> Anchors:

@@ -10,7 +10,9 @@ sigma_w and sigma_s are learnt (EM). The error d of the newest pose has the prio
 variance c, so the mean of d^2 should be sigma^2 - c. Images determine independent errors. They hardly determine errors
 that successive poses share; the mean product of successive d estimates these. Errors of a late trajectory are
 proportional to the motion: ``time_offset`` estimates the offset, and the poses are corrected for it first. A single
-pose with a far larger error than the others starts another trajectory: SLAM has closed a loop.
+pose with a far larger error than the others starts another trajectory: SLAM has closed a loop. Tracks of things that
+move would turn the poses towards them: where many tracks fit the input poses much worse than the largest group, only
+the group refines them.
 """
 
 from __future__ import annotations
@@ -22,29 +24,24 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.anchors.epipolar import median
+from ufmstar_torch.anchors.epipolar import FAR, NEAR, median, off_lines, on_lines
 from ufmstar_torch.anchors.saved_state import POSITIVE, SavedState
 from ufmstar_torch.anchors.time_offset import TimeOffset
 
-# [px] Standard deviations of a position: by errors of the poses at first (best on tours whose poses err by .05 to .15
-# degrees and 2 mm), their limits when they are learnt, and by tracking from one view to the next (.25 to .4 on
-# recordings and tours).
-_FIRST, _LEAST, _LARGEST, _TRACKING = 0.5, 0.003, 20.0, 0.35
-# A corner's position v views ago has 1 + _DRIFT (v - 1) times the variance of its position one view ago.
-_DRIFT = 0.6
-# Information of a position as a share of that of an independent one: errors of neighbouring corners are correlated, and
-# so are those of a corner in several views. On tours .3 is best with noisy poses, .05 with a rolling shutter.
-_INFORMATION = 0.15
+# [px] Standard deviations of a position by errors of the poses: at first (best on tours whose poses err by .05 to .15
+# degrees and 2 mm), and their limits when they are learnt.
+_FIRST, _LEAST, _LARGEST = 0.5, 0.003, 20.0
 # Share of the running estimates that remains after a frame.
 _MEMORY = 0.8
-# Degrees of freedom of a position's distribution; Gauss-Newton steps; earlier steps on inverse depths alone.
-_STUDENT, _STEPS, _DEPTH_STEPS = 4.0, 4, 6
 # A pose starts another trajectory if the score of its error, chi-squared with six degrees of freedom, exceeds _SCORE
-# and _TIMES the recent scores, and the error's mean square, as shifts of a position, exceeds _SHIFT [px^2]. Otherwise
-# the poses are noisier than learnt so far.
-_SCORE, _TIMES, _SHIFT = 60.0, 5.0, 1.0
-# Least numbers of corners and views for a refinement.
-_ENOUGH, _VIEWS = 8, 3
+# and _TIMES the recent scores, and its shift of positions is clear (``kernels.bundle``). Otherwise the poses are
+# noisier than learnt so far.
+_SCORE, _TIMES = 60.0, 5.0
+# Least share of the tracks that do not fit the input poses, for them to be taken for tracks of things that move, which
+# the poses would follow; below .2 on recordings of still scenes. Least number of tracks that is judged.
+_MOVING, _FEWEST = 0.25, 8
+# Least number of views for a refinement.
+_VIEWS = 3
 
 
 class PoseRefinement(SavedState):
@@ -113,51 +110,29 @@ class PoseRefinement(SavedState):
         Returns:
             [W, 4, 4] refined poses; the input poses if too few corners are seen, or after a jump.
         """
-        from ufmstar_torch.anchors.kernels.bundle import adjusted, equations, inverse_depths, moved
+        from ufmstar_torch.anchors.kernels.bundle import refined  # compiles when it is first needed
 
         self.shared, self.jumped = 0.0, False
-        tracks, views = seen[:, -1] & (seen.sum(1) > 1), np.flatnonzero(seen.any(0))
-        if tracks.sum() < _ENOUGH or len(views) < _VIEWS:
+        views = np.flatnonzero(seen.any(0))
+        if len(views) < _VIEWS:
             return T_world_cam
         unit = np.array([[1], [depth]]) / K[0, 0]  # w [rad] and s [m] that shift a position by a pixel
-        ray = (pixel[np.ix_(tracks, views)] - K[:2, 2]) / K.diagonal()[:2]
-        growth = 1 + _DRIFT * np.arange(len(views) - 2, -1, -1)
-        precision = seen[np.ix_(tracks, views[:-1])] / growth * (K[0, 0] / _TRACKING) ** 2
-        prior = np.broadcast_to(1 / (self._variance[:, None] * unit**2), (len(views), 2, 3)).ravel()
-        shift = self.offset.shift(T_world_cam[views])
-        poses = moved(T_world_cam[views], shift.ravel())
-        rho = inverse_depths(ray, precision, poses, 1 / depth, _STUDENT, _DEPTH_STEPS)
-        A, b, by_error, rho_step = equations(ray, precision, poses, rho, 1 / depth, _STUDENT)
-        try:
-            self.jumped = self._jumps(_INFORMATION * A[-6:, -6:], _INFORMATION * b[-6:], prior[-6:], unit)
-        except np.linalg.LinAlgError:  # singular: values far out of scale
-            return T_world_cam
-        if self.jumped:
-            return T_world_cam
-        first = A, b, by_error, rho_step
-        result = adjusted(ray, precision, poses, rho, 1 / depth, _STUDENT, first, prior, _INFORMATION, _STEPS)
+        stated, prior = T_world_cam[views], np.tile(np.repeat(1 / (self._variance * unit[:, 0] ** 2), 3), len(views))
+        shift, most = self.offset.shift(stated), max(_SCORE, _TIMES * self._recent_score)
+        pixel, seen = pixel[:, views], seen[:, views]
+        seen = seen & _static(pixel, seen, stated, K, depth)[:, None]
+        result, score, self.jumped = refined(pixel, seen, stated, K, depth, shift, prior, most)
+        if score == score:
+            self._recent_score = max(score, _MEMORY * self._recent_score)
         if result is None:
             return T_world_cam
-        error, covariance, by_poses = result
-        if not (np.isfinite(poses).all() and np.isfinite(covariance).all()):
-            return T_world_cam
-        self.shared = median(by_poses)
+        self.shared = median(result.depth_variance)
         self._offset_variance = float(np.square(shift[-1].reshape(2, 3) / unit).sum()) / 3
-        self._learn(error[-6:].reshape(2, 3) / unit, covariance.diagonal()[-6:].reshape(2, 3) / unit**2)
-        self.offset.learn(T_world_cam[views], prior, error, covariance)
-        refined = T_world_cam.copy()
-        refined[views] = poses
-        return refined
-
-    def _jumps(
-        self, A: NDArray[np.float64], b: NDArray[np.float64], prior: NDArray[np.float64], unit: NDArray[np.float64]
-    ) -> bool:
-        """True if the newest input pose starts another trajectory, from its block of the equations A d = b."""
-        score = float(b @ np.linalg.solve(A + 2 * A / prior @ A, b))  # earlier views have errors, too
-        shift = np.linalg.solve(A, b).reshape(2, 3) / unit
-        jumps = score > max(_SCORE, _TIMES * self._recent_score) and np.square(shift).sum() > 3 * _SHIFT
-        self._recent_score = max(score, _MEMORY * self._recent_score)
-        return bool(jumps)
+        self._learn(result.error[-6:].reshape(2, 3) / unit, result.covariance.diagonal()[-6:].reshape(2, 3) / unit**2)
+        self.offset.learn(stated, prior, result.error, result.covariance)
+        poses = T_world_cam.copy()
+        poses[views] = result.poses
+        return poses
 
     def _learn(self, error: NDArray[np.float64], posterior_variance: NDArray[np.float64]) -> None:
         """Update the variances by the newest pose's error [2, 3] and its posterior variance [2, 3], in pixels, as far
@@ -171,3 +146,25 @@ class PoseRefinement(SavedState):
         product = float((error * self._last_error).sum()) / 3
         self.correlated = max(_MEMORY * self.correlated + (1 - _MEMORY) * product, 0.0)
         self._last_error = error
+
+
+def _static(
+    pixel: NDArray[np.float64], seen: NDArray[np.bool_], T_world_cam: NDArray[np.float64], K: NDArray[np.float64],
+    depth: float,
+) -> NDArray[np.bool_]:  # fmt: skip
+    """Which tracks [N] refine the poses [W, 4, 4]: the largest group that fits them between its first view and the
+    newest. All, where few do not fit: their Student-t weights suffice. Arguments as in :meth:`PoseRefinement.refine`.
+    """
+    from ufmstar_torch.anchors.kernels.bundle import position_variance
+
+    tracks = np.flatnonzero(seen[:, -1] & (seen.sum(1) > 1))
+    result = np.ones(len(pixel), np.bool_)
+    if len(tracks) < _FEWEST:
+        return result
+    first, newest = seen[tracks].argmax(1), pixel[tracks, -1]
+    views = newest, pixel[tracks, first], T_world_cam[-1], T_world_cam[first]
+    distance, *_ = off_lines(*views, K, NEAR * depth, FAR * depth)
+    sigma = np.sqrt(position_variance(seen.shape[1] - 1 - first))
+    fits, _ = on_lines(distance / sigma, newest, 2 * K[:2, 2], 1.0)
+    result[tracks] = fits | bool(fits.mean() > 1 - _MOVING)
+    return result

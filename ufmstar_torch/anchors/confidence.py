@@ -31,8 +31,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.config import ConfidenceConfig
-from ufmstar_torch.frames.frame import LARGEST, AnchorInput, FrameInput
+from ufmstar_torch.frames.frame import LARGEST, FrameInput
 
 # Numbers per anchor: c, y, w. Statistics of the gains: the number of frames, and, for the gain over V and over one
 # factor, the sum and the sum of squares, all with exponential forgetting.
@@ -163,14 +164,12 @@ def after_frame(
     return learnt.packed(), factor, gain
 
 
-def _taught(
-    learnt: Learnt, confidence: Tensor, anchors: AnchorInput, variance: Tensor, config: ConfidenceConfig
-) -> Learnt:
+def _taught(learnt: Learnt, confidence: Tensor, anchors: Anchors, variance: Tensor, config: ConfidenceConfig) -> Learnt:
     """The statistics after a frame's anchors."""
     dtype = learnt.c.dtype
     c = confidence.flatten(1).gather(1, anchors.index).to(dtype)
     V = variance.detach().flatten(1).gather(1, anchors.index).double()
-    usable = anchors.valid & V.isfinite() & (V > 0) & ~c.isnan()
+    usable = anchors.mask & V.isfinite() & (V > 0) & ~c.isnan()
     V = torch.where(usable, V, torch.ones_like(V))
     spread = V + anchors.variance
     y = ((anchors.depth - anchors.predicted).square() / spread).clamp_max(config.largest).to(dtype)

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.anchors.dense_keyframes import Keyframes
+from ufmstar_torch.anchors.dense_keyframes import Keyframes, halved
 from ufmstar_torch.anchors.dense_memory import Memory
 from ufmstar_torch.anchors.dense_poses import Fit, PoseErrors
 from ufmstar_torch.anchors.epipolar import median
@@ -48,8 +48,6 @@ _JUMPED = 3
 _SCALE = 0.005
 # Variance of a match of the wide windows over that computed from its residual; 2 to 4 on tours.
 _COARSE_NOISE = 4.0
-# [px] Distance from the border within which a view does not show a position.
-_BORDER = 3
 # Mapping of pixels to those of an image of half the size, and back.
 _HALVED = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
 _DOUBLED = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1]])
@@ -110,6 +108,20 @@ class Depths(NamedTuple):
     pixel: NDArray[np.float64]
     rho: NDArray[np.float64]
     variance: NDArray[np.float64]
+
+
+class Compared(NamedTuple):
+    """V keyframes that a frame is compared with.
+
+    Attributes:
+        views: with the mapping of the frame's pixels to theirs.
+        shares: [V] indices of their baselines.
+        half: [V, H // 2, W // 2] their images at half the size.
+    """
+
+    views: Views
+    shares: NDArray[np.int64]
+    half: NDArray[np.uint8]
 
 
 class DenseEvidence(SavedState):
@@ -233,7 +245,7 @@ class DenseEvidence(SavedState):
         found, searched, trusted, tested, disagree = self._in_cells(small, T, K, cell, compared, trusted)
         self._contradicted = 0 if trusted else self._contradicted + 1
         if compared is not None and trusted:
-            coarse = self._coarse(small, found.pixel, compared[0], cell)
+            coarse = self._coarse(small, found.pixel, compared, cell)
             found = Depths(*(np.concatenate(pair) for pair in zip(found, coarse, strict=True)))
         ratios = self._motion.log_ratios(tested, small.shape, cell) if trusted else None
         moving = np.zeros(len(found.pixel), np.bool_) if ratios is None else moves(ratios, found.pixel, cell)
@@ -260,7 +272,7 @@ class DenseEvidence(SavedState):
         T: NDArray,
         K: NDArray,
         cell: int,
-        compared: tuple[Views, NDArray] | None,
+        compared: Compared | None,
         trusted: bool,
     ) -> tuple[Depths, int, bool, Tested, int]:
         """Measure visible landmarks again where the camera has moved, and new pixels in the cells without a landmark.
@@ -279,8 +291,7 @@ class DenseEvidence(SavedState):
         searched = np.concatenate([np.flatnonzero(sighted.due), np.arange(n, len(pixel))])
         tests, disagree = [(sighted.compared, LANDMARK, sighted.hidden)], 0
         if compared is not None:
-            found, fit, precise, trusted, disagree = self._searched(small, pixel[searched], *compared, K, cell)
-            seen = _shown_twice(pixel[searched], compared[0], small.shape, 1 / self._depth)
+            found, fit, precise, trusted, seen, disagree = self._searched(small, pixel[searched], compared, K, cell)
             unmatched = np.ones(len(searched), np.bool_)
             unmatched[found] = False
             tests.append((pixel[searched][seen], SEARCH, unmatched[seen]))
@@ -305,30 +316,31 @@ class DenseEvidence(SavedState):
         return Depths(pixel[valid], rho[valid], variance[valid]), count, trusted, Tested.of(*tests), disagree
 
     def _searched(
-        self, small: NDArray[np.uint8], pixel: NDArray, views: Views, shares: NDArray, K: NDArray, cell: int
-    ) -> tuple[NDArray[np.int64], Fit, NDArray[np.bool_], bool, int]:
+        self, small: NDArray[np.uint8], pixel: NDArray, compared: Compared, K: NDArray, cell: int
+    ) -> tuple[NDArray[np.int64], Fit, NDArray[np.bool_], bool, NDArray[np.bool_], int]:
         """Match pixels [N, 2] with the keyframes.
 
         Returns:
             Indices [n] of the measured pixels; their depths, corrected for errors of the poses; [n] True for depths to
             store (not an uncertain match of a single view, which the next images measure better); False if the views
-            contradict each other; the number of pixels with depths that disagree.
+            contradict each other; [N] True where two views show the line; the number of pixels with depths that
+            disagree.
         """
         from ufmstar_torch.anchors.kernels.check import CERTAIN, confirmed
         from ufmstar_torch.anchors.kernels.dense import measure
 
+        views, shares, _ = compared
         self._baseline = float(np.linalg.norm(inverse_intrinsics(K) @ views.b[-1]))
         matches = measure(small, pixel, views, self._search())
         accepted = confirmed(pixel, matches, cell)
         agreeing = accepted[matches.agreed + matches.contradicted > 1]
         trusted = len(agreeing) < _ENOUGH or bool(agreeing.mean() >= self.config.min_share)
         found = np.flatnonzero(accepted)
-        arguments = matches.only(found), shares, views, K, self._depth, trusted
-        fit = self._errors.corrected(pixel[found], *arguments)
+        fit = self._errors.corrected(pixel, found, matches, shares, views, K, self._depth, trusted)
         storable = (matches.agreed[found] > 1) | (fit.variance < np.square(CERTAIN * fit.rho))
-        return found, fit, storable, trusted, int((matches.contradicted > 0).sum())
+        return found, fit, storable, trusted, matches.shown > 1, int((matches.contradicted > 0).sum())
 
-    def _coarse(self, small: NDArray[np.uint8], occupied: NDArray[np.float64], views: Views, cell: int) -> Depths:
+    def _coarse(self, small: NDArray[np.uint8], occupied: NDArray[np.float64], compared: Compared, cell: int) -> Depths:
         """Search the cells without a pixel of ``occupied`` [N, 2] with windows of twice the width, in images of half
         the size.
 
@@ -336,11 +348,12 @@ class DenseEvidence(SavedState):
         matched.
         """
         from ufmstar_torch.anchors.kernels.check import confirmed
-        from ufmstar_torch.anchors.kernels.dense import MARGIN, Views, measure
+        from ufmstar_torch.anchors.kernels.dense import Views, measure
+        from ufmstar_torch.anchors.kernels.windows import MARGIN
 
-        half = _halved(small)
-        H, images = _HALVED @ views.H @ _DOUBLED, np.stack([_halved(image) for image in views.image])
-        reduced = Views(images, np.ascontiguousarray(H), np.ascontiguousarray(views.b @ _HALVED.T), views.noise / 4)
+        half, (views, _, images) = halved(small), compared
+        H, b = _HALVED @ views.H @ _DOUBLED, views.b @ _HALVED.T
+        reduced = Views(images, np.ascontiguousarray(H), np.ascontiguousarray(b), views.noise / 4)
         occupied = (occupied - 0.5) / 2
         inside = ((occupied >= 0) & (occupied < half.shape[::-1])).all(1)
         pixel = _pixels(half, cell // 2, occupied[inside])
@@ -368,9 +381,8 @@ class DenseEvidence(SavedState):
         accepted = config.sigmas, config.least_score, config.rival, config.match_noise
         return Search(rho, _FARTHEST * rho, _NEAREST * rho, *accepted)
 
-    def _compared(self, T: NDArray, K: NDArray, width: int) -> tuple[Views, NDArray[np.int64]] | None:
-        """Choose V keyframes to compare with a camera T [4, 4]. Return them with the mapping of its pixels to theirs,
-        and the indices [V] of their baselines; None if there is no suitable keyframe."""
+    def _compared(self, T: NDArray, K: NDArray, width: int) -> Compared | None:
+        """Choose keyframes to compare with a camera T [4, 4]; None if there is no suitable one."""
         from ufmstar_torch.anchors.kernels.dense import Views
 
         chosen = self._keyframes.choose(T, K, self._depth, _BASELINES)
@@ -382,20 +394,8 @@ class DenseEvidence(SavedState):
         H = K @ R_keyframe_world @ T[:3, :3] @ inverse_intrinsics(K)
         b = ((T[:3, 3] - pose[:, :3, 3])[:, None] @ pose[:, :3, :3])[:, 0] @ K.T
         noise = self._errors.positions(K, width, self._depth)[shares]
-        return Views(image, np.ascontiguousarray(H), np.ascontiguousarray(b), noise), shares
-
-
-def _shown_twice(
-    pixel: NDArray[np.float64], views: Views, size: tuple[int, int], start: float
-) -> NDArray[np.bool_]:  # fmt: skip
-    """[N] whether two views show the lines of pixels [N, 2], from infinity to twice the inverse depth ``start``."""
-    point = np.concatenate([pixel, np.ones((len(pixel), 1))], axis=1)
-    shown = np.ones((len(views.H), len(pixel)), np.bool_)
-    for rho in (0.0, 2 * start):
-        x, y, z = np.moveaxis(point @ views.H.transpose(0, 2, 1) + rho * views.b[:, None], -1, 0)
-        inside = (x > _BORDER * z) & (x < (size[1] - 1 - _BORDER) * z)
-        shown &= (z > 0) & inside & (y > _BORDER * z) & (y < (size[0] - 1 - _BORDER) * z)
-    return np.asarray(shown.sum(0) > 1)
+        views = Views(image, np.ascontiguousarray(H), np.ascontiguousarray(b), noise)
+        return Compared(views, shares, self._keyframes.halves(keyframes))
 
 
 def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
@@ -408,13 +408,6 @@ def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], ND
     along, down = size[0] / gray.shape[1], size[1] / gray.shape[0]
     scale = np.array([[along, 0, 0.5 * along - 0.5], [0, down, 0.5 * down - 0.5], [0, 0, 1]])
     return np.asarray(small, dtype=np.uint8), scale
-
-
-def _halved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Average blocks of two by two pixels; an odd last row or column is dropped."""
-    cv2 = opencv()
-    height, width = image.shape[0] // 2, image.shape[1] // 2
-    return np.asarray(cv2.resize(image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA))
 
 
 def _cell(width: int) -> int:

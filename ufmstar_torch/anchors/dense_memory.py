@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.anchors.epipolar import MEDIAN_SQUARE, median
 from ufmstar_torch.anchors.saved_state import SavedState
-from ufmstar_torch.gaussians.camera import inverse_intrinsics
 
-# A landmark is measured again when the camera has moved by the share _DUE of its depth, times 1 plus the number of
-# confirmations, at most _LONGEST.
-_DUE, _LONGEST = 0.04, 4
+if TYPE_CHECKING:
+    from ufmstar_torch.anchors.kernels.landmarks import Columns
+
 # Two measurements confirm each other if they differ by at most _SIGMAS standard deviations and the share _SHARE of the
 # inverse depth, added in quadrature.
 _SIGMAS, _SHARE = 3.5, 0.01
 # Running estimate ``apart``: least number of measurements for an update, first value, and steps of the bisection.
 _ENOUGH, _FIRST_APART, _STEPS = 10, 0.01**2, 8
-# Failures in a row, beyond the number of confirmations, after which a landmark is deleted.
-_FAILURES = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +77,7 @@ class Memory(SavedState):
 
     def reset(self) -> None:
         """Forget everything."""
-        from ufmstar_torch.anchors.kernels.dense import SIDE
+        from ufmstar_torch.anchors.kernels.windows import SIDE
 
         n = self._count
         self._point, self._pose = np.zeros((n, 3)), np.tile(np.eye(4), (n, 1, 1))
@@ -104,24 +101,18 @@ class Memory(SavedState):
         from ufmstar_torch.anchors.kernels.landmarks import sight
 
         self.frame += 1
-        columns = self._point, self._pose, self._sigma, self._patch, self._used
-        pixel, depth, spread, shown = sight(image, *columns, T_world_cam, K)
-        self._seen[shown > 0], self._failed[shown > 0] = self.frame, 0
-        compared, hidden = np.flatnonzero(shown), np.flatnonzero(shown < 0)
-        tests = pixel[compared], shown[compared] < 0
-        self._failed[hidden] += 1
-        self._forget(hidden)
-        slot = np.flatnonzero(shown > 0)
-        # Each cell retains the landmark with the most confirmations; among equals, the one with the least uncertainty.
-        column, row = (pixel[slot] / cell).astype(np.int64).T
-        order = np.lexsort((spread[slot] / depth[slot], -self.confirmed[slot], column, row))
-        first = np.diff(row[order] * image.shape[1] + column[order], prepend=-1) > 0
-        self._used[slot[order[~first]]] = False
-        slot = slot[order[first]]
-        pixel, depth, spread = pixel[slot], depth[slot], spread[slot]
-        moved = np.linalg.norm(self._pose[slot, :3, 3] - T_world_cam[:3, 3], axis=1)
-        due = moved >= _DUE * depth * np.minimum(1 + self.confirmed[slot], _LONGEST)
-        return Sighted(slot, pixel, 1 / depth, np.square(spread / np.square(depth)), due, *tests)
+        seen = sight(self._columns(), self.frame, image, T_world_cam, K, cell)
+        compared = np.flatnonzero(seen.shown)
+        tests = seen.pixel[compared], seen.shown[compared] < 0
+        slot = seen.slot
+        depth, spread = seen.depth[slot], seen.spread[slot]
+        return Sighted(slot, seen.pixel[slot], 1 / depth, np.square(spread / np.square(depth)), seen.due, *tests)
+
+    def _columns(self) -> Columns:
+        from ufmstar_torch.anchors.kernels.landmarks import Columns
+
+        of_cameras = self._point, self._pose, self._sigma, self._patch
+        return Columns(*of_cameras, self._used, self.confirmed, self._failed, self._seen)
 
     @property
     def empty(self) -> bool:
@@ -131,9 +122,6 @@ class Memory(SavedState):
     def forget(self) -> None:
         """Delete all landmarks, but retain the running estimate."""
         self._used[:] = False
-
-    def _forget(self, slot: NDArray[np.int64]) -> None:
-        self._used[slot[self._failed[slot] > _FAILURES + self.confirmed[slot]]] = False
 
     def compare(
         self, sighted: Sighted, rho: NDArray[np.float64], variance: NDArray[np.float64], measured: NDArray[np.bool_]
@@ -149,6 +137,8 @@ class Memory(SavedState):
         Returns:
             The landmarks with old and new measurements merged; [n] True where not refuted.
         """
+        from ufmstar_torch.anchors.kernels.landmarks import FAILURES
+
         spread, square = sighted.variance + variance, np.square(sighted.rho)
         difference = np.square(rho - sighted.rho)
         consistent = difference <= _SIGMAS**2 * (spread + self.apart * square) + _SHARE**2 * square
@@ -159,7 +149,8 @@ class Memory(SavedState):
         self.confirmed[sighted.slot[confirmed]] += 1
         self._failed[sighted.slot[refuted]] += 2
         self._used[sighted.slot[refuted & (self.confirmed[sighted.slot] == 0)]] = False
-        self._forget(sighted.slot[refuted])
+        again = sighted.slot[refuted]
+        self._used[again[self._failed[again] > FAILURES + self.confirmed[again]]] = False
         old, new = 1 / sighted.variance, 1 / np.where(confirmed, variance, 1)
         merged = np.where(confirmed, (sighted.rho * old + rho * new) / (old + new), sighted.rho)
         # Measurements share keyframes and patches: merging them does not reduce the smaller variance.
@@ -187,18 +178,15 @@ class Memory(SavedState):
             T_world_cam: [4, 4] [m].
             K: [3, 3] [px].
         """
-        from ufmstar_torch.anchors.kernels.landmarks import patches
+        from ufmstar_torch.anchors.kernels.landmarks import store
 
         if slot is None:
-            age = np.where(self._used, self._seen, -1)
-            slot = np.argsort(age, kind="stable")[: len(rho)]
+            slot = np.flatnonzero(~self._used)[: len(rho)]
+            if len(slot) < len(rho):
+                age = np.where(self._used, self._seen, -1)
+                slot = np.argsort(age, kind="stable")[: len(rho)]
             self.confirmed[slot] = 0
-        n = len(slot)
-        rays = np.concatenate([pixel[:n], np.ones((n, 1))], axis=1) @ inverse_intrinsics(K).T
-        self._point[slot] = rays / rho[:n, None] @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
-        self._pose[slot], self._sigma[slot] = T_world_cam, np.sqrt(variance[:n]) / rho[:n]
-        self._patch[slot] = patches(image, pixel[:n])
-        self._used[slot], self._failed[slot], self._seen[slot] = True, 0, self.frame
+        store(self._columns(), slot, self.frame, image, pixel, rho, variance, T_world_cam, K)
 
 
 def _beyond(square: NDArray[np.float64], variance: NDArray[np.float64]) -> float:

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.anchors.epipolar import MEDIAN_SQUARE, median
 from ufmstar_torch.anchors.kernels.dense import Measured, Views
-from ufmstar_torch.anchors.kernels.poses import CAMERA, POSE, Shown, Solution, linearised, solved
+from ufmstar_torch.anchors.kernels.poses import CAMERA, POSE, Corrected, corrected
 from ufmstar_torch.anchors.saved_state import SavedState
 
 # Least number of matches for an update of the running estimates.
@@ -39,8 +39,6 @@ _FIRST, _LEAST = 0.1, 0.003
 # The variance of a pixel is _PATCH times that of its match times the mean squared residual of its views, in which the
 # running mean counts as one more view. The factor, fitted on tours, stands for errors that views share in the patch.
 _PATCH = 2.0
-# Number of linearisations.
-_LINEARISATIONS = 2
 # [px] First standard deviation of a position that pose errors do not explain.
 _FIRST_UNEXPLAINED = 0.1
 # Correlation of the errors of two keyframes' relative poses: the present view contributes half of each variance.
@@ -114,6 +112,7 @@ class PoseErrors(SavedState):
     def corrected(
         self,
         pixel: NDArray[np.float64],
+        found: NDArray[np.int64],
         measured: Measured,
         shares: NDArray[np.int64],
         views: Views,
@@ -124,42 +123,31 @@ class PoseErrors(SavedState):
         """Correct the depths for errors of the poses and the camera, and update the estimates of these errors.
 
         Args:
-            pixel: [N, 2] (u, v).
-            measured: matches of N pixels in V views, each in at least one view.
+            pixel: [M, 2] (u, v).
+            found: [N] indices of the pixels to use, each with a match in at least one view.
+            measured: matches of the M pixels in V views.
             shares: [V] index of each view's baseline.
             views: V keyframes.
             K: [3, 3] from :meth:`camera`, as in the views [px].
             depth: median of the scene [m].
             trusted: False = poses and images contradict each other; the camera's errors are not updated.
+
+        Returns:
+            Of the N pixels.
         """
-        if not len(pixel):
-            return Fit(measured.rho, measured.variance, np.zeros(0))
-        used = np.isfinite(measured.value)
-        shows = used & np.isfinite(measured.across)
-        speed, slope = (np.where(used, x, 1.0) for x in (measured.speed, measured.slope))
-        along = np.where(used[..., None], measured.along, 0.0)
-        unexplained = self._unexplained[shares]
-        noise = np.where(used, (measured.noise + unexplained * (1 + slope**2)) / speed**2, np.inf)
-        value = np.where(used, measured.value - measured.rho[:, None], 0.0)
-        across = np.where(shows, measured.across, 0.0)
-        across_variance = np.where(shows, measured.across_noise + unexplained, np.inf)
-        prior, rho = self._prior(shares), measured.rho
-        for _ in range(_LINEARISATIONS):  # the correction changes the depths at which it is linearised
-            on_line, across_change = linearised(pixel, rho, along, slope, views, K)
-            shown = Shown(on_line / speed[..., None], value, noise, across_change, across, across_variance)
-            solution = solved(shown, *prior)
-            rho = measured.rho + solution.rho
-        if not np.isfinite(solution.covariance).all():  # never store NaN
-            return Fit(measured.rho, np.full(len(pixel), np.inf), np.full(len(pixel), np.nan))
-        self._learn_poses(solution, shares, K, depth)
+        if not len(found):
+            return Fit(np.zeros(0), np.zeros(0), np.zeros(0))
+        prior = self._prior(shares)
+        result = corrected(pixel, found, measured, views, K, self._unexplained[shares], *prior)
+        if not np.isfinite(result.covariance).all():  # never store NaN
+            return Fit(measured.rho[found], np.full(len(found), np.inf), np.full(len(found), np.nan))
+        self._learn_poses(result, shares, K, depth)
         if trusted:
-            self._learn_camera(solution, prior[0][-CAMERA:, -CAMERA:], views.image.shape[2])
-        compared = used & (measured.agreed > 1)[:, None]
-        self._learn_noise(solution.residual[compared], solution.across_residual, measured.across_noise, shows, shares)
-        dispersion = (self._disagreement + solution.residual.sum(1)) / np.maximum(measured.agreed, 1)
-        variance = _PATCH * dispersion * noise.min(1, initial=np.inf) + solution.common
-        off_line = np.where(shows, solution.across_residual / across_variance, -1.0).max(1, initial=-1.0)
-        return Fit(rho, variance, np.where(shows.any(1), off_line, np.nan))
+            self._learn_camera(result, prior[0][-CAMERA:, -CAMERA:], views.image.shape[2])
+        compared = np.isfinite(measured.value[found]) & (measured.agreed[found] > 1)[:, None]
+        self._learn_noise(result.residual.T[compared], result.across_residual.T, measured.across_noise[found], shares)
+        dispersion = (self._disagreement + result.residual.sum(0)) / np.maximum(measured.agreed[found], 1)
+        return Fit(result.rho, _PATCH * dispersion * result.match + result.common, result.off_line)
 
     def _prior(self, shares: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Prior precision [S, S] and mean [S] of the errors of V keyframes and of the camera, S = 6 V + 4."""
@@ -170,17 +158,18 @@ class PoseErrors(SavedState):
         precision[n:, n:] = np.linalg.inv(self._covariance)
         return precision, np.concatenate([np.zeros(n + 3), self._camera[3:]])  # K includes the first three
 
-    def _learn_poses(self, solution: Solution, shares: NDArray[np.int64], K: NDArray[np.float64], depth: float) -> None:
-        posterior = solution.covariance.diagonal()[:-CAMERA].reshape(-1, 2, 3).sum(2)
+    def _learn_poses(
+        self, solution: Corrected, shares: NDArray[np.int64], K: NDArray[np.float64], depth: float
+    ) -> None:
+        remaining = solution.covariance.diagonal()[:-CAMERA].reshape(-1, 2, 3).sum(2)
         square = np.square(solution.error[:-CAMERA]).reshape(-1, 2, 3).sum(2)
         least = np.square(_LEAST / K[0, 0]) * np.array([1, depth**2])
-        for share, remaining, error2 in zip(shares, posterior, square, strict=True):
-            before = self._variance[share]
-            determined = 3 - remaining / before  # how many of 3 components
-            step = (1 - self._memory) * (error2 - determined * before) / np.maximum(determined, 1)
-            self._variance[share] = np.maximum(before + step, least)
+        before = self._variance[shares]
+        determined = 3 - remaining / before  # how many of 3 components
+        step = (1 - self._memory) * (square - determined * before) / np.maximum(determined, 1)
+        self._variance[shares] = np.maximum(before + step, least)
 
-    def _learn_camera(self, solution: Solution, precision: NDArray[np.float64], width: int) -> None:
+    def _learn_camera(self, solution: Corrected, precision: NDArray[np.float64], width: int) -> None:
         prior = np.diag(1 / self._camera_prior(width).diagonal())
         posterior = np.linalg.inv(solution.covariance[-CAMERA:, -CAMERA:])
         measured = solution.error[-CAMERA:] + np.append(self._camera[:3], 0)
@@ -194,23 +183,21 @@ class PoseErrors(SavedState):
         residual: NDArray[np.float64],
         across_residual: NDArray[np.float64],
         noise: NDArray[np.float64],
-        shows: NDArray[np.bool_],
         shares: NDArray[np.int64],
     ) -> None:
         if len(residual) < _ENOUGH:
             return
+        shows = np.isfinite(noise)
         unexplained = (_medians(across_residual, shows) / MEDIAN_SQUARE - _medians(noise, shows)).clip(_LEAST**2)
-        for share, newest, count in zip(shares, unexplained, shows.sum(0), strict=True):
-            if count >= _ENOUGH:
-                self._unexplained[share] = self._faded(self._unexplained[share], newest)
-        self._disagreement = self._faded(self._disagreement, median(residual) / MEDIAN_SQUARE)
+        enough = shows.sum(0) >= _ENOUGH
+        seen = shares[enough]
+        self._unexplained[seen] = self._memory * self._unexplained[seen] + (1 - self._memory) * unexplained[enough]
+        newest = median(residual) / MEDIAN_SQUARE
+        self._disagreement = self._memory * self._disagreement + (1 - self._memory) * newest
 
     def _camera_prior(self, width: int) -> NDArray[np.float64]:
         """[4, 4] prior covariance of the camera's errors."""
         return np.diag(np.square(np.array(_CAMERA) * [1, width, width, 1]))
-
-    def _faded(self, running: float, newest: float) -> float:
-        return self._memory * running + (1 - self._memory) * float(newest)
 
 
 @functools.lru_cache(maxsize=8)

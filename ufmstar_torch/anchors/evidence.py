@@ -38,7 +38,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ufmstar_torch.frames.frame import AnchorInput
+from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.gaussians.fixed_order import total
 
 SUMS = 3  # entries of a row of sums: w, w r and w e
@@ -78,29 +78,29 @@ class Evidence:
         return Evidence(torch.nn.functional.pad(self.component, (0, 0, 0, max(missing, 0))), self.overall)
 
 
-def inliers(anchors: AnchorInput) -> Tensor:
+def inliers(anchors: Anchors) -> Tensor:
     """[B, N] True for valid anchors that enough of their neighbours in the image support.
 
     A stream with at most ``SUPPORT`` valid anchors uses all of them.
     """
-    n = anchors.valid.shape[1]
-    few = anchors.valid.sum(1, keepdim=True) <= SUPPORT
+    n = anchors.mask.shape[1]
+    few = anchors.mask.sum(1, keepdim=True) <= SUPPORT
     if n <= SUPPORT:
-        return anchors.valid
+        return anchors.mask
     log_ratio = (anchors.depth / anchors.predicted).log()
     u, v = anchors.pixel.unbind(-1)
     distance2 = (u[:, :, None] - u[:, None]).square_().add_((v[:, :, None] - v[:, None]).square_())
     # The first of equally near neighbours wins; the choice of topk depends on the padding of a row.
     distance2 += TIE * torch.arange(n, dtype=distance2.dtype, device=few.device)
-    distance2.masked_fill_(~anchors.valid[:, None], torch.inf).diagonal(dim1=1, dim2=2).fill_(torch.inf)
+    distance2.masked_fill_(~anchors.mask[:, None], torch.inf).diagonal(dim1=1, dim2=2).fill_(torch.inf)
     distance, neighbour = distance2.topk(min(NEIGHBOURS, n - 1), dim=2, largest=False)
-    paired = (distance < torch.inf) & anchors.valid[:, :, None]
+    paired = (distance < torch.inf) & anchors.mask[:, :, None]
     difference = (log_ratio[:, :, None] - _take(log_ratio, neighbour)).abs()
     quartile = torch.where(paired, difference, torch.nan).flatten(1).nanquantile(0.25, dim=1).nan_to_num(0.0)
     noise = anchors.variance / anchors.depth.square()  # variance of log g
     sigma2 = (quartile / LOWER_QUARTILE).square()[:, None, None] + 2 * LEAST_SIGMA**2
     similar = difference <= SIMILAR_SIGMAS * (sigma2 + noise[:, :, None] + _take(noise, neighbour)).sqrt()
-    return anchors.valid & (few | ((similar & paired).sum(2) >= SUPPORT))
+    return anchors.mask & (few | ((similar & paired).sum(2) >= SUPPORT))
 
 
 def _take(value: Tensor, index: Tensor) -> Tensor:
@@ -110,10 +110,10 @@ def _take(value: Tensor, index: Tensor) -> Tensor:
 
 def observe(
     evidence: Evidence,
-    anchors: AnchorInput,
+    anchors: Anchors,
     distribute: Callable[[Tensor], Tensor],
     memory: float,
-    supported_by_neighbours: Callable[[AnchorInput], Tensor] = inliers,
+    supported_by_neighbours: Callable[[Anchors], Tensor] = inliers,
 ) -> tuple[Evidence, Tensor]:
     """Fade the old evidence and add that of a frame.
 
@@ -130,7 +130,7 @@ def observe(
     """
     supported = supported_by_neighbours(anchors)
     r = anchors.depth / anchors.predicted - 1
-    claim = (anchors.variance + anchors.own_variance) / anchors.predicted.square()
+    claim = (anchors.variance + anchors.network_variance) / anchors.predicted.square()
     w = _weight(r.square(), claim, supported)
     rows = torch.stack([w, w * r, w * (r.square() - claim)], dim=-1)
     rows = torch.where(supported[..., None], rows, torch.zeros_like(rows))

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.evidence import Evidence, inliers, means, observe
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.frames.frame import AnchorInput, FrameInput
+from ufmstar_torch.frames.frame import FrameInput
 from ufmstar_torch.gaussians.camera import unproject_at
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 
@@ -55,7 +56,7 @@ def learn(
     frame: FrameInput,
     config: UfMStarConfig,
     distribute: Distribute,
-    supported: Callable[[AnchorInput], Tensor] = inliers,
+    supported: Callable[[Anchors], Tensor] = inliers,
 ) -> Learnt:
     """Add a frame's anchors to the evidence.
 
@@ -83,17 +84,18 @@ def learn(
     return Learnt(evidence, used, *means(evidence, config.anchors.shrinkage))
 
 
-def counts(anchors: AnchorInput | None, used: Tensor) -> dict[str, Tensor]:
+def counts(anchors: Anchors | None, used: Tensor) -> dict[str, Tensor]:
     """The statistics of a frame's anchors, of which ``used`` [B] were used."""
     none = torch.zeros_like(used)
     if anchors is None:
         return {"anchors": none, "anchors_used": used, "anchors_rejected": none, "anchors_moving": none}
-    measured = {"anchors_rejected": anchors.rejected, "pose_error": anchors.pose_error}
+    measured = {} if anchors.pose_error is None else {"pose_error": anchors.pose_error}
     return {
-        "anchors": anchors.valid.sum(1),
+        "anchors": anchors.mask.sum(1),
         "anchors_used": used,
+        "anchors_rejected": anchors.rejected,
         "anchors_moving": none if anchors.moving is None else anchors.moving,
-        **{name: value for name, value in measured.items() if value is not None},
+        **measured,
     }
 
 
@@ -106,7 +108,7 @@ def anchored_term(
         depth: d, [B, ...] [m].
         excess: e, same shape, the relative mean square error that the network does not predict (``evidence``).
         disagreement: M, same shape [m^2].
-        contradiction: [B] mean r^2 of rejected anchors that outnumber the others (``AnchorInput``), a lower bound of
+        contradiction: [B] mean r^2 of rejected anchors that outnumber the others (``Anchors``), a lower bound of
             B/d^2; None = 0.
     """
     square = depth.square()

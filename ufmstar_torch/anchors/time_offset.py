@@ -74,9 +74,11 @@ class TimeOffset(SavedState):
             error: [6 W] e, beyond :meth:`shift`.
             covariance: [6 W, 6 W] C.
         """
-        steps = _motion(T_world_cam[:-1], T_world_cam[1:])
-        central = _motion(T_world_cam[:-2], T_world_cam[2:]) / 2
-        motion = np.concatenate([steps[1:2], central, steps[-2:-1]]).ravel()
+        views = len(T_world_cam)  # before and after each view; neighbours of the first and the last view
+        before, after = [1, *range(views - 2), views - 3], [2, *range(2, views), views - 2]
+        motion = _motion(T_world_cam[before], T_world_cam[after])
+        motion[1:-1] /= 2
+        motion = motion.ravel()
         weighted = precision * motion
         # Windows overlap: each pose is in W windows.
         window_information = float(weighted @ (motion - covariance @ weighted)) / len(T_world_cam)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.bundle import PoseRefinement
 from ufmstar_torch.anchors.corners import find, follow
-from ufmstar_torch.anchors.epipolar import NEAREST, median, off_lines, weighted_quantile
+from ufmstar_torch.anchors.epipolar import FAR, NEAR, NEAREST, median, off_lines, on_lines, weighted_quantile
 from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, OtherCameraError, checked
 from ufmstar_torch.anchors.saved_state import POSITIVE, SavedState, saved_image
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
@@ -38,10 +38,9 @@ _MEMORY, _LONG = 0.8, 4
 _NO_TRACK, _NO_DEPTH = "no corner followed from the frame before", "no parallax, or no track that fits the poses"
 # Largest difference of the entries of equal poses [1, m].
 _SAME = 1e-6
-# Range of a scene's depths over the median, in which corners' points must lie. The upper limit is far above the median,
-# which is inaccurate at first. In an image without motion the limit is the median: all points of a frozen image would
-# lie beyond it, but only half of a scene's points do.
-_NEAR, _FAR, _MEDIAN_DEPTH = 1 / 50, 10.0, 1.0
+# Upper limit of depths over the median in an image without motion: all points of a frozen image would lie beyond it,
+# but only half of a scene's points do.
+_MEDIAN_DEPTH = 1.0
 # Share of the running distance from the epipolar lines that remains after a frame; least motion of a corner that
 # determines a depth, and median motion below which an image stands still [px].
 _FADE, _MOVES, _STILL = 0.6, 1.0, 0.2
@@ -52,13 +51,8 @@ _PARALLAX = 0.005
 # seem too near: by a factor of 7 with a share of .05, of 1.2 with .3 (a turning camera, on tours). Where the camera
 # moves, the share exceeds one half.
 _CLEAR_SHARE = 1 / 3
-# Cells of the image per axis; corners of each cell have the same total weight in the comparison with the poses.
-_CELLS = 6
 # The median of the absolute value of a standard normal variable.
 _MEDIAN = 0.6745
-# Corners on a thing that moves leave their epipolar lines as a group. The standard deviation is that by the quantile
-# _REST of the distances, _REST_QUANTILE of a normal one, where it is below 1/_APART of that by the median.
-_REST, _REST_QUANTILE, _APART = 0.3, 0.3853, 4.0
 
 
 @dataclass(frozen=True)
@@ -303,14 +297,10 @@ class LandmarkTracker(SavedState):
         first = order[seen[chosen].argmax(1)]
         views = self._pixel[chosen, self._view], self._pixel[chosen, first], self._poses[self._view], self._poses[first]
         motion = np.linalg.norm(views[0] - views[1], axis=1)
-        far = self._depth * (_MEDIAN_DEPTH if median(motion) < _STILL else _FAR)
-        distance, rho, baseline = off_lines(*views, self._K, _NEAR * self._depth, far)
-        cell = (views[0] * _CELLS / self._gray.shape[::-1]).astype(np.int64).clip(0, _CELLS - 1) @ [1, _CELLS]
-        weight = 1 / np.bincount(cell)[cell]  # by area: a moving object may have most of the corners
-        newest = weighted_quantile(distance, weight, 0.5) / _MEDIAN
-        lowest = weighted_quantile(distance, weight, _REST) / _REST_QUANTILE
-        if median(motion) >= _STILL and lowest < newest / _APART:
-            newest = lowest
+        far = self._depth * (_MEDIAN_DEPTH if median(motion) < _STILL else FAR)
+        distance, rho, baseline = off_lines(*views, self._K, NEAR * self._depth, far)
+        group, weight = on_lines(distance, views[0], self._gray.shape[::-1], self.config.pixel_noise / 2)
+        newest = weighted_quantile(distance[group], weight[group], 0.5) / _MEDIAN
         self._newest_line_error = newest
         self._line_error = newest if self._line_error < 0 else _FADE * self._line_error + (1 - _FADE) * newest
         self.baseline = median(baseline)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import sys
 from bisect import bisect_left
 from enum import Enum
 
 import numpy as np
 
 from ufmstar_torch.frames.warnings import LOGGER
-from ufmstar_torch.gaussians.trajectory import Trajectory, interpolate_pose
+from ufmstar_torch.gaussians.trajectory import SAME_TIME, Trajectory, interpolate_pose
 
 # [s] A stamp farther from the stream's last one than this, and than the time since that arrived, is doubted.
 JUMP = 2.0
@@ -134,3 +135,16 @@ class PoseBuffer:
             self._poses.insert(index, T)
         del self._times[:-_MOST_POSES], self._poses[:-_MOST_POSES]
         return dropped
+
+
+def require_stamp(stamp: float) -> float:
+    """The stamp as a float. Raises TypeError, ValueError: not a finite number in seconds, exact to 1 ms."""
+    if isinstance(stamp, bool) or not isinstance(stamp, float | int | np.floating | np.integer):
+        raise TypeError(f"stamp must be a number of seconds, got {type(stamp).__name__}")
+    exact = stamp.item() if isinstance(stamp, np.generic) else stamp
+    if not abs(exact) < sys.float_info.max:
+        raise ValueError(f"stamp must be finite [s], got {stamp}")
+    step = float(np.spacing(abs(stamp))) if isinstance(stamp, np.floating) else math.ulp(exact)
+    if step > SAME_TIME:
+        raise ValueError(f"stamp must be in seconds and exact to 1 ms, got {stamp}, which is exact to {step:g} s")
+    return float(stamp)

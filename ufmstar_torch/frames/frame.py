@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.frames.arguments import (
     Array,
     CameraLike,
@@ -48,40 +49,6 @@ FARTHEST = 1e9  # [m] any coordinate of a camera
 
 
 @dataclass(frozen=True)
-class AnchorInput:
-    """Checked anchors, and the frame's values at their pixels.
-
-    Attributes:
-        pixel: [B, N, 2] position (u, v) [px]; 0 where it is impossible or outside the image.
-        index: [B, N] int64 of the pixel in the flattened image.
-        predicted: [B, N] the network's depth at the pixel [m]; 1 where not valid.
-        depth, variance: [B, N] of the anchor [m], [m^2]; 1 and 0 where not valid.
-        own_variance: [B, N] variance that the network predicts at the pixel, A + E as far as they are used [m^2].
-        valid: [B, N] bool: finite, depth > 0, 0 <= variance < depth^2, within a factor of 100 of the prediction, on a
-            valid pixel, not masked.
-        rejected: [B] number of anchors that only this factor makes invalid; None = not counted.
-        contradiction: [B] mean r^2 of the rejected anchors, r at most 100, where they outnumber the valid ones and
-            therefore measure the prediction's error; else 0. None = not counted.
-        pose_error, shared, scale, motion, moving: as in :class:`~ufmstar_torch.anchors.anchors.Anchors`.
-    """
-
-    pixel: Tensor
-    index: Tensor
-    predicted: Tensor
-    depth: Tensor
-    variance: Tensor
-    own_variance: Tensor
-    valid: Tensor
-    rejected: Tensor | None = None
-    contradiction: Tensor | None = None
-    pose_error: Tensor | None = None
-    shared: Tensor | None = None
-    scale: Tensor | None = None
-    motion: Tensor | None = None
-    moving: Tensor | None = None
-
-
-@dataclass(frozen=True)
 class FrameInput:
     """A checked frame of B streams, all on the depth's device.
 
@@ -100,7 +67,7 @@ class FrameInput:
         host_fault: ``fault`` on the CPU if pose and intrinsics were there, so that reading it does not wait; else None.
         member: [B] float64 index of the network, or of the random sample, that predicted; None = always the same.
         informative: [B] False where the image shows nothing, so that its depth is a guess; None = all True.
-        anchors: of the frame, or None.
+        anchors: of the frame, checked (``anchors.check``), or None.
         confidence: [B, H, W] float32, finite or NaN, the network's confidence; None = not predicted, or not used.
     """
 
@@ -118,7 +85,7 @@ class FrameInput:
     host_fault: Tensor | None = None
     member: Tensor | None = None
     informative: Tensor | None = None
-    anchors: AnchorInput | None = None
+    anchors: Anchors | None = None
     confidence: Tensor | None = None
 
     @property

@@ -147,3 +147,9 @@ def _require_matrix(intrinsics: Tensor) -> None:
     """Raises TypeError, ValueError: no floating-point tensor [..., 3, 3]."""
     if require_float("intrinsics", intrinsics).shape[-2:] != (3, 3):
         raise ValueError(f"intrinsics must be [..., 3, 3], got {tuple(intrinsics.shape)}")
+
+
+def camera_of(size: tuple[int, int]) -> Tensor:
+    """[3, 3] intrinsics [px] of a camera with images of ``size`` (H, W), 53 degrees wide."""
+    height, width = size
+    return torch.tensor([[float(width), 0, width / 2], [0, float(width), height / 2], [0, 0, 1]])

@@ -117,15 +117,3 @@ class GaussianMixture:
             return torch.cat([value, value.new_zeros(value.shape[0], missing, *value.shape[2:])], dim=1)
 
         return GaussianMixture(**{name: pad(value) for name, value in self.tensors().items()})
-
-    def __post_init__(self) -> None:
-        slots = b, k = self.weight.shape
-        expected = {
-            "mean": (b, k, 3), "covariance": (b, k, 3, 3), "disagreement": slots, "compared": slots,
-            "views": slots, "reference": (b, k, 5),
-        }  # fmt: skip
-        for name, shape in expected.items():
-            if getattr(self, name).shape != shape:
-                raise ValueError(f"{name} must have shape {tuple(shape)}, got {tuple(getattr(self, name).shape)}")
-        if self.features.shape[:2] != (b, k) or self.features.dim() != 3:
-            raise ValueError(f"features must have shape ({b}, {k}, F), got {tuple(self.features.shape)}")

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import functools
 import warnings
-from collections.abc import Callable
-from dataclasses import fields, is_dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.anchors import CheckAnchors, check_anchor_values
+from ufmstar_torch.anchors.check import CheckAnchors, check_anchor_values
+from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.frames.frame import CheckKernel, check_values
+from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.steps.merge import REFERENCE as MERGE_REFERENCE
 from ufmstar_torch.steps.merge import MergeKernels
 from ufmstar_torch.steps.sample import REFERENCE as SAMPLE_REFERENCE
@@ -94,9 +95,7 @@ def select_kernels(name: str, device_type: str) -> Kernels:
         return _triton()
     if name == "torch" or device_type in ("cpu", "meta"):
         return REFERENCE
-    from ufmstar_torch.kernels.cpu import segment as segment_cpu
-
-    return replace(REFERENCE, spgf=on_host(segment_cpu.segment))
+    return replace(REFERENCE, spgf=_segment_on_host)
 
 
 def _compiled(name: str, device_type: str) -> bool:
@@ -144,33 +143,11 @@ def _has_triton(device_type: str) -> bool:
     return True
 
 
-def moved(value: Any, device: torch.device | str) -> Any:
-    """The same value with its tensors on a device: a tensor, a tuple, or a dataclass with tensors in its fields."""
-    if isinstance(value, Tensor):
-        return value.to(device)
-    if isinstance(value, tuple):
-        return tuple(moved(part, device) for part in value)
-    if not is_dataclass(value) or isinstance(value, type):
-        return value
-    before = {f.name: getattr(value, f.name) for f in fields(value)}
-    after = {name: moved(part, device) for name, part in before.items()}
-    changed = any(after[name] is not part for name, part in before.items())
-    return replace(value, **after) if changed else value
+def _segment_on_host(
+    depth: Tensor, intrinsics: Tensor, limits: SPGFConfig, features: Tensor | None
+) -> tuple[GaussianMixture, Tensor]:
+    """The segmentation of tensors of any device, on the CPU; synchronises."""
+    from ufmstar_torch.kernels.cpu.segment import segment
 
-
-def on_host(kernel: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap a CPU kernel for tensors of any device: copy them, synchronise, return results on the first tensor's
-    device."""
-
-    def call(*arguments: Any) -> Any:
-        return moved(kernel(*moved(arguments, "cpu")), _first(arguments).device)
-
-    return call
-
-
-def _first(value: Any) -> Any:
-    """The first tensor in a value, or None."""
-    if isinstance(value, Tensor):
-        return value
-    parts = value if isinstance(value, tuple) else vars(value).values() if is_dataclass(value) else ()
-    return next((tensor for part in parts if (tensor := _first(part)) is not None), None)
+    mixture, labels = segment(depth.cpu(), intrinsics.cpu(), limits, None if features is None else features.cpu())
+    return mixture.to(depth.device), labels.to(depth.device)

@@ -3,99 +3,86 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ufmstar_torch.anchors.anchors import FARTHEST_OFF
-from ufmstar_torch.kernels.compile_cpu import cached
-from ufmstar_torch.posterior.config import PosteriorConfig
-from ufmstar_torch.posterior.field import fast
-from ufmstar_torch.posterior.running import Floats
+from ufmstar_torch.anchors.check import FARTHEST_OFF
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, part, reordered_leaf
 
 # Upper limit of |y|: anchors that are off by more are not valid.
 LARGEST = math.log(FARTHEST_OFF)
-# Kernels whose sums may be reordered, for values with NaN.
-with_nan = cached(fastmath={"contract", "reassoc", "nsz", "arcp"})
 
 
-def cell_means(logs: NDArray[Any], valid: NDArray[np.bool_], rows: int, cols: int) -> Floats:
+@part
+def cell_means(logs, valid, rows, cols):
     """Mean of log d over the valid pixels of every cell [rows cols]; a cell covers every pixel that it touches."""
-    total, count = np.zeros((2, rows, cols))
-    _add_up(logs, valid, total, count)
-    mean = total / np.maximum(count, 1)
-    return np.where(count > 0, mean, mean.sum() / max(np.count_nonzero(count), 1)).ravel()
+    mean = empty(rows * cols, np.float64)
+    _cell_means(logs, valid, rows, cols, mean)
+    total, count = 0.0, 0
+    for i in range(mean.size):
+        if mean[i] == mean[i]:
+            total += mean[i]
+            count += 1
+    for i in range(mean.size):
+        if mean[i] != mean[i]:
+            mean[i] = total / max(count, 1)
+    return mean
 
 
-@fast
-def _add_up(logs, valid, total, count):
-    """Sums over the cells."""
+@reordered_leaf
+def _cell_means(logs, valid, rows, cols, mean):
+    """As :func:`cell_means`, NaN in cells without a valid pixel."""
     height, width = logs.shape
-    rows, cols = total.shape
     for row in range(rows):
-        for i in range(row * height // rows, ((row + 1) * height + rows - 1) // rows):
-            for c in range(cols):
-                cell_sum, used = 0.0, 0
+        for c in range(cols):
+            total, count = 0.0, 0
+            for i in range(row * height // rows, ((row + 1) * height + rows - 1) // rows):
                 for j in range(c * width // cols, ((c + 1) * width + cols - 1) // cols):
                     if valid[i, j]:
-                        cell_sum += logs[i, j]
-                        used += 1
-                total[row, c] += cell_sum
-                count[row, c] += used
+                        total += logs[i, j]
+                        count += 1
+            mean[row * cols + c] = total / count if count else np.nan
 
 
-def features(logs: Floats, u: Floats, v: Floats) -> Floats:
-    """[N, 4] features for log d - m_0 [N] at u and v [N] from 0 to 1: 1, log d - m_0, u and v from -1 to 1."""
-    return np.stack([np.ones_like(logs), logs, 2 * u - 1, 2 * v - 1], 1)
-
-
-def ranges(depth: NDArray[Any], valid: NDArray[np.bool_], index: NDArray[np.int64]) -> Floats:
-    """[N] largest less smallest log d of the valid pixels among a valid pixel and its eight neighbours."""
-    out = np.empty(len(index))
-    _highest_over_lowest(depth, valid, index, out)
-    return np.log(out)
-
-
-@fast
-def _highest_over_lowest(depth, valid, index, out):
+@reordered_leaf
+def highest_over_lowest(depth, valid, index):
+    """The ratio of the largest and the least depth of the valid pixels among a valid pixel and its eight neighbours."""
     height, width = depth.shape
-    for k in range(len(index)):
-        row, column = index[k] // width, index[k] % width
-        low = high = np.float64(depth[row, column])
-        for i in range(max(row - 1, 0), min(row + 2, height)):
-            for j in range(max(column - 1, 0), min(column + 2, width)):
-                if valid[i, j]:
-                    low, high = min(low, np.float64(depth[i, j])), max(high, np.float64(depth[i, j]))
-        out[k] = high / low
+    row = index // width
+    column = index - row * width
+    low = high = np.float64(depth[row, column])
+    for i in range(max(row - 1, 0), min(row + 2, height)):
+        for j in range(max(column - 1, 0), min(column + 2, width)):
+            if valid[i, j]:
+                low, high = min(low, np.float64(depth[i, j])), max(high, np.float64(depth[i, j]))
+    return high / low
 
 
-def local_variance(f: Floats) -> Floats:
-    """[R, C] variance of f [R, C] over each value and its eight neighbours; border values are repeated outside."""
-    out = np.empty_like(f)
-    _vary(f, out)
+@part
+def steepness(f, rows, cols):
+    """[n] variance of the field's mean ``f`` [n] over a node and its eight neighbours, values at the border repeated
+    outside: the grid locates a depth edge, where y changes, to one node only."""
+    out = empty(f.size, np.float64)
+    _vary(f, rows, cols, out)
     return out
 
 
-@fast
-def _vary(f, out):
-    rows, cols = f.shape
+@reordered_leaf
+def _vary(f, rows, cols, out):
     for i in range(rows):
         for j in range(cols):
             total = squares = 0.0  # of differences from the centre, to lose less in rounding
             for r in range(i - 1, i + 2):
                 for c in range(j - 1, j + 2):
-                    difference = f[min(max(r, 0), rows - 1), min(max(c, 0), cols - 1)] - f[i, j]
+                    difference = f[min(max(r, 0), rows - 1) * cols + min(max(c, 0), cols - 1)] - f[i * cols + j]
                     total += difference
                     squares += difference * difference
-            out[i, j] = squares / 9 - (total / 9) ** 2
+            out[i * cols + j] = squares / 9 - (total / 9) ** 2
 
 
-def read(
-    depth: NDArray[Any], valid: NDArray[np.bool_], logs: NDArray[Any], claimed: NDArray[Any], nodes: Floats,
-    coefficients: Floats, mean: float, size: tuple[int, int], config: PosteriorConfig,
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:  # fmt: skip
-    """Depth, variances and the probability of another surface at every pixel.
+@part
+def interpolate(depth, valid, logs, claimed, nodes, coefficients, grid, config, y, variance, inlier, outlier):
+    """Write y, the two variances and the probability of another surface at every pixel [H, W].
 
     The four nodes around a pixel have their bilinear weights times 1/(1 + (D/edge_contrast)^2); D is the difference
     between the pixel's log d and the node's.
@@ -105,55 +92,38 @@ def read(
         valid: [H, W].
         logs: [H, W] log d.
         claimed: [H, W] UfM*'s variance [m^2]; its product with the share without evidence is a lower limit.
-        nodes: [n, 6] log d, y - b . x, variance over the squared depth, the same on the evidence's surface, probability
+        nodes: [6, n] log d, y - b . x, variance over the squared depth, the same on the evidence's surface, probability
             of another surface, and share without evidence.
         coefficients: [4] of 1, log d - m_0, u, v.
-        mean: m_0.
-        size: R and C of the nodes.
+        grid: of the nodes.
         config: of the posterior.
-
-    Returns:
-        Depth d e^y [m], its variance [m^2], that on the surface of the evidence, and the probability, [H, W] in
-        depth's dtype, NaN where not valid.
+        y, outlier: y and the probability, NaN where not valid.
+        variance, inlier: variance of the depth d e^y over e^2y [m^2], and that on the surface of the evidence.
     """
-    rows, cols = size
-    width = depth.shape[1]
-    u = (np.arange(width) + 0.5) / width
-    between = (u * cols - 0.5).clip(0, cols - 1)
-    before = np.minimum(between.astype(np.int64), max(cols - 2, 0))
-    lines = np.ascontiguousarray(nodes.reshape(rows, cols, 6).transpose(0, 2, 1))
-    left, right = lines.take(before, 2), lines.take(np.minimum(before + 1, cols - 1), 2)
-    y, spread, inlier, p = (np.empty_like(logs) for _ in range(4))
-    base = coefficients[0] - coefficients[1] * mean + coefficients[2] * (2 * u - 1)
-    slopes = coefficients[1], coefficients[3]
+    b, rows, cols, width = coefficients, grid.rows, grid.cols, depth.shape[1]
+    left, right = empty((rows, 6, width), np.float64), empty((rows, 6, width), np.float64)
+    across, base = empty(width, np.float64), empty(width, np.float64)
+    for j in range(width):
+        u = (j + 0.5) / width
+        position = min(max(u * cols - 0.5, 0.0), cols - 1.0)
+        before = min(int(position), max(cols - 2, 0))
+        after = min(before + 1, cols - 1)
+        across[j], base[j] = position - before, b[0] - b[1] * grid.mean + b[2] * (2 * u - 1)
+        for row in range(rows):
+            for k in range(6):
+                left[row, k, j], right[row, k, j] = nodes[k, row * cols + before], nodes[k, row * cols + after]
     limits = config.edge_contrast**2, LARGEST
-    _pixels(depth, valid, logs, claimed, left, right, between - before, base, slopes, limits, y, spread, inlier, p)
-    factor = np.exp(y, out=y)
-    square = factor * factor
-    return depth * factor, spread * square, inlier * square, p
+    _pixels(depth, valid, logs, claimed, left, right, across, base, (b[1], b[3]), limits, y, variance, inlier, outlier)
 
 
-@with_nan
-def widen(depth, variance, inlier, shared, scale, contradiction, limit, floor):
-    """Raise two variances [H, W] to ``floor`` and add what the anchors of a frame share (``correct.widened``)."""
-    for i in range(depth.shape[0]):
-        d, V, V1 = depth[i], variance[i], inlier[i]
-        for j in range(len(d)):
-            square = np.float64(d[j]) * np.float64(d[j])
-            common = square * shared + scale
-            added = square * (contradiction + (common if common < limit else limit))
-            V[j] = (floor if V[j] < floor else V[j]) + added
-            V1[j] = (floor if V1[j] < floor else V1[j]) + added
-
-
-@with_nan
+@reordered_leaf
 def _pixels(depth, valid, logs, claimed, left, right, across, base, slopes, limits, y, spread, inlier, outlier):
-    """Write y [H, W], the variances of d e^y over e^2y, and p at every pixel; y and p are NaN where not valid.
+    """As :func:`interpolate`.
 
     ``left`` and ``right`` [R, 6, W] are the nodes before and after each column, ``across`` the weight of the one after.
     The ratios of the four weights s/(1 + D^2) are those of s times the other three denominators.
     """
-    height, rows = len(logs), len(left)
+    height, rows, width = logs.shape[0], left.shape[0], across.size
     contrast2, largest = limits
     by_depth, by_row = slopes
     for i in range(height):
@@ -164,7 +134,7 @@ def _pixels(depth, valid, logs, claimed, left, right, across, base, slopes, limi
         n0, n1, n2, n3 = left[top], right[top], left[bottom], right[bottom]
         depths, used, gs, Vs = depth[i], valid[i], logs[i], claimed[i]
         ys, variances, inliers, outliers = y[i], spread[i], inlier[i], outlier[i]
-        for j in range(len(across)):
+        for j in range(width):
             g, d, V, fu = np.float64(gs[j]), np.float64(depths[j]), np.float64(Vs[j]), across[j]
             a0, a1, a2, a3 = g - n0[0, j], g - n1[0, j], g - n2[0, j], g - n3[0, j]
             q0, q1, q2, q3 = contrast2 + a0 * a0, contrast2 + a1 * a1, contrast2 + a2 * a2, contrast2 + a3 * a3
@@ -181,3 +151,23 @@ def _pixels(depth, valid, logs, claimed, left, right, across, base, slopes, limi
             outliers[j] = p * share if used[j] else np.nan
             variances[j] = max(variance * d * d, unseen * (V if V == V else 0.0)) * share
             inliers[j] = inlier_variance * d * d * share
+
+
+@kernel
+def finish(depth, factor, variance, inlier, common, floor):
+    """Change e^y [H, W] to the depth d e^y, and its variances over e^2y to those [m^2]: at least ``floor``, plus the
+    errors that all anchors of the frame share.
+
+    ``common``: variance of the inverse-depth error, variance of the logarithm of a factor, mean square of rejected
+    anchors' relative errors (``Anchors``), and the limit of the first two, over the squared depth.
+    """
+    shared, scale, contradiction, limit = common
+    for i in range(depth.shape[0]):
+        for j in range(depth.shape[1]):
+            square = np.float64(factor[i, j]) * np.float64(factor[i, j])
+            d = factor[i, j] = depth[i, j] * factor[i, j]
+            V, V1 = variance[i, j] * square, inlier[i, j] * square
+            depth_square = np.float64(d) * np.float64(d)
+            added = depth_square * (contradiction + min(depth_square * shared + scale, limit))
+            variance[i, j] = (floor if floor > V else V) + added
+            inlier[i, j] = (floor if floor > V1 else V1) + added

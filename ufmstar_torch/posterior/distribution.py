@@ -12,22 +12,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.special import ndtr, ndtri
 
 from ufmstar_torch.posterior.conformal import corrected, uncorrected
-from ufmstar_torch.posterior.running import Floats
 
 # [m^2] of a component: a variance of 0 has no density.
 LEAST_VARIANCE = 1e-12
 # Least distance of F from 0 and 1 [1]: z stays finite in float64.
 TAIL = 1e-15
-# Quantile of the variance of inliers over the image that limits it.
-_TYPICAL = 0.7
-# Least ratio of the variances of another surface and of the evidence's.
-_APART = 4.0
 # Steps of the bisection: a bracket of 20 m shrinks to a micrometre.
 _BISECTIONS = 24
 
@@ -89,27 +83,6 @@ class DepthDistribution:
     def _quantiles_at(self, like: Tensor) -> Tensor:
         """[3, B, 1, ...] to broadcast over the pixels of ``like`` [B, ...]."""
         return self.quantiles.double().T.reshape(3, -1, *[1] * (like.dim() - 1))
-
-
-def divided(variance: Floats, inlier: Floats, p: Floats) -> tuple[Floats, Floats]:
-    """Variance of the inliers and probability of the others, for a mixture of the same total variance V whose inliers
-    have at most the quantile ``_TYPICAL`` of their variance over the image:
-
-        V_1' = min(V_1, quantile),      V_2' = max(V_2, ``_APART`` V_1'),      p' = max(p, (V - V_1')/(V_2' - V_1')).
-
-    Where the field is uncertain, most errors remain those of a surface with evidence, and some are those of another.
-    One wide normal distribution would not separate them.
-
-    Args:
-        variance: [n] total.
-        inlier: [n] V_1.
-        p: [n] probability of another surface.
-    """
-    elsewhere = np.maximum((variance - (1 - p) * inlier) / np.maximum(p, 1e-12), inlier)
-    limited = np.minimum(inlier, np.quantile(inlier, _TYPICAL))
-    excess = np.maximum(elsewhere, _APART * limited) - limited
-    share: Floats = np.maximum(p, ((variance - limited) / np.maximum(excess, 1e-12)).clip(0, 1))
-    return limited, share
 
 
 def _conditional(distribution: DepthDistribution, depth: Tensor) -> Tensor:

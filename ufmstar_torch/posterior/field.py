@@ -1,4 +1,4 @@
-"""A Gaussian field on a grid's nodes, conditioned on observations at some: mean and variance at every node.
+"""A Gaussian field on a grid's nodes, conditioned on observations at some: mean and variance at every node (numba).
 
     y = x . b + f + noise,      b ~ N(b_0, P),      f ~ N(0, Q^-1)
 
@@ -6,7 +6,7 @@ with the features x and the field f of precision Q: f^T Q f = kappa |f|^2 + sum 
 the link. An observation of variance 1/w at node i adds w to Q_ii. A Schur complement integrates b out. The only large
 system is that of the nodes.
 
-A Cholesky factorisation (numba, float64) solves it in a window of 32 nodes. With C columns, the precision matrix has
+A Cholesky factorisation (float64) solves it in a window of 32 nodes. With C columns, the precision matrix has
 the bandwidth C, and elimination fills only the band. The window of C + 1 nodes
 is a full matrix, which nodes enter and leave in order. A backward pass over the factor gives the covariance within the
 window (Takahashi's equations), and with it all marginal variances. Node i has the slot i mod 32, so that every loop has
@@ -15,21 +15,19 @@ one fixed length.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.kernels.compile_cpu import cached, kernel, part
+from ufmstar_torch.kernels.compile_cpu import empty, leaf, part, reordered_leaf
 from ufmstar_torch.posterior.running import Floats
 
 WINDOW = 32
 # Number of right-hand sides: features, y, and zeros up to a multiple of four.
 RIGHT = 8
 _WIDTH = WINDOW + RIGHT
-
-# Kernels (``compile_cpu``) whose sums may be reordered, for values without infinity and NaN.
-fast = cached(fastmath=True)
 
 
 class Field(NamedTuple):
@@ -39,7 +37,7 @@ class Field(NamedTuple):
         coefficients: [F] mean of b.
         covariance: [F, F] of b.
         offset: [n] mean of f.
-        response: [n, F] decrease of f's mean per unit of b.
+        response: [n, RIGHT] decrease of f's mean per unit of b, in the first F columns.
         variance: [n] variance of f for fixed b.
     """
 
@@ -54,14 +52,14 @@ class Prior(NamedTuple):
     """Prior of b and f.
 
     Attributes:
-        diagonal: [n] kappa.
+        diagonal: kappa.
         right, down: [n] precision of the link to the next node in the row, in the column; 0 where there is none.
         mean: [F] b_0; F + 1 is at most ``RIGHT``.
         precision: [F, F] P^-1.
         cols: nodes in a row, less than ``WINDOW``.
     """
 
-    diagonal: Floats
+    diagonal: float
     right: Floats
     down: Floats
     mean: Floats
@@ -83,104 +81,108 @@ class Observed(NamedTuple):
     value: Floats
 
 
-def conditioned(prior: Prior, observed: Observed, weight: Floats) -> Field:
-    """Condition the prior on observations of precision ``weight`` [N]."""
-    n, F = len(prior.diagonal), len(prior.mean)
-    nodes, offset, coefficients = np.zeros((n, RIGHT)), np.empty(n), prior.mean.copy()
-    diagonal, precision, right_side = prior.diagonal.copy(), prior.precision.copy(), np.zeros(F)
-    _gather(*observed, weight, prior.mean, diagonal, nodes, precision, right_side)
+@part
+def conditioned(prior, observed, weight):
+    """The :class:`Field` of a :class:`Prior`, conditioned on observations of precision ``weight`` [N]."""
+    n, F = prior.right.size, prior.mean.size
+    diagonal, nodes = empty(n, np.float64), empty((n, RIGHT), np.float64)
+    coefficients, precision = empty(F, np.float64), empty((F, F), np.float64)
+    offset, right_side = empty(n, np.float64), empty(F, np.float64)
+    _gather(prior, observed, weight, diagonal, nodes, precision, right_side)
     solved, variance = solve(diagonal, prior.right, prior.down, nodes, prior.cols)
     _subtract_schur(nodes, solved, precision, right_side)
-    _invert(precision)
-    _add_observed(precision, right_side, solved, coefficients, offset)
-    return Field(coefficients, precision, offset, solved[:, :F], variance)
+    invert(precision)
+    _add_observed(prior.mean, precision, right_side, solved, coefficients, offset)
+    return Field(coefficients, precision, offset, solved, variance)
 
 
-@fast
-def _gather(node, features, value, weight, mean, diagonal, nodes, precision, right_side):
-    """Add the observations to the prior's equations: w to the diagonal of their nodes, w x and w (y - x b_0) to the
-    nodes' right-hand sides, w x x^T and w x (y - x b_0) to the coefficients' precision and right-hand side."""
-    F = len(mean)
-    for k in range(len(node)):
-        x, row, w, residual = features[k], nodes[node[k]], weight[k], value[k]
+@leaf
+def _gather(prior, observed, weight, diagonal, nodes, precision, right_side):
+    """Write the equations. The observations add w to the diagonal of their nodes, w x and w (y - x b_0) to the nodes'
+    right-hand sides, w x x^T and w x (y - x b_0) to the coefficients' precision and right-hand side."""
+    F = prior.mean.size
+    for i in range(diagonal.size):
+        diagonal[i] = prior.diagonal
+        for c in range(RIGHT):
+            nodes[i, c] = 0.0
+    for f in range(F):
+        right_side[f] = 0.0
+        for g in range(F):
+            precision[f, g] = prior.precision[f, g]
+    for k in range(weight.size):
+        i, w, residual = observed.node[k], weight[k], observed.value[k]
         for f in range(F):
-            residual -= x[f] * mean[f]
-        diagonal[node[k]] += w
-        row[F] += w * residual
+            residual -= observed.features[k, f] * prior.mean[f]
+        diagonal[i] += w
+        nodes[i, F] += w * residual
         for f in range(F):
-            row[f] += w * x[f]
-            right_side[f] += w * x[f] * residual
+            weighted = w * observed.features[k, f]
+            nodes[i, f] += weighted
+            right_side[f] += weighted * residual
             for g in range(F):
-                precision[f, g] += w * x[f] * x[g]
+                precision[f, g] += weighted * observed.features[k, g]
 
 
-@fast
+@leaf
 def _subtract_schur(nodes, solved, precision, right_side):
     """Schur complement: subtract what the field explains of the observations from the coefficients' equations."""
-    F = len(right_side)
-    for i in range(len(nodes)):
-        x, y = nodes[i], solved[i]
-        if x[0] > 0:  # observed; the first feature is 1
+    F = right_side.size
+    for i in range(nodes.shape[0]):
+        if nodes[i, 0] > 0:  # observed; the first feature is 1
             for f in range(F):
-                right_side[f] -= x[f] * y[F]
+                right_side[f] -= nodes[i, f] * solved[i, F]
                 for g in range(F):
-                    precision[f, g] -= x[f] * y[g]
+                    precision[f, g] -= nodes[i, f] * solved[i, g]
 
 
-@fast
-def _invert(A):
+@leaf
+def invert(A):
     """Invert a positive definite matrix [F, F] in place (Gauss-Jordan)."""
-    for k in range(len(A)):
+    n = A.shape[0]
+    for k in range(n):
         pivot = 1 / A[k, k]
         A[k, k] = 1.0
-        for c in range(len(A)):
+        for c in range(n):
             A[k, c] *= pivot
-        for r in range(len(A)):
+        for r in range(n):
             if r != k:
                 factor = A[r, k]
                 A[r, k] = 0.0
-                for c in range(len(A)):
+                for c in range(n):
                     A[r, c] -= factor * A[k, c]
 
 
-@fast
-def _add_observed(covariance, right_side, solved, coefficients, offset):
-    """Add the observations' effect to the coefficients, and write the mean of the field."""
-    F = len(right_side)
-    b = np.zeros(F)
+@leaf
+def _add_observed(before, covariance, right_side, solved, coefficients, offset):
+    """Add the observations' effect to the coefficients ``before``, and write the mean of the field."""
+    F = before.size
     for f in range(F):
+        coefficients[f] = 0.0
         for g in range(F):
-            b[f] += covariance[f, g] * right_side[g]
-        coefficients[f] += b[f]
-    for i in range(len(offset)):
+            coefficients[f] += covariance[f, g] * right_side[g]
+    for i in range(offset.size):
         offset[i] = solved[i, F]
         for f in range(F):
-            offset[i] -= solved[i, f] * b[f]
+            offset[i] -= solved[i, f] * coefficients[f]
+    for f in range(F):
+        coefficients[f] += before[f]
 
 
-def at(field: Field, node: NDArray[np.int64], features: Floats) -> tuple[Floats, Floats]:
-    """Mean and variance [N] of x . b + f at nodes [N] with features [N, F]."""
-    mean, variance = field.offset[node], field.variance[node]
-    _add_coefficients(features, features - field.response[node], field.coefficients, field.covariance, mean, variance)
+@leaf
+def at(field, node, features, k):
+    """Mean and variance of x . b + f at a node, for x = ``features[k]``."""
+    F, mean, variance = field.coefficients.size, field.offset[node], field.variance[node]
+    for f in range(F):
+        mean += features[k, f] * field.coefficients[f]
+        product = 0.0
+        for g in range(F):
+            product += field.covariance[f, g] * (features[k, g] - field.response[node, g])
+        variance += product * (features[k, f] - field.response[node, f])
     return mean, variance
 
 
-@fast
-def _add_coefficients(features, reduced, b, covariance, mean, variance):
-    """Add x . b to the mean, and r . covariance r to the variance, with r = ``reduced``: x less the field's
-    response."""
-    F = len(b)
-    for k in range(len(features)):
-        x = reduced[k]
-        for f in range(F):
-            mean[k] += features[k, f] * b[f]
-            product = 0.0
-            for g in range(F):
-                product += covariance[f, g] * x[g]
-            variance[k] += product * x[f]
-
-
-def solve(diagonal: Floats, right: Floats, down: Floats, columns: Floats, cols: int) -> tuple[Floats, Floats]:
+@part
+def solve(diagonal, right, down, columns, cols):
     """Solve A X = Y and compute the diagonal of A^-1, for A from a diagonal and the links of a grid.
 
     Args:
@@ -192,24 +194,26 @@ def solve(diagonal: Floats, right: Floats, down: Floats, columns: Floats, cols: 
     Returns:
         X [n, RIGHT], and the diagonal of A^-1 [n].
     """
-    n = len(diagonal)
-    factor, solved, variance = np.empty((n, _WIDTH)), np.empty((n, RIGHT)), np.empty(n)
-    _eliminate(diagonal, right, down, columns, cols, np.zeros((WINDOW, _WIDTH)), factor)
-    _covariances(factor, np.zeros((WINDOW, _WIDTH)), np.empty(_WIDTH), solved, variance)
+    n = diagonal.size
+    factor, window, row = empty((n, _WIDTH), np.float64), empty((WINDOW, _WIDTH), np.float64), empty(_WIDTH, np.float64)
+    solved, variance = empty((n, RIGHT), np.float64), empty(n, np.float64)
+    _eliminate(diagonal, right, down, columns, cols, window, factor)
+    _covariances(factor, window, row, solved, variance)
     return solved, variance
 
 
-@fast
+@reordered_leaf
 def _eliminate(diagonal, right, down, columns, cols, window, factor):
     """Write the factor [n, 40]: row j has the window's nodes at their slots, then the right-hand sides."""
-    n = len(diagonal)
+    n = diagonal.size
+    _clear(window)
     for j in range(-cols, n):
         if j + cols < n:
             _enter(window, j + cols, diagonal, right, down, columns, cols)
         if j < 0:
             continue
         slot, row = j % WINDOW, factor[j]
-        scale = 1 / np.sqrt(window[slot, slot])
+        scale = 1 / math.sqrt(window[slot, slot])
         for c in range(_WIDTH):
             row[c] = window[slot, c] * scale
         for k in range(WINDOW):
@@ -222,10 +226,17 @@ def _eliminate(diagonal, right, down, columns, cols, window, factor):
             window[slot, c] = 0.0
 
 
-@part
+@leaf
+def _clear(window):
+    for k in range(WINDOW):
+        for c in range(_WIDTH):
+            window[k, c] = 0.0
+
+
+@leaf
 def _enter(window, i, diagonal, right, down, columns, cols):
     """Enter node i with its links to earlier nodes at a slot that is 0."""
-    slot, n = i % WINDOW, len(diagonal)
+    slot, n = i % WINDOW, diagonal.size
     total = diagonal[i]
     if (i + 1) % cols:
         total += right[i]
@@ -244,9 +255,10 @@ def _enter(window, i, diagonal, right, down, columns, cols):
         window[slot, WINDOW + c] = columns[i, c]
 
 
-@fast
+@reordered_leaf
 def _covariances(factor, window, out, solved, variance):
     """Backward pass over the factor, whose diagonal is overwritten: the solutions and marginal variances."""
+    _clear(window)
     for j in range(len(factor) - 1, -1, -1):
         slot, row = j % WINDOW, factor[j]
         scale = 1 / row[slot]
@@ -268,7 +280,8 @@ def _covariances(factor, window, out, solved, variance):
             solved[j, c] = window[slot, WINDOW + c] = scale * (row[WINDOW + c] - out[WINDOW + c])
 
 
-def distance(source: NDArray[np.bool_], right: Floats, down: Floats, cols: int, limit: float) -> Floats:
+@part
+def distance(source, right, down, cols, limit):
     """Geodesic distance of every node from the nearest evidence, along the links of the grid.
 
     Args:
@@ -281,15 +294,17 @@ def distance(source: NDArray[np.bool_], right: Floats, down: Floats, cols: int, 
     Returns:
         [n] distances.
     """
-    length = np.where(source, 0.0, limit)
+    length = empty(source.size, np.float64)
+    for i in range(length.size):
+        length[i] = 0.0 if source[i] else limit
     _sweep(length, right, down, cols)
     return length
 
 
-@kernel
+@leaf
 def _sweep(length, right, down, cols):
     """Relax the lengths forwards and backwards until none changes."""
-    n, shorter = len(length), True
+    n, shorter = length.size, True
     while shorter:
         shorter = False
         for i in range(n):

@@ -1,4 +1,4 @@
-"""Updates ``running`` from a frame's anchors by cross-validation: one anchor, or a disc of anchors, is held out.
+"""Sums for ``running`` by cross-validation (numba): one anchor of a frame, or a disc of anchors, is held out.
 
 Leave-one-out residuals give roughness and noise. For the other ratios, discs that move over the image are held out, and
 the field of the other anchors predicts those in them. Products of errors in neighbouring cells give the amplitude, and
@@ -9,25 +9,24 @@ other anchors: outliers have widened the field's variance, and ``wrong`` account
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+import math
 
-from ufmstar_torch.posterior.conformal import image_weights
-from ufmstar_torch.posterior.field import Field, at, conditioned
-from ufmstar_torch.posterior.moments import score
-from ufmstar_torch.posterior.running import Floats, Running
+import numpy as np
+
+from ufmstar_torch.kernels.compile_cpu import empty, leaf, part
+from ufmstar_torch.posterior.cells import steepness
+from ufmstar_torch.posterior.field import at, conditioned
+from ufmstar_torch.posterior.moments import below, second_moments
+from ufmstar_torch.posterior.running import AMPLITUDE, CALIBRATION, INLIER, NOISE, RATIOS, ROUGHNESS, UNSEEN, WRONG
 from ufmstar_torch.posterior.scene import (
     MOST_WRONG,
-    LeftOut,
-    Scene,
     at_pixels,
     away_from,
+    counts,
     elsewhere_variance,
     inlier_factor,
     local_scale,
-    second_moments,
     spread_around,
-    steepness,
     wrong_factor,
 )
 
@@ -40,117 +39,173 @@ LEAST_REST = 5
 STEPS = (0.7548776662466927, 0.5698402909980532)
 
 
-def learnt(
-    scene: Scene, field: Field, weight: Floats, left_out: LeftOut, running: Running, away: Floats,
-    of_surfaces: dict[str, tuple[float, float]],
-) -> tuple[Floats, Floats]:  # fmt: skip
-    """The packed memory after the frame; and [2, M] scores of held-out anchors with their weights (``conformal``).
-    ``away`` [R C]: distance of every node from evidence; ``of_surfaces``: sums from ``motion.surfaces``."""
-    sums, scores = _of_discs(scene, weight, left_out, running, away)
-    above, below = running.added(_of_neighbours(scene, left_out, running) | sums | of_surfaces)
-    first, b = [running.frames + 1, scene.grid.mean], field.coefficients
-    slopes = running.with_slopes(b[1:])
-    return np.concatenate([first, above, below, slopes, b, field.covariance.ravel()]), scores
+@part
+def sums_of(scene, weight, left_out, ratios, frames, config):
+    """Sums over a frame's anchors, and the scores of the held-out ones.
+
+    Args:
+        scene: of the frame.
+        weight: [N] of the anchors (``scene.fitted``).
+        left_out: leave-one-out predictions.
+        ratios: up to the frame before.
+        frames: number of frames with anchors before.
+        config: of the posterior.
+
+    Returns:
+        [2, R] numerators and denominators to add to those of the ratios, 0 for "between" and "centre"; and [3, M] of
+        the held-out anchors: CDF of the posterior at the depth, distance from evidence, and weight by area.
+    """
+    sums = empty((2, RATIOS), np.float64)
+    for i in range(RATIOS):
+        sums[0, i] = sums[1, i] = 0.0
+    _add_neighbours(scene, left_out, ratios, config, sums)
+    rest, held_out = empty(weight.size, np.bool_), _discs(scene, frames, config)
+    count = 0
+    for k in range(weight.size):
+        rest[k] = not held_out[k]
+        count += rest[k]
+    if count < LEAST_REST:
+        for k in range(weight.size):
+            held_out[k] = False
+    scores = _add_discs(scene, weight, left_out, ratios, rest, held_out, config, sums)
+    return sums, scores
 
 
-def _of_neighbours(scene: Scene, left_out: LeftOut, running: Running) -> dict[str, tuple[float, float]]:
-    """Sums for roughness and noise from the excess of squared leave-one-out residuals over their variance, weighted by
-    the squared share of the quantity in that variance."""
-    variance = left_out.total
-    excess = np.minimum(left_out.residual**2, scene.config.clip * variance) - variance
-    per_cell = 1 / scene.counted(np.ones(len(variance)))
-    sums = {}
-    for name, part in (("roughness", np.full(len(variance), running.ratios["roughness"])), ("noise", scene.stated)):
-        w = per_cell * (part / variance) ** 2
-        unit = running.ratios[name] / np.maximum(part, 1e-12)
-        sums[name] = float((w * (part + excess) * unit).sum()), float(w.sum())
-    return sums
+@leaf
+def _add(sums, ratio, above, under):
+    sums[0, ratio] += above
+    sums[1, ratio] += under
 
 
-def _of_discs(
-    scene: Scene, weight: Floats, left_out: LeftOut, running: Running, everywhere: Floats
-) -> tuple[dict[str, tuple[float, float]], Floats]:
-    """Sums for the other ratios, from anchors in held-out discs, and these anchors' scores with weights."""
-    held_out, config = _discs(scene, running.frames), scene.config
-    rest = ~held_out
-    held_out = held_out & (np.count_nonzero(rest) >= LEAST_REST)
-    field = conditioned(scene.prior, scene.observed, weight * rest)
-    node, x, noise = scene.observed.node[held_out], scene.observed.features[held_out], scene.noise[held_out]
-    mean, variance = at(field, node, x)
-    away, b = away_from(scene, rest)[node], field.coefficients
-    error, offset = scene.observed.value[held_out] - mean, mean - (x * b).sum(1)
-    believed = np.where(held_out, scene.believed, 0.0)
-    area = (believed / np.maximum(scene.counted(believed), 1e-12))[held_out]
-    unseen = away * running.ratios["unseen"]
-    wide = elsewhere_variance(config, spread_around(scene, rest, b[0])[node], unseen)
-    scale, factor = local_scale(scene, left_out, rest)[node], inlier_factor(running, away)
-    steep = steepness(scene.grid, field.offset)[node]
-    inlier_variance = factor * (variance + noise + unseen) + steep
-    inlier_variance, more_wrong = scale * inlier_variance, wrong_factor(config, away, scale)
-    p = np.minimum(running.ratios["wrong"] * more_wrong, MOST_WRONG)
-    z2 = error**2 / inlier_variance - (error + offset) ** 2 / (noise + wide)
-    with np.errstate(over="ignore", divide="ignore"):  # infinite odds of the evidence's surface
-        elsewhere = 1 / (1 + np.exp(-np.log(p / (1 - p)) - (np.log(inlier_variance / (noise + wide)) + z2) / 2))
-    stated = second_moments(config, inlier_variance, p, offset, wide)[0]
-    sums = {
-        "wrong": (area * elsewhere, area * more_wrong),
-        "inlier": (area * (1 - elsewhere) * factor * error**2 / inlier_variance, area * (1 - elsewhere)),
-        "calibration": (area * error**2 / stated, area),
-    }
-    added = {name: (float(above.sum()), float(below.sum())) for name, (above, below) in sums.items()}
-    # At a pixel there is neither an anchor's blur nor its part in ``alone``, only the noise of its measurement.
-    measured = scene.stated[held_out] - config.alone / len(scene.stated)
-    at_pixel = at_pixels(config, factor, variance, running.ratios["roughness"], unseen, steep)
-    moments = second_moments(config, scale * (at_pixel + measured), p, offset, wide + measured)
-    scores = np.stack([score(error, p, *moments), image_weights(away, area, everywhere)])
-    return _of_pairs(scene, node, np.stack([error, variance, away, noise]), running) | added, scores
+@part
+def _add_neighbours(scene, left_out, ratios, config, sums):
+    """Add the sums for roughness and noise from the excess of squared leave-one-out residuals over their variance,
+    weighted by the squared share of the quantity in that variance."""
+    count = counts(scene.observed.node, scene.grid.log_depth.size)
+    for k in range(scene.noise.size):
+        variance, residual = left_out.total[k], left_out.residual[k]
+        excess = min(residual * residual, config.clip * variance) - variance
+        for ratio, value, term in (
+            (ROUGHNESS, ratios.roughness, ratios.roughness), (NOISE, ratios.noise, scene.stated[k]),
+        ):  # fmt: skip
+            w = (term / variance) ** 2 / count[scene.observed.node[k]]
+            _add(sums, ratio, w * (term + excess) * value / max(term, 1e-12), w)
 
 
-def _of_pairs(
-    scene: Scene, node: NDArray[np.int64], values: Floats, running: Running
-) -> dict[str, tuple[float, float]]:  # fmt: skip
-    """Sums for amplitude and unseen from the errors at pairs of neighbouring cells.
+@part
+def _add_discs(scene, weight, left_out, ratios, rest, held_out, config, sums):
+    """Add the sums for the other ratios, from anchors in held-out discs; returns the scores of these anchors."""
+    grid, observed, M = scene.grid, scene.observed, 0
+    of_rest, area = empty(weight.size, np.float64), empty(grid.log_depth.size, np.float64)
+    for i in range(area.size):
+        area[i] = 0.0
+    for k in range(weight.size):
+        of_rest[k] = weight[k] if rest[k] else 0.0
+        if held_out[k]:
+            area[observed.node[k]] += scene.believed[k]
+            M += 1
+    field = conditioned(scene.prior, observed, of_rest)
+    b, steep = field.coefficients, steepness(field.offset, grid.rows, grid.cols)
+    distances = away_from(grid, observed.node, rest, config)
+    around, scales = spread_around(scene, rest, b[0], config), local_scale(scene, left_out, rest, config)
+    scores, node, values, m = empty((3, M), np.float64), empty(M, np.int64), empty((4, M), np.float64), 0
+    for k in range(weight.size):
+        if not held_out[k]:
+            continue
+        i = observed.node[k]
+        mean, variance = at(field, i, observed.features, k)
+        offset, error = mean, observed.value[k] - mean
+        for f in range(b.size):
+            offset -= observed.features[k, f] * b[f]
+        noise, away, scale, believed = scene.noise[k], distances[i], scales[i], scene.believed[k] / max(area[i], 1e-12)
+        node[m], scores[1, m], scores[2, m] = i, away, believed
+        values[0, m], values[1, m], values[2, m], values[3, m] = error, variance, away, noise
+        unseen = away * ratios.unseen
+        wide, factor = elsewhere_variance(config, around[i], unseen), inlier_factor(config, ratios, away)
+        inlier, more_wrong = (
+            scale * (factor * (variance + noise + unseen) + steep[i]),
+            wrong_factor(config, away, scale),
+        )
+        p = min(ratios.wrong * more_wrong, MOST_WRONG)
+        z2 = error * error / inlier - (error + offset) ** 2 / (noise + wide)
+        # infinite odds of the evidence's surface make 0
+        elsewhere = 1 / (1 + math.exp(-math.log(p / (1 - p)) - (math.log(inlier / (noise + wide)) + z2) / 2))
+        stated = second_moments(config, inlier, p, offset, wide)[0]
+        _add(sums, WRONG, believed * elsewhere, believed * more_wrong)
+        _add(sums, INLIER, believed * (1 - elsewhere) * factor * error * error / inlier, believed * (1 - elsewhere))
+        _add(sums, CALIBRATION, believed * error * error / stated, believed)
+        # At a pixel there is neither an anchor's blur nor its part in ``alone``, only the noise of its measurement.
+        measured = scene.stated[k] - config.alone / weight.size
+        at_pixel = at_pixels(config, factor, variance, ratios.roughness, unseen, steep[i], 0.0)
+        moment, inlier = second_moments(config, scale * (at_pixel + measured), p, offset, wide + measured)
+        scores[0, m] = below(math.exp(error), p, moment, inlier)
+        m += 1
+    _add_pairs(grid, node, values, ratios, sums)
+    return scores
+
+
+@part
+def _add_pairs(grid, node, values, ratios, sums):
+    """Add the sums for amplitude and unseen from the errors at pairs of neighbouring cells.
 
     The mean product of their errors is the covariance of the network's errors: noise and wrong anchors are independent
     between cells. An isolated cell contributes its squared error less its noise. The more pairs there are, the less
     isolated cells count.
 
     Args:
-        scene: of the frame.
+        grid: of the frame.
         node: [M] nodes of the held-out anchors.
         values: [4, M] error, its variance in the field, distance from evidence and noise.
-        running: up to the frame before.
+        ratios: up to the frame before.
+        sums: [2, R].
     """
-    grid, amplitude, sums = scene.grid, running.ratios["amplitude"], np.zeros(4)
-    count = np.bincount(node, minlength=grid.rows * grid.cols)
-    means = np.stack([np.bincount(node, row, len(count)) for row in values]) / np.maximum(count, 1)
-    cells, alone, pairs = np.arange(len(count)).reshape(grid.rows, grid.cols), count > 0, 0
-    for first, second, link in ((cells[:, :-1], cells[:, 1:], grid.right), (cells[:-1], cells[1:], grid.down)):
-        pair = (count[first] > 0) & (count[second] > 0)
-        one, other = first[pair], second[pair]
-        alone[one] = alone[other] = False
-        pairs += len(one)
-        _, variance, away, noise = (means[:, one] + means[:, other]) / 2
-        covariance = np.maximum(variance - APART * amplitude * link[one] / 2, 0)
-        sums += _products(means[0, one] * means[0, other], covariance, variance, noise, away)
-    error, variance, away, noise = means[:, alone]
-    share = len(error) / max(len(error) + pairs, 1)
-    sums += share * _products(error**2 - noise / count[alone], variance, variance, noise, away)
-    return {"amplitude": (float(sums[0]), float(sums[1]) / amplitude), "unseen": (float(sums[2]), float(sums[3]))}
+    n = grid.log_depth.size
+    count, means, alone = counts(node, n), empty((4, n), np.float64), empty(n, np.bool_)
+    for i in range(n):
+        alone[i] = count[i] > 0
+        for c in range(4):
+            means[c, i] = 0.0
+    for m in range(node.size):
+        for c in range(4):
+            means[c, node[m]] += values[c, m] / count[node[m]]
+    pairs, isolated = 0, 0
+    for i in range(n):
+        for other, link in ((i + 1 if (i + 1) % grid.cols else n, grid.right[i]), (i + grid.cols, grid.down[i])):
+            if other < n and count[i] > 0 and count[other] > 0:
+                alone[i] = alone[other] = False
+                pairs += 1
+                variance, away = (means[1, i] + means[1, other]) / 2, (means[2, i] + means[2, other]) / 2
+                covariance = max(variance - APART * ratios.amplitude * link / 2, 0.0)
+                noise = (means[3, i] + means[3, other]) / 2
+                _add_product(means[0, i] * means[0, other], covariance, variance, noise, away, 1.0, ratios, sums)
+    for i in range(n):
+        isolated += alone[i]
+    share = isolated / max(isolated + pairs, 1)
+    for i in range(n):
+        if alone[i]:
+            error, variance, away, noise = means[0, i], means[1, i], means[2, i], means[3, i]
+            _add_product(
+                error * error - noise / count[i], variance, variance, noise, away, share, ratios, sums
+            )  # fmt: skip
 
 
-def _products(product: Floats, expected: Floats, variance: Floats, noise: Floats, away: Floats) -> Floats:
-    """[4] sums: numerator and denominator of amplitude, weighted, and of unseen."""
-    weight = 1 / np.maximum(variance + noise, 1e-12)
-    terms = weight * product, weight * expected, away * (product - expected), away**2
-    return np.array([x.sum() for x in terms])
+@leaf
+def _add_product(product, expected, variance, noise, away, share, ratios, sums):
+    """Add a product of errors whose ``expected`` value holds without the error's growth with the distance."""
+    weight = share / max(variance + noise, 1e-12)
+    _add(sums, AMPLITUDE, weight * product, weight * expected / ratios.amplitude)
+    _add(sums, UNSEEN, share * away * (product - expected), share * away * away)
 
 
-def _discs(scene: Scene, frames: float) -> NDArray[np.bool_]:
+@part
+def _discs(scene, frames, config):
     """[N] whether an anchor lies in one of the frame's discs."""
-    position, discs = (scene.observed.features[:, 2:4] + 1) / 2, scene.config.discs
-    inside = np.zeros(len(position), np.bool_)
-    for disc in range(discs):
-        centre = np.array([((frames * discs + disc + 1) * step) % 1 for step in STEPS])
-        inside |= ((position - centre) ** 2).sum(1) < scene.config.radius**2
+    x, discs = scene.observed.features, config.discs
+    inside = empty(x.shape[0], np.bool_)
+    for k in range(x.shape[0]):
+        inside[k] = False
+        for disc in range(int(discs)):
+            u = (frames * discs + disc + 1) * STEPS[0] % 1 - (x[k, 2] + 1) / 2
+            v = (frames * discs + disc + 1) * STEPS[1] % 1 - (x[k, 3] + 1) / 2
+            inside[k] |= u * u + v * v < config.radius**2
     return inside

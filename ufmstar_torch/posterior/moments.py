@@ -1,33 +1,35 @@
-"""Second moments of a log-normal error and probabilities of a normal mixture, element by element (numba)."""
+"""Second moments of a log-normal error, and mixtures of two normal distributions of a relative depth (numba)."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-import torch
-from torch.special import ndtri
 
-from ufmstar_torch.kernels.compile_cpu import kernel, part
-from ufmstar_torch.posterior.distribution import TAIL
-from ufmstar_torch.posterior.running import Floats
+from ufmstar_torch.kernels.compile_cpu import empty, leaf, part
+from ufmstar_torch.kernels.cpu.sample import smallest
 
 # Least variance of y whose distribution is computed.
 LEAST_VARIANCE = 1e-12
 # Standard deviations beyond which the normal distribution function is 0 or 1 in float64.
 _FARTHEST = 8.3
+# Quantile of the variance of inliers over the image that limits it.
+_TYPICAL = 0.7
+# Least ratio of the variances of another surface and of the evidence's.
+_APART = 16.0
 
 
-@kernel
-def moments(variance, p, offset, wide, limit, widest, total, inlier):
-    """Write both results [n] of :func:`ufmstar_torch.posterior.scene.second_moments`."""
-    for i in range(variance.size):
-        inlier[i] = _moment(min(variance[i], widest), 0.0, limit)
-        tail = _moment(wide[i], min(max(offset[i], -limit), limit), limit)
-        total[i] = (1 - p[i]) * inlier[i] + p[i] * tail
+@leaf
+def second_moments(config, variance, p, offset, wide):
+    """Variances over the squared depth: in total, and if the local correction holds. With probability ``p`` the local
+    correction ``offset`` does not hold, and y has the variance ``wide`` instead of ``variance``."""
+    limit = math.log(config.farthest)
+    inlier = _moment(min(variance, config.widest), 0.0, limit)
+    tail = _moment(wide, min(max(offset, -limit), limit), limit)
+    return (1 - p) * inlier + p * tail, inlier
 
 
-@part
+@leaf
 def _moment(variance, offset, limit):
     """E[(e^n - 1)^2 | |n| <= ``limit``], n ~ N(-offset, variance)."""
     sigma = math.sqrt(max(variance, LEAST_VARIANCE))
@@ -38,7 +40,7 @@ def _moment(variance, offset, limit):
     return max(moment / mass, 0.0)
 
 
-@part
+@leaf
 def _mass(low, high):
     """Probability of the normal distribution between two values."""
     if low < -_FARTHEST and high > _FARTHEST:
@@ -46,34 +48,51 @@ def _mass(low, high):
     return normal_below(high) - normal_below(low)
 
 
-@part
+@leaf
 def normal_below(x):
     """The normal distribution function."""
     return 0.5 * math.erfc(-x * math.sqrt(0.5))
 
 
-def score(error: Floats, p: Floats, moment: Floats, inlier: Floats) -> Floats:
-    """|z| [N] of held-out anchors.
+@leaf
+def below(ratio, p, moment, inlier):
+    """CDF at ``ratio`` of a positive depth over its mean: a mixture of two normal distributions of mean 1, of weight
+    1 - ``p`` with the variance ``inlier``, and with the second moment ``moment`` in total."""
+    elsewhere = max((moment - (1 - p) * inlier) / max(p, 1e-12), inlier)
+    first, second = 1 / math.sqrt(inlier), 1 / math.sqrt(elsewhere)
+    zero = (1 - p) * normal_below(-first) + p * normal_below(-second)
+    x = ratio - 1
+    return ((1 - p) * normal_below(x * first) + p * normal_below(x * second) - zero) / (1 - zero)
+
+
+@part
+def divide(variance, inlier, p):
+    """Change the variance of the inliers and the probability of the others, for a mixture of the same total variance V
+    whose inliers have at most the quantile ``_TYPICAL`` of their variance over the image:
+
+        V_1' = min(V_1, quantile),      V_2' = max(V_2, ``_APART`` V_1'),      p' = max(p, (V - V_1')/(V_2' - V_1')).
+
+    Where the field is uncertain, most errors remain those of a surface with evidence, and some are those of another.
+    One wide normal distribution would not separate them.
 
     Args:
-        error: [N] log of the depth over the posterior's.
-        p: [N] probability that the posterior's local correction does not hold.
-        moment, inlier: [N] second moment of the relative error, and the same if the local correction holds.
+        variance: [n] total.
+        inlier: [n] V_1; changed.
+        p: [n] probability of another surface; changed.
     """
-    below = np.empty(len(error))
-    _conditional(np.exp(error), p, moment, inlier, below)
-    z: Floats = ndtri(torch.from_numpy(below).clamp_(TAIL, 1 - TAIL)).abs().numpy()
-    return z
-
-
-@kernel
-def _conditional(ratio, p, moment, inlier, out):
-    """Write the CDF [n] at ``ratio`` of a positive depth over its mean: a mixture of two normal distributions of mean
-    1, of weight 1 - ``p`` with the variance ``inlier``, and with the second moment ``moment`` in total."""
-    for i in range(ratio.size):
-        elsewhere = max((moment[i] - (1 - p[i]) * inlier[i]) / max(p[i], 1e-12), inlier[i])
-        first, second = 1 / math.sqrt(inlier[i]), 1 / math.sqrt(elsewhere)
-        zero = (1 - p[i]) * normal_below(-first) + p[i] * normal_below(-second)
-        x = ratio[i] - 1
-        below = (1 - p[i]) * normal_below(x * first) + p[i] * normal_below(x * second)
-        out[i] = (below - zero) / (1 - zero)
+    n, ordered = inlier.size, empty(inlier.size, np.float64)
+    for i in range(n):
+        ordered[i] = inlier[i]
+    position = _TYPICAL * (n - 1)
+    lower = int(position)
+    quantile = smallest(ordered, n, lower)
+    upper = np.inf  # the next value: the smaller ones were sorted to the left
+    for i in range(lower + 1, n):
+        upper = min(upper, ordered[i])
+    if position > lower:
+        quantile += (position - lower) * (upper - quantile)
+    for i in range(n):
+        elsewhere = max((variance[i] - (1 - p[i]) * inlier[i]) / max(p[i], 1e-12), inlier[i])
+        inlier[i] = min(inlier[i], quantile)
+        excess = max(elsewhere, _APART * inlier[i]) - inlier[i]
+        p[i] = max(p[i], min(max((variance[i] - inlier[i]) / max(excess, 1e-12), 0.0), 1.0))

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -37,32 +37,43 @@ _MATRIX = FEATURES * FEATURES
 LARGEST_LOG, LARGEST = 14.0, 1e9
 
 
-class Ratio(NamedTuple):
-    """The prior of a ratio: its value, its weight in anchors, and the limits of the ratio."""
+class Ratios(NamedTuple):
+    """The ratios by name; for each, a number or what belongs to it."""
 
-    value: float
-    weight: float
-    least: float
-    largest: float
+    amplitude: Any
+    roughness: Any
+    noise: Any
+    unseen: Any
+    wrong: Any
+    inlier: Any
+    between: Any
+    centre: Any
+    calibration: Any
 
 
-def ratios(config: PosteriorConfig) -> dict[str, Ratio]:
-    """The priors of the ratios by name. The calibration has none."""
+RATIOS = len(Ratios._fields)
+AMPLITUDE, ROUGHNESS, NOISE, UNSEEN, WRONG, INLIER, BETWEEN, CENTRE, CALIBRATION = range(RATIOS)
+
+
+@functools.lru_cache(maxsize=4)  # a posterior has the same config in every frame
+def priors(config: PosteriorConfig) -> Floats:
+    """[4, R] value and weight [anchors] of each ratio's prior, and the limits of the ratio. The calibration has no
+    prior."""
     weight = config.prior_weight
-    return {
-        "amplitude": Ratio(1.0, weight, 0.1, 100.0),
-        "roughness": Ratio(config.roughness**2, weight, 0.01**2, 0.2**2),
-        "noise": Ratio(1.0, weight, 0.25, 16.0),
-        "unseen": Ratio(config.unseen, weight, 0.0, 16.0),
-        "wrong": Ratio(config.wrong, weight, config.wrong / 10, 10 * config.wrong),
-        "inlier": Ratio(1.0, weight, 0.05, 4.0),
-        "between": Ratio(config.between**2, weight, 0.03**2, 1.0),
-        "centre": Ratio(0.0, 0.0, -LARGEST_LOG, LARGEST_LOG),
-        "calibration": Ratio(0.0, 0.0, 0.0, 1e6),
-    }
+    columns = Ratios(
+        amplitude=(1.0, weight, 0.1, 100.0),
+        roughness=(config.roughness**2, weight, 0.01**2, 0.2**2),
+        noise=(1.0, weight, 0.25, 16.0),
+        unseen=(config.unseen, weight, 0.0, 16.0),
+        wrong=(config.wrong, weight, config.wrong / 10, 10 * config.wrong),
+        inlier=(1.0, weight, 0.05, 4.0),
+        between=(config.between**2, weight, 0.03**2, 1.0),
+        centre=(0.0, 0.0, -LARGEST_LOG, LARGEST_LOG),
+        calibration=(0.0, 0.0, 0.0, 1e6),
+    )
+    return np.ascontiguousarray(np.array(columns).T)
 
 
-RATIOS = len(ratios(PosteriorConfig()))
 SIZE = 2 + 2 * RATIOS + SLOPES + FEATURES + _MATRIX
 
 
@@ -78,7 +89,7 @@ def require(packed: Tensor) -> None:
     """Raise a ValueError if no anchors can have led to the memory [B, SIZE]."""
     frames, mean, _, _, covariance = packed.split([1, 1, 2 * RATIOS, SLOPES + FEATURES, _MATRIX], 1)
     matrix = covariance.reshape(-1, FEATURES, FEATURES)
-    signed = 2 + list(ratios(PosteriorConfig())).index("centre")
+    signed = 2 + CENTRE
     sums = torch.cat([packed[:, 2:signed], packed[:, signed + 1 : 2 + 2 * RATIOS]], 1)
     scale = matrix.abs().amax((1, 2)).clamp(1e-300, 1e300)
     low = torch.linalg.eigvalsh(matrix / scale[:, None, None])[:, 0]
@@ -96,18 +107,16 @@ class Running(NamedTuple):
     """The posterior's memory of one stream.
 
     Attributes:
-        config: of the posterior.
         frames: number of frames with anchors.
         mean: m_0 of the last frame.
-        above, below: [R] numerators and denominators of :func:`ratios`, in their order.
+        above, below: [R] numerators and denominators of the ratios.
         slopes: [3] mean of the slopes in the coefficients over the frames with anchors, with the half-life and with
             ``slope_weight`` frames of 0.
         coefficients: [4] of the features in the last frame.
         covariance: [4, 4] of the coefficients.
-        ratios: the ratios by name, within their limits; the prior's value where the denominator is 0.
+        ratios: within their limits; the prior's value where the denominator is 0.
     """
 
-    config: PosteriorConfig
     frames: float
     mean: float
     above: Floats
@@ -115,70 +124,69 @@ class Running(NamedTuple):
     slopes: Floats
     coefficients: Floats
     covariance: Floats
-    ratios: dict[str, float]
+    ratios: Ratios
 
     @classmethod
     def of(cls, packed: Floats, config: PosteriorConfig) -> Running:
         """Unpack [SIZE]; zeros are the start."""
-        names, (value, weight, least, largest) = _priors(config)
+        value, weight, least, largest = priors(config)
         (above, below), rest = packed[2 : 2 + 2 * RATIOS].reshape(2, RATIOS), packed[2 + 2 * RATIOS :]
-        slopes, b, covariance = np.split(rest, [SLOPES, SLOPES + FEATURES])
-        covariance = covariance.reshape(FEATURES, FEATURES)
+        slopes, b = rest[:SLOPES], rest[SLOPES : SLOPES + FEATURES]
+        covariance = rest[SLOPES + FEATURES :].reshape(FEATURES, FEATURES)
         if packed[0] == 0:
             above, below, covariance = value * weight, weight, np.diag(config.prior_variance)
         values = np.where(below > 0, above / np.maximum(below, 1e-12), value).clip(least, largest)
-        by_name = dict(zip(names, values.tolist(), strict=True))
-        return cls(config, packed[0], packed[1], above, below, slopes, b, covariance, by_name)
+        frames, mean = packed[:2].tolist()
+        return cls(frames, mean, above, below, slopes, b, covariance, Ratios(*values.tolist()))
 
-    def added(self, sums: dict[str, tuple[float, float]]) -> tuple[Floats, Floats]:
-        """Numerators and denominators [R] after a frame with the ``sums`` by name."""
-        value, weight, least, largest = _priors(self.config)[1]
-        fade, (above, below) = 0.5 ** (1 / self.config.half_life), np.array([sums[name] for name in self.ratios]).T
+    def after(self, name: str, above: float, below: float, config: PosteriorConfig) -> float:
+        """A ratio after a frame with its numerator and denominator."""
+        k = Ratios._fields.index(name)
+        value, weight, least, largest = priors(config)[:, k].tolist()
+        fade = 0.5 ** (1 / config.half_life)
+        n = fade * float(self.below[k]) + (1 - fade) * weight + below
+        total = fade * float(self.above[k]) + (1 - fade) * weight * value + above
+        return min(max(total / n, least), largest)
+
+    def added(self, sums: Floats, config: PosteriorConfig) -> tuple[Floats, Floats]:
+        """Numerators and denominators [R] after a frame with the ``sums`` [2, R]."""
+        value, weight, least, largest = priors(config)
+        fade, (above, below) = 0.5 ** (1 / config.half_life), sums
         n = fade * self.below + (1 - fade) * weight + below
         total = fade * self.above + (1 - fade) * weight * value + above
         return np.minimum(np.maximum(total, least * n), largest * n), n
 
-    def after(self, name: str, above: float, below: float) -> float:
-        """A ratio after a frame with its numerator and denominator."""
-        k, prior = list(self.ratios).index(name), ratios(self.config)[name]
-        fade = 0.5 ** (1 / self.config.half_life)
-        n = fade * self.below[k] + (1 - fade) * prior.weight + below
-        total = fade * self.above[k] + (1 - fade) * prior.weight * prior.value + above
-        return float(min(max(total / n, prior.least), prior.largest))
-
-    def with_slopes(self, slopes: Floats) -> Floats:
-        """Mean slopes [3] after a frame with anchors whose coefficients have the ``slopes`` [3]."""
-        rate = math.log(2) / self.config.half_life
+    def learnt(
+        self, sums: Floats, mean: float, coefficients: Floats, covariance: Floats, config: PosteriorConfig
+    ) -> Floats:
+        """Pack into [SIZE] after a frame with anchors: with the ``sums`` [2, R] for the ratios, m_0 = ``mean``, and the
+        coefficients and their covariance."""
+        rate = math.log(2) / config.half_life
         weight = math.expm1(-rate * (self.frames + 1)) / math.expm1(-rate)  # of the frames with anchors, 1 of the last
-        mean: Floats = self.slopes + (slopes - self.slopes) / (weight + self.config.slope_weight)
-        return mean
+        slopes = self.slopes + (coefficients[1:] - self.slopes) / (weight + config.slope_weight)
+        first = [self.frames + 1, mean]
+        return np.concatenate([first, *self.added(sums, config), slopes, coefficients, covariance.ravel()])
 
-    def drifted(self, mean: float) -> Floats:
+    def drifted(self, mean: float, config: PosteriorConfig) -> Floats:
         """Pack into [SIZE] after a frame without anchors whose m_0 is ``mean``. The mean slopes revert, too."""
-        b, covariance = self.expected(mean)
-        slopes = (1 - self.config.reversion) * self.slopes
+        b, covariance = self.expected(mean, config)
+        slopes = (1 - config.reversion) * self.slopes
         return np.concatenate([[self.frames, mean], self.above, self.below, slopes, b, covariance.ravel()])
 
-    def expected(self, mean: float) -> tuple[Floats, Floats]:
+    def expected(self, mean: float, config: PosteriorConfig) -> tuple[Floats, Floats]:
         """Predict coefficients [4] and covariance [4, 4] for a frame whose m_0 is ``mean``.
 
         The constant follows a random walk from the last frame, which stops adding variance at the prior's. The slopes
-        revert to 0 and the variance before the first anchor: what anchors showed of one surface is no evidence of the
-        network's shape on another.
+        revert to the variance before the first anchor, that in log d to 0: what anchors showed of one surface is no
+        evidence of the network's shape on another. Those in u and v revert to their mean over the stream.
         """
         if not self.frames:
             return self.coefficients, self.covariance
-        T, (constant, *slopes) = np.eye(FEATURES), self.config.prior_variance
+        T, (constant, *slopes) = np.eye(FEATURES), config.prior_variance
         T[0, 1] = mean - self.mean
-        T[1:] *= 1 - self.config.reversion
+        T[1:] *= 1 - config.reversion
         transformed = T @ self.covariance @ T.T
-        grown = self.config.drift**2 * min(max(1 - transformed[0, 0] / constant, 0), 1)
-        added = (1 - (1 - self.config.reversion) ** 2) * np.array(slopes)
-        return T @ self.coefficients, transformed + np.diag([grown, *added])
-
-
-@functools.lru_cache(maxsize=4)  # a posterior has the same config in every frame
-def _priors(config: PosteriorConfig) -> tuple[tuple[str, ...], Floats]:
-    """Names of the ratios [R], and their values, weights, least and largest values [4, R]."""
-    priors = ratios(config)
-    return tuple(priors), np.array(list(priors.values())).T
+        grown = config.drift**2 * min(max(1 - transformed[0, 0] / constant, 0), 1)
+        added = (1 - (1 - config.reversion) ** 2) * np.array(slopes)
+        mean_slopes = config.reversion * self.slopes * [0, 1, 1]
+        return T @ self.coefficients + [0, *mean_slopes], transformed + np.diag([grown, *added])

@@ -1,24 +1,25 @@
-"""A frame's nodes and anchors, the field fitted to them, and the resulting variance (model: ``update``).
+"""A frame's nodes and anchors, the field fitted to them, and the parts of the resulting variance (numba; model:
+``update``).
 
 The nodes are cells of the image with links between neighbours. A link is weaker, the more the predicted depths of its
 two nodes differ: across a depth edge, the network may err by another factor.
+
+``config`` is the posterior's, as ``config.Constants``. Functions of one node or anchor take numbers.
 """
 
 from __future__ import annotations
 
-import functools
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.posterior.cells import features, local_variance, ranges
-from ufmstar_torch.posterior.config import PosteriorConfig
-from ufmstar_torch.posterior.field import Field, Observed, Prior, at, conditioned, distance
-from ufmstar_torch.posterior.moments import moments
-from ufmstar_torch.posterior.nodes import link, scale, spread
-from ufmstar_torch.posterior.running import Floats, Running
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, part
+from ufmstar_torch.posterior.cells import cell_means, highest_over_lowest
+from ufmstar_torch.posterior.field import Observed, Prior, at, conditioned, distance, invert
+from ufmstar_torch.posterior.nodes import windows_around
+from ufmstar_torch.posterior.running import FEATURES, Floats
 
 # Largest number of nodes in a row and in a column (the field's window allows 31 in a row).
 SIDE = 28
@@ -29,24 +30,14 @@ MOST_WRONG = 0.5
 
 
 class AnchorRows(NamedTuple):
-    """The N valid anchors of one stream.
-
-    Attributes:
-        pixel: [N, 2] position [px].
-        at_pixel: [N] index of the pixel in the flattened image.
-        predicted: [N] d at the pixel [m].
-        depth: [N] g [m].
-        variance: [N] of g [m^2].
-        motion: [M, 3] pixels (u, v) [px], and the log likelihood ratio of motion there; None = the anchors hold for
-            surfaces that move, too.
-    """
+    """N anchors of one stream, as in ``Anchors``, whose ``index`` is ``at_pixel``."""
 
     pixel: Floats
     at_pixel: NDArray[np.int64]
     predicted: Floats
     depth: Floats
     variance: Floats
-    motion: Floats | None = None
+    valid: NDArray[np.bool_]
 
 
 class Grid(NamedTuple):
@@ -70,19 +61,11 @@ class Grid(NamedTuple):
     far_right: Floats
     far_down: Floats
 
-    @classmethod
-    def of(cls, log_depth: Floats, rows: int, cols: int, config: PosteriorConfig) -> Grid:
-        """The links between cells of mean ``log_depth`` [R C]."""
-        links = np.empty((4, rows, cols))
-        link(log_depth.reshape(rows, cols), config.jump, config.link_variance, config.edge_variance, *links)
-        return cls(rows, cols, log_depth, float(log_depth.mean()), *links.reshape(4, -1))
-
 
 class Scene(NamedTuple):
-    """A frame's nodes and N anchors, before the fit.
+    """A frame's nodes and N valid anchors, before the fit.
 
     Attributes:
-        config: of the posterior.
         grid: the nodes.
         prior: of b and f.
         observed: the anchors.
@@ -92,7 +75,6 @@ class Scene(NamedTuple):
         by_area: [N] ``believed`` over the number of anchors in the cell.
     """
 
-    config: PosteriorConfig
     grid: Grid
     prior: Prior
     observed: Observed
@@ -100,12 +82,6 @@ class Scene(NamedTuple):
     noise: Floats
     believed: Floats
     by_area: Floats
-
-    def counted(self, values: Floats) -> Floats:
-        """[N] sums of ``values`` over the anchors of the same cell."""
-        node = self.observed.node
-        summed: Floats = np.bincount(node, values, len(self.grid.log_depth)).astype(np.float64)
-        return summed[node]
 
 
 class LeftOut(NamedTuple):
@@ -120,165 +96,218 @@ class LeftOut(NamedTuple):
     total: Floats
 
 
-def scene_of(
-    grid: Grid, depth: NDArray[Any], valid: NDArray[np.bool_], anchors: AnchorRows, running: Running
-) -> Scene:  # fmt: skip
-    """The nodes and anchors of a frame.
-
-    Args:
-        grid: of the frame.
-        depth: [H, W] d [m].
-        valid: [H, W].
-        anchors: of the frame.
-        running: up to the frame before.
-    """
-    (u, v), log_depth = ((anchors.pixel + 0.5) / depth.shape[::-1]).T.copy(), np.log(anchors.predicted)
-    column, row = ((x * n).astype(np.int64).clip(0, n - 1) for x, n in ((u, grid.cols), (v, grid.rows)))
-    x = features(log_depth - grid.mean, u, v)
-    observed = Observed(row * grid.cols + column, x, np.log(anchors.depth) - log_depth)
-    stated = running.ratios["noise"] * anchors.variance / anchors.depth**2
-    stated = stated + running.config.alone / max(len(stated), 1)
-    noise = stated + running.ratios["roughness"] + (ranges(depth, valid, anchors.at_pixel) / 2) ** 2
-    believed, count = 1 / (1 + noise / running.config.weak_sigma**2), np.bincount(observed.node)
-    by_area = believed / count[observed.node]
-    return Scene(running.config, grid, _prior(grid, running), observed, stated, noise, believed, by_area)
+@kernel
+def grid_of(logs, valid, rows, cols, config):
+    """The :class:`Grid` of log d [H, W], which is read where ``valid`` [H, W]."""
+    log_depth, n, total = cell_means(logs, valid, rows, cols), rows * cols, 0.0
+    right, down, far_right, far_down = (
+        empty(n, np.float64), empty(n, np.float64), empty(n, np.float64), empty(n, np.float64),
+    )  # fmt: skip
+    for i in range(n):
+        total += log_depth[i]
+        edge = config.jump * abs(log_depth[i + 1] - log_depth[i]) if (i + 1) % cols else np.inf
+        right[i], far_right[i] = config.link_variance + config.edge_variance * edge * edge, 1 / cols + edge
+        edge = config.jump * abs(log_depth[i + cols] - log_depth[i]) if i + cols < n else np.inf
+        down[i], far_down[i] = config.link_variance + config.edge_variance * edge * edge, 1 / rows + edge
+    return Grid(rows, cols, log_depth, total / n, right, down, far_right, far_down)
 
 
-def _prior(grid: Grid, running: Running) -> Prior:
-    """The prior of b and f in the next frame."""
-    mean, covariance = running.expected(grid.mean)
-    amplitude = running.ratios["amplitude"]
-    diagonal = np.full(len(grid.log_depth), running.config.precision / amplitude)
-    right, down = 1 / (grid.right * amplitude), 1 / (grid.down * amplitude)
-    precision: Floats = np.linalg.inv(covariance).astype(np.float64)
-    return Prior(diagonal, right, down, mean, precision, grid.cols)
+@leaf
+def features(log_depth, u, v, x, k):
+    """Write the features ``x[k]`` for log d - m_0 at u and v from 0 to 1: 1, log d - m_0, u and v from -1 to 1."""
+    x[k, 0], x[k, 1], x[k, 2], x[k, 3] = 1.0, log_depth, 2 * u - 1, 2 * v - 1
 
 
-def fitted(scene: Scene) -> tuple[Field, LeftOut, Floats]:
-    """The field with robust weights, its leave-one-out predictions, and the anchors' weights [N]."""
-    first, left_out = _with_weights(scene, 1 / scene.noise)
-    excess = np.maximum(left_out.residual**2 - left_out.total, 0) / (scene.config.degrees_of_freedom + 1)
-    weight = 1 / (scene.noise + excess)
-    return *_with_weights(scene._replace(prior=_loosened(scene, first)), weight), weight
+@part
+def _scene_of(grid, depth, valid, anchors, ratios, expected, config):
+    """The :class:`Scene` of the :class:`AnchorRows` of a frame of depth d [H, W] [m]. ``ratios`` and ``expected``
+    (``Running.expected``) are those of the frames before."""
+    N, k, n = 0, 0, grid.log_depth.size
+    for i in range(anchors.valid.size):
+        N += anchors.valid[i]
+    node, x, y = empty(N, np.int64), empty((N, FEATURES), np.float64), empty(N, np.float64)
+    stated, noise, believed, by_area = (
+        empty(N, np.float64), empty(N, np.float64), empty(N, np.float64), empty(N, np.float64),
+    )  # fmt: skip
+    for i in range(anchors.valid.size):
+        if not anchors.valid[i]:
+            continue
+        u, v = (anchors.pixel[i, 0] + 0.5) / depth.shape[1], (anchors.pixel[i, 1] + 0.5) / depth.shape[0]
+        column, row = min(max(int(u * grid.cols), 0), grid.cols - 1), min(max(int(v * grid.rows), 0), grid.rows - 1)
+        node[k], log_depth, g = row * grid.cols + column, math.log(anchors.predicted[i]), anchors.depth[i]
+        features(log_depth - grid.mean, u, v, x, k)
+        y[k] = math.log(g) - log_depth
+        stated[k] = ratios.noise * anchors.variance[i] / (g * g) + config.alone / N
+        blur = math.log(highest_over_lowest(depth, valid, anchors.at_pixel[i])) / 2
+        noise[k] = stated[k] + ratios.roughness + blur * blur
+        believed[k] = by_area[k] = 1 / (1 + noise[k] / config.weak_sigma**2)
+        k += 1
+    count = counts(node, n)
+    for k in range(N):
+        by_area[k] /= count[node[k]]
+    return Scene(grid, _prior(grid, ratios, expected, config), Observed(node, x, y), stated, noise, believed, by_area)
 
 
-def _loosened(scene: Scene, field: Field) -> Prior:
-    """The prior with Student-t weights on the links: a link across a jump of ``field`` is weaker."""
-    nu, grid, prior = scene.config.degrees_of_freedom, scene.grid, scene.prior
-    f = field.offset.reshape(grid.rows, grid.cols)
-    right, down = np.diff(f, axis=1, append=f[:, -1:]).ravel(), np.diff(f, axis=0, append=f[-1:]).ravel()
-    right, down = (w * (nu + 1) / (nu + w * x**2) for w, x in ((prior.right, right), (prior.down, down)))
-    return prior._replace(right=right, down=down)
+@part
+def counts(node, n):
+    """[n] number of anchors at every node, for the nodes [N] of anchors."""
+    count = empty(n, np.float64)
+    for i in range(n):
+        count[i] = 0.0
+    for k in range(node.size):
+        count[node[k]] += 1
+    return count
 
 
-def _with_weights(scene: Scene, weight: Floats) -> tuple[Field, LeftOut]:
+@part
+def _prior(grid, ratios, expected, config):
+    """The prior of b and f."""
+    mean, precision = expected
+    right, down = empty(grid.right.size, np.float64), empty(grid.down.size, np.float64)
+    for i in range(right.size):
+        right[i], down[i] = 1 / (grid.right[i] * ratios.amplitude), 1 / (grid.down[i] * ratios.amplitude)
+    invert(precision)
+    return Prior(config.precision / ratios.amplitude, right, down, mean, precision, grid.cols)
+
+
+@part
+def fitted(grid, depth, valid, anchors, ratios, expected, config):
+    """The :class:`Scene`; the field with robust weights; its :class:`LeftOut`; the anchors' weights [N]; and the
+    distance of every node from evidence [n]. Arguments of :func:`_scene_of`; the covariance in ``expected`` is
+    overwritten."""
+    scene = _scene_of(grid, depth, valid, anchors, ratios, expected, config)
+    weight, evidence = empty(scene.noise.size, np.float64), empty(scene.noise.size, np.bool_)
+    for k in range(weight.size):
+        weight[k] = 1 / scene.noise[k]
+    first, left_out = _with_weights(scene, scene.prior, weight)
+    for k in range(weight.size):
+        excess = max(left_out.residual[k] ** 2 - left_out.total[k], 0.0) / (config.degrees_of_freedom + 1)
+        weight[k] = 1 / (scene.noise[k] + excess)
+        evidence[k] = weight[k] * config.weak_sigma**2 >= 1
+    field, left_out = _with_weights(scene, _loosened(scene.prior, first.offset, config), weight)
+    return scene, field, left_out, weight, away_from(grid, scene.observed.node, evidence, config)
+
+
+@part
+def _loosened(prior, f, config):
+    """The prior with Student-t weights on the links: a link across a jump of the field's mean ``f`` is weaker."""
+    nu, right, down = config.degrees_of_freedom, empty(f.size, np.float64), empty(f.size, np.float64)
+    for i in range(f.size):
+        x = f[i + 1] - f[i] if (i + 1) % prior.cols else 0.0
+        right[i] = prior.right[i] * (nu + 1) / (nu + prior.right[i] * x * x)
+        x = f[i + prior.cols] - f[i] if i + prior.cols < f.size else 0.0
+        down[i] = prior.down[i] * (nu + 1) / (nu + prior.down[i] * x * x)
+    return Prior(prior.diagonal, right, down, prior.mean, prior.precision, prior.cols)
+
+
+@part
+def _with_weights(scene, prior, weight):
     """The field for anchors of precision ``weight`` [N]."""
-    field = conditioned(scene.prior, scene.observed, weight)
-    mean, variance = at(field, scene.observed.node, scene.observed.features)
-    divisor = np.maximum(1 - weight * variance, LEAST_LEFT)
-    return field, LeftOut((scene.observed.value - mean) / divisor, variance / divisor + scene.noise)
+    field, observed = conditioned(prior, scene.observed, weight), scene.observed
+    residual, total = empty(weight.size, np.float64), empty(weight.size, np.float64)
+    for k in range(weight.size):
+        mean, variance = at(field, observed.node[k], observed.features, k)
+        divisor = max(1 - weight[k] * variance, LEAST_LEFT)
+        residual[k], total[k] = (observed.value[k] - mean) / divisor, variance / divisor + scene.noise[k]
+    return field, LeftOut(residual, total)
 
 
-def spread_around(scene: Scene, used: NDArray[np.bool_], mean: float) -> Floats:
+@part
+def away_from(grid, node, evidence, config):
+    """[n] geodesic distance of every node from the anchors of the mask ``evidence`` [N] at nodes [N], in image
+    widths."""
+    source = empty(grid.log_depth.size, np.bool_)
+    for i in range(source.size):
+        source[i] = False
+    for k in range(node.size):
+        if evidence[k]:
+            source[node[k]] = True
+    return distance(source, grid.far_right, grid.far_down, grid.cols, config.reach)
+
+
+@part
+def spread_around(scene, used, mean, config):
     """[n] variance of y around every node, over the anchors of the mask ``used`` [N], weighted ``by_area`` and by a
     Gaussian window, and one virtual anchor of the prior variance about ``mean``."""
-    out, grid = np.empty(len(scene.grid.log_depth)), scene.grid
-    windows = (_window(count, scene.config.radius) for count in (grid.rows, grid.cols))
-    observed, prior = scene.observed, scene.config.prior_sigma**2
-    spread(observed.node, scene.by_area, used, observed.value, *windows, mean, prior, out)
-    return out
+    y, rows = scene.observed.value, empty((3, used.size), np.float64)
+    for k in range(used.size):
+        weight = scene.by_area[k] if used[k] else 0.0
+        rows[0, k], rows[1, k], rows[2, k] = weight, weight * y[k], weight * y[k] * y[k]
+    sums, around = windows_around(scene, rows, config.radius), empty(scene.grid.log_depth.size, np.float64)
+    for i in range(around.size):
+        total = sums[0, i] + 1
+        middle = (sums[1, i] + mean) / total
+        around[i] = max((sums[2, i] + mean * mean + config.prior_sigma**2) / total - middle * middle, 0.0)
+    return around
 
 
-def local_scale(scene: Scene, left_out: LeftOut, used: NDArray[np.bool_]) -> Floats:
+@part
+def local_scale(scene, left_out, used, config):
     """[n] factor by which errors around every node exceed the field's prediction: the mean leave-one-out z^2 of the
     anchors of the mask ``used`` [N] and of one virtual anchor with z^2 = 1. Gaussian windows and weights as in
     :func:`spread_around`."""
-    out, grid = np.empty(len(scene.grid.log_depth)), scene.grid
-    windows = (_window(count, scene.config.near) for count in (grid.rows, grid.cols))
-    scale(scene.observed.node, scene.by_area, used, *left_out, scene.config.clip, *windows, out)
-    return out
+    rows, scale = empty((2, used.size), np.float64), empty(scene.grid.log_depth.size, np.float64)
+    for k in range(used.size):
+        weight = scene.by_area[k] if used[k] else 0.0
+        rows[0, k] = weight
+        rows[1, k] = weight * min(left_out.residual[k] ** 2 / left_out.total[k], config.clip)
+    sums = windows_around(scene, rows, config.near)
+    for i in range(scale.size):
+        scale[i] = (sums[1, i] + 1) / (sums[0, i] + 1)
+    return scale
 
 
-@functools.lru_cache(maxsize=8)  # two widths; the sizes of the grid hardly change
-def _window(count: int, width: float) -> Floats:
-    """[count, count] Gaussian weights between the rows, or columns, of nodes."""
-    position = np.arange(count) / count
-    return np.exp(-(((position[:, None] - position) / width) ** 2) / 2)
+@leaf
+def wrong_factor(config, away, scale):
+    """Factor on ``wrong``: the local ``scale`` of errors at the evidence, 1 from the distance ``radius`` on; ``away``
+    is the distance."""
+    return scale ** max(1 - away / config.radius, 0.0)
 
 
-def wrong_factor(config: PosteriorConfig, away: Floats, scale: Floats) -> Floats:
-    """[n] factor on ``wrong``: the local ``scale`` [n] of errors at the evidence, 1 from the distance ``radius`` on;
-    ``away`` [n] is the distance."""
-    factor: Floats = scale ** np.maximum(1 - away / config.radius, 0)
-    return factor
+@leaf
+def slopes_away(config, x, k, away, slopes):
+    """Change of y at features ``x[k]`` and the distance ``away`` from evidence, where the mean slopes of the stream
+    replace those of the frame: what its anchors show is no evidence far from them. ``slopes`` [3] are the mean ones
+    less the frame's."""
+    change = 0.0
+    for f in range(slopes.size):
+        change += x[k, 1 + f] * slopes[f]
+    return away * away / (away * away + config.slope_reach**2) * change
 
 
-def slopes_away(config: PosteriorConfig, x: Floats, away: Floats, slopes: Floats, mean: Floats) -> Floats:
-    """[n] change of y at nodes with features ``x`` [n, 4] and distances ``away`` [n] from evidence, where the ``mean``
-    slopes [3] of the stream replace those of the frame: what its anchors show is no evidence far from them."""
-    share = away**2 / (away**2 + config.slope_reach**2)
-    change: Floats = share * (x[:, 1:] @ (mean - slopes))
-    return change
-
-
-def unmeasured(config: PosteriorConfig, variance: float) -> float:
+@leaf
+def unmeasured(config, variance):
     """Share in [0, 1] of the prior that is left: the squared share of the ``variance`` of b's constant in that before
     the first anchor."""
     return min(variance / config.prior_sigma**2, 1.0) ** 2
 
 
-def misscaled(config: PosteriorConfig, share: float, p: Floats, wide: Floats) -> tuple[Floats, Floats]:
-    """The probabilities [n] of another surface and the variances [n] of y there, raised towards ``misscaled`` and
-    ``widest`` by the ``share`` that is ``unmeasured``."""
-    return p + share * np.maximum(config.misscaled - p, 0), wide + share * (config.widest - wide)
+@leaf
+def misscaled(config, share, p, wide):
+    """The probability of another surface and the variance of y there, raised towards ``misscaled`` and ``widest`` by
+    the ``share`` that is ``unmeasured``."""
+    return p + share * max(config.misscaled - p, 0.0), wide + share * (config.widest - wide)
 
 
-def inlier_factor(running: Running, away: Floats) -> Floats:
-    """[n] factor on the variance of y on the evidence's surface, at distances ``away`` [n]: ``inlier`` at the evidence,
-    1 from a disc's diameter on. Held-out anchors are no farther from the others."""
-    factor: Floats = 1 + (running.ratios["inlier"] - 1) * np.maximum(1 - away / (2 * running.config.radius), 0)
-    return factor
+@leaf
+def inlier_factor(config, ratios, away):
+    """Factor on the variance of y on the evidence's surface, at the distance ``away``: ``inlier`` at the evidence, 1
+    from a disc's diameter on. Held-out anchors are no farther from the others."""
+    return 1 + (ratios.inlier - 1) * max(1 - away / (2 * config.radius), 0.0)
 
 
-def steepness(grid: Grid, f: Floats) -> Floats:
-    """[n] variance of the field's mean ``f`` [n] over a node and its eight neighbours: the grid locates a depth edge,
-    where y changes, to one node only."""
-    return local_variance(f.reshape(grid.rows, grid.cols)).ravel()
-
-
-def elsewhere_variance(config: PosteriorConfig, around: Floats, unseen: Floats) -> Floats:
+@leaf
+def elsewhere_variance(config, around, unseen):
     """Variance of y on another surface than the evidence's: the variance ``around`` of the anchors' y plus
     ``elsewhere`` times the variance ``unseen`` from the distance; at most ``widest``."""
-    return np.minimum(around + config.elsewhere * unseen, config.widest)
+    return min(around + config.elsewhere * unseen, config.widest)
 
 
-def at_pixels(
-    config: PosteriorConfig, factor: Floats, field: Floats, roughness: float, unseen: Floats, steep: Floats,
-    share: float = 0.0,
-) -> Floats:  # fmt: skip
+@leaf
+def at_pixels(config, factor, field, roughness, unseen, steep, share):
     """Variance of y at pixels on the evidence's surface, before the local scale: the parts that held-out anchors show,
     times factors from anchors to pixels. ``factor`` is h; the ``share`` that is ``unmeasured`` of the field's variance
     has no factor."""
     of_field = config.pixel_field + (1 - config.pixel_field) * share
     parts = of_field * field + config.pixel_roughness * roughness + config.pixel_unseen * unseen
     return factor * parts + config.pixel_steepness * steep
-
-
-def second_moments(
-    config: PosteriorConfig, variance: Floats, p: Floats, offset: Floats, wide: Floats
-) -> tuple[Floats, Floats]:  # fmt: skip
-    """Variances over the squared depth: in total, and if the local correction holds. With probability ``p`` the local
-    correction ``offset`` does not hold, and y has the variance ``wide`` instead of ``variance``. All arguments are
-    [n]."""
-    limit = math.log(config.farthest)
-    total, inlier = np.empty((2, len(variance)))
-    moments(variance, p, offset, wide, limit, config.widest, total, inlier)
-    return total, inlier
-
-
-def away_from(scene: Scene, evidence: NDArray[np.bool_]) -> Floats:
-    """[n] geodesic distance of every node from the anchors of the mask ``evidence`` [N], in image widths."""
-    grid = scene.grid
-    source = np.zeros(len(grid.log_depth), np.bool_)
-    source[scene.observed.node[evidence]] = True
-    return distance(source, grid.far_right, grid.far_down, grid.cols, scene.config.reach)

@@ -4,10 +4,11 @@ At an anchor of depth g the network's error is y = log(g/d). Its model over the 
 
     y = b . (1, log d - m_0, u, v) + f.
 
-b's constant follows a random walk from frame to frame; its slopes revert to 0, so that without evidence the depth fades
-to the network's shape at the stream's scale. At the distance a from evidence the slopes are those of the frame and the
-mean slopes of the stream (``running``), with the shares l^2/(a^2 + l^2) and a^2/(a^2 + l^2), l = ``slope_reach``: in a
-turn, anchors at one side of the image are no evidence of the network's shape at the other.
+b's constant follows a random walk from frame to frame. The slope in log d reverts to 0, those in u and v to their means
+over the stream, so that without evidence the depth fades to the network's shape at the stream's scale. At the distance
+a from evidence the slopes are those of the frame and the mean slopes of the stream (``running``), with the shares
+l^2/(a^2 + l^2) and a^2/(a^2 + l^2), l = ``slope_reach``: in a turn, anchors at one side of the image are no evidence of
+the network's shape at the other.
 
 f is a Gaussian field on a grid whose links are weaker across edges of the predicted depth (``scene``, ``field``). An
 anchor of standard deviation s observes y with the variance
@@ -38,7 +39,7 @@ Variance over the squared depth at a node, with share = min(1, distance/reach):
   not count: without this limit, errors that never occur would decide the variance. The output ``inlier`` is m(v), at
   most its 70 % quantile over the image.
 - p is the probability that the depth is of another surface than its evidence. Where the inliers' variance exceeds the
-  usual one of the image, a larger output ``outlier`` stands for the difference (``distribution.divided``).
+  usual one of the image, a larger output ``outlier`` stands for the difference (``moments.divide``).
 - The ratios include the held-out anchors of this frame.
 
 Before the first anchor the network may be off by any factor. The squared share of the variance of b's constant in that
@@ -76,38 +77,41 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.special import ndtri
 
-from ufmstar_torch.frames.frame import AnchorInput, FrameInput
+from ufmstar_torch.anchors.anchors import Anchors
+from ufmstar_torch.frames.frame import FrameInput
+from ufmstar_torch.kernels.compile_cpu import empty, kernel
 from ufmstar_torch.kernels.cpu.calls import array, each
-from ufmstar_torch.posterior.cells import cell_means, features, read
-from ufmstar_torch.posterior.config import PosteriorConfig
-from ufmstar_torch.posterior.distribution import divided
+from ufmstar_torch.posterior.cells import finish, interpolate, steepness
+from ufmstar_torch.posterior.config import PosteriorConfig, constants
+from ufmstar_torch.posterior.conformal import image_weights
+from ufmstar_torch.posterior.distribution import TAIL
 from ufmstar_torch.posterior.field import at
-from ufmstar_torch.posterior.learn import learnt
+from ufmstar_torch.posterior.learn import sums_of
+from ufmstar_torch.posterior.moments import divide, second_moments
 from ufmstar_torch.posterior.motion import in_image, probability, surfaces, tests_at
-from ufmstar_torch.posterior.running import Floats, Running
+from ufmstar_torch.posterior.running import BETWEEN, CENTRE, FEATURES, Floats, Running
 from ufmstar_torch.posterior.scene import (
     MOST_WRONG,
     SIDE,
     AnchorRows,
-    Grid,
     at_pixels,
-    away_from,
     elsewhere_variance,
+    features,
     fitted,
+    grid_of,
     inlier_factor,
     local_scale,
     misscaled,
-    scene_of,
-    second_moments,
     slopes_away,
     spread_around,
-    steepness,
     unmeasured,
     wrong_factor,
 )
 
-_NONE = AnchorRows(np.empty((0, 2)), np.empty(0, np.int64), *(np.empty(0) for _ in range(3)))
+_EMPTY = np.empty(0)
+_NONE = AnchorRows(np.empty((0, 2)), np.empty(0, np.int64), _EMPTY, _EMPTY, _EMPTY, np.empty(0, np.bool_))
 
 
 @dataclass(frozen=True)
@@ -116,7 +120,8 @@ class Posterior:
 
     Attributes:
         depth: [B, H, W] [m]; as predicted before the first anchor. NaN where not valid.
-        variance: [B, H, W] [m^2]; UfM*'s in a stream without anchors.
+        variance: [B, H, W] [m^2]; UfM*'s in a stream without anchors. With the errors that all anchors of the frame
+            share; where most anchors are off by a factor over 100, with their mean squared error.
         calibration: [B] running mean z^2 of held-out anchors: 1 = as predicted, above = too certain; NaN before any.
         unseen: [B] variance of y per image width of distance from evidence.
         outlier: [B, H, W] probability in [0, 1] that the error is not one of the inliers: the pixel lies on another
@@ -135,8 +140,9 @@ class Posterior:
 
 
 def update(
-    packed: Tensor, frame: FrameInput, anchors: AnchorInput | None, claimed: Tensor, config: PosteriorConfig
-) -> tuple[Tensor, Posterior]:
+    packed: Tensor, frame: FrameInput, anchors: Anchors | None, claimed: Tensor, config: PosteriorConfig,
+    floor: float = 0.0,
+) -> tuple[Tensor, Posterior]:  # fmt: skip
     """Process a frame of B streams, one after the other, on the CPU.
 
     Args:
@@ -145,6 +151,7 @@ def update(
         anchors: of the frame, or None.
         claimed: [B, H, W] V of UfM* without B [m^2], NaN where not valid.
         config: the constants.
+        floor: least variance [m^2], before the errors that the anchors share.
 
     Returns:
         The memory after this frame, and the posterior, on the frame's device. Without a valid anchor, a stream learns
@@ -153,78 +160,147 @@ def update(
     device = frame.depth.device
     if device.type == "meta":
         return packed, Posterior(frame.depth, claimed, packed[:, 0], packed[:, 0], frame.depth, claimed)
-    maps = [array(x) for x in (packed, frame.depth, frame.valid, claimed)]
-    streams = zip(*maps, _anchors(anchors, len(packed)), strict=True)
-    results = each(functools.partial(_of_stream, config), list(streams))
-    memory, depth, variance, outlier, inlier = (np.stack([result[i] for result in results]) for i in range(5))
-    memories = [result[5] for result in results]
-    calibration = [one.ratios["calibration"] if one.below[-1] > 0 else np.nan for one in memories]
-    unseen = [one.ratios["unseen"] for one in memories]
-    names = ("depth", "variance", "outlier", "inlier", "calibration", "unseen")
-    arrays = depth, variance, outlier, inlier, np.array(calibration), np.array(unseen)
-    scores = tuple(torch.from_numpy(result[6]) for result in results)
-    outputs = {name: torch.from_numpy(x).to(device) for name, x in zip(names, arrays, strict=True)}
-    return torch.from_numpy(memory).to(device), Posterior(**outputs, scores=scores)
+    before, *maps = (array(x) for x in (packed, frame.depth, frame.valid, claimed))
+    after, outputs = before.copy(), np.empty((4, *maps[0].shape), maps[0].dtype)
+    common = _common(anchors, len(before), config)
+    streams = zip(before, after, *maps, _anchors(anchors, len(before)), common, outputs.swapaxes(0, 1), strict=True)
+    scores = each(functools.partial(_of_stream, config, floor), list(streams))
+    memories = [Running.of(one, config) for one in after]
+    calibration = [one.ratios.calibration if one.below[-1] > 0 else np.nan for one in memories]
+    unseen = [one.ratios.unseen for one in memories]
+    depth, variance, outlier, inlier = (torch.from_numpy(x).to(device) for x in outputs)
+    shown, growth = (torch.tensor(x, dtype=torch.float64, device=device) for x in (calibration, unseen))
+    found = Posterior(depth, variance, shown, growth, outlier, inlier, tuple(map(torch.from_numpy, scores)))
+    return torch.from_numpy(after).to(device), found
 
 
-def _anchors(anchors: AnchorInput | None, streams: int) -> list[AnchorRows | None]:
+def _anchors(anchors: Anchors | None, streams: int) -> list[tuple[AnchorRows, Floats | None] | None]:
+    """For each stream its anchors, and the tests of motion, None without any."""
     if anchors is None:
         return [None] * streams
-    fields = [array(x) for x in (anchors.pixel, anchors.index, anchors.predicted, anchors.depth, anchors.variance)]
-    used, motion = array(anchors.valid), None if anchors.motion is None else array(anchors.motion)
-    rows = [AnchorRows(*(x[b][used[b]] for x in fields)) for b in range(streams)]
-    return (
-        list(rows)
-        if motion is None
-        else [row._replace(motion=motion[b] if np.isfinite(motion[b]).any() else None) for b, row in enumerate(rows)]
-    )
+    fields = (anchors.pixel, anchors.index, anchors.predicted, anchors.depth, anchors.variance, anchors.mask)
+    motion = [None] * streams if anchors.motion is None else array(anchors.motion)
+    tested = [None if one is None or not np.isfinite(one).any() else one for one in motion]
+    return list(zip(map(AnchorRows, *map(array, fields)), tested, strict=True))
+
+
+def _common(anchors: Anchors | None, streams: int, config: PosteriorConfig) -> list[tuple[float, ...]]:
+    """For each stream the arguments of ``cells.finish``."""
+    columns = [[0.0] * streams] * 3
+    if anchors is not None:
+        shared = (anchors.shared, anchors.scale, anchors.contradiction)
+        columns = [none if x is None else x.tolist() for none, x in zip(columns, shared, strict=True)]
+    return [(*one, config.prior_sigma**2) for one in zip(*columns, strict=True)]
 
 
 def _of_stream(
-    config: PosteriorConfig, packed: Floats, depth: NDArray[Any], valid: NDArray[np.bool_], claimed: NDArray[Any],
-    anchor_rows: AnchorRows | None,
-) -> tuple[Floats, NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], Running, Floats]:  # fmt: skip
-    """The memory after the frame; depth, variance, probability of another surface and inlier variance; the unpacked
-    memory; and the scores."""
-    running, anchors = Running.of(packed, config), _NONE if anchor_rows is None else anchor_rows
-    has_valid = len(anchors.depth) > 0
-    if anchor_rows is None and not running.frames:
-        predicted = np.where(valid, depth, np.nan).astype(depth.dtype)
-        return packed, predicted, claimed, np.full_like(depth, np.nan), claimed, running, np.zeros((2, 0))
+    config: PosteriorConfig, floor: float, packed: Floats, after: Floats, depth: NDArray[Any],
+    valid: NDArray[np.bool_], claimed: NDArray[Any], found: tuple[AnchorRows, Floats | None] | None,
+    common: tuple[float, ...], outputs: NDArray[Any],
+) -> Floats:  # fmt: skip
+    """Write the memory after the frame, and depth, variance, probability of another surface and inlier variance
+    [4, H, W]; returns the scores."""
+    running, (anchors, motion) = Running.of(packed, config), (_NONE, None) if found is None else found
+    factor, variance, outlier, inlier = outputs
+    if found is None and not running.frames:
+        factor[:], variance[:], inlier[:], outlier[:] = np.where(valid, 1, np.nan), claimed, claimed, np.nan
+        finish(depth, factor, variance, inlier, common, floor)
+        return np.zeros((2, 0))
+    numbers, (rows, cols) = constants(config), (min(SIDE, n) for n in depth.shape)
     with np.errstate(all="ignore"):  # invalid pixels are not read
         logs = np.log(depth)
-    rows, cols = (min(SIDE, n) for n in depth.shape)
-    grid = Grid.of(cell_means(logs, valid, rows, cols), rows, cols, config)
-    scene = scene_of(grid, depth, valid, anchors, running)
-    field, left_out, weight = fitted(scene)
-    away = away_from(scene, weight * config.weak_sigma**2 >= 1)
-    scores, (c, of_surfaces) = np.zeros((2, 0)), surfaces(scene, field.coefficients, running)
-    if has_valid:
-        memory, scores = learnt(scene, field, weight, left_out, running, away, of_surfaces)
-    else:
-        memory = running.drifted(grid.mean) if running.frames and valid.any() else packed
-    node = np.arange(rows * cols)
-    x = features(grid.log_depth - grid.mean, (node % cols + 0.5) / cols, (node // cols + 0.5) / rows)
-    mean, variance = at(field, node, x)
-    b, updated = field.coefficients, Running.of(memory, config)
-    offset, all_anchors = mean - (x * b).sum(1), np.ones(len(scene.noise), np.bool_)
-    unseen = away * updated.ratios["unseen"]
-    steep = steepness(grid, field.offset)
-    share, factor = unmeasured(config, field.covariance[0, 0]), inlier_factor(updated, away)
-    variance = at_pixels(config, factor, variance, updated.ratios["roughness"], unseen, steep, share)
-    wide = elsewhere_variance(config, spread_around(scene, all_anchors, b[0]), unseen)
-    scale = local_scale(scene, left_out, all_anchors)
-    p = np.minimum(updated.ratios["wrong"] * wrong_factor(config, away, scale), MOST_WRONG)
-    p, wide = misscaled(config, share, p, wide)
-    variance, inlier = second_moments(config, scale * variance, p, offset, wide)
-    if anchors.motion is not None:
-        tests = tests_at(anchors.motion, depth.shape[0], depth.shape[1], rows, cols)
-        e = mean - c - in_image(x, b)
-        P = probability(e, grid.log_depth, away / config.reach, tests, updated.ratios["between"], (rows, cols))
-        one = np.ones_like(P)
-        p, variance = 1 - (1 - p) * (1 - P), (1 - P) * variance + P * second_moments(config, variance, one, e, wide)[0]
-    inlier, p = divided(variance, inlier, p)
-    offset = offset + slopes_away(config, x, away, b[1:], updated.slopes)
-    nodes = np.stack([grid.log_depth, offset, variance, inlier, p, away / config.reach], 1)
-    depth, spread, inlier, p = read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
-    return memory, depth, spread, p, inlier, updated, scores
+    grid = grid_of(logs, valid, rows, cols, numbers)
+    expected = running.expected(grid.mean, config)
+    of_frame = grid, depth, valid, anchors, running.ratios, expected, running.frames, numbers
+    scene, field, left_out, away, sums, (below, distance, area) = evidence_of(*of_frame)
+    scores, (c, of_surfaces) = np.zeros((2, 0)), surfaces(scene, field.coefficients, running, config)
+    if len(scene.noise):
+        sums[:, CENTRE], sums[:, BETWEEN] = of_surfaces["centre"], of_surfaces["between"]
+        after[:] = running.learnt(sums, grid.mean, field.coefficients, field.covariance, config)
+        z = ndtri(torch.from_numpy(below).clamp_(TAIL, 1 - TAIL)).abs_().numpy()
+        scores = np.stack([z, image_weights(distance, area, away)])
+    elif running.frames and valid.any():
+        after[:] = running.drifted(grid.mean, config)
+    updated = Running.of(after, config)
+    nodes, x, mean, wide = nodes_of(scene, field, left_out, away, updated.ratios, numbers)
+    P = e = np.zeros(rows * cols)
+    if motion is not None:
+        tests = tests_at(motion, depth.shape[0], depth.shape[1], rows, cols)
+        e = mean - c - in_image(x, field.coefficients)
+        P = probability(e, grid.log_depth, nodes[5], tests, updated.ratios.between, (rows, cols))
+    slopes = updated.slopes - field.coefficients[1:]
+    maps = depth, valid, logs, claimed
+    at_every_pixel(maps, nodes, x, wide, (e, P), away, slopes, field.coefficients, grid, numbers, outputs)
+    np.exp(factor, out=factor)
+    finish(depth, factor, variance, inlier, common, floor)
+    return scores
+
+
+@kernel
+def evidence_of(grid, depth, valid, anchors, ratios, expected, frames, config):
+    """A frame's anchors: the scene, the field, leave-one-out predictions, the distance of every node from evidence
+    (:func:`~ufmstar_torch.posterior.scene.fitted`); and the sums and scores of held-out anchors
+    (:func:`~ufmstar_torch.posterior.learn.sums_of`)."""
+    scene, field, left_out, weight, away = fitted(grid, depth, valid, anchors, ratios, expected, config)
+    sums, scores = sums_of(scene, weight, left_out, ratios, frames, config)
+    return scene, field, left_out, away, sums, scores
+
+
+@kernel
+def nodes_of(scene, field, left_out, away, ratios, config):
+    """The nodes of :func:`ufmstar_torch.posterior.cells.interpolate` without motion [6, n], their features [n, F], mean
+    of y [n], and its variance on another surface [n]."""
+    grid, b, n = scene.grid, field.coefficients, away.size
+    nodes, x = empty((6, n), np.float64), empty((n, FEATURES), np.float64)
+    means, wides, every = empty(n, np.float64), empty(n, np.float64), empty(scene.noise.size, np.bool_)
+    for k in range(every.size):
+        every[k] = True
+    around, scales = spread_around(scene, every, b[0], config), local_scale(scene, left_out, every, config)
+    steep, share = steepness(field.offset, grid.rows, grid.cols), unmeasured(config, field.covariance[0, 0])
+    for i in range(n):
+        row = i // grid.cols
+        features(
+            grid.log_depth[i] - grid.mean, (i - row * grid.cols + 0.5) / grid.cols, (row + 0.5) / grid.rows, x, i
+        )  # fmt: skip
+        mean, variance = at(field, i, x, i)
+        offset = mean
+        for f in range(FEATURES):
+            offset -= x[i, f] * b[f]
+        unseen, factor = away[i] * ratios.unseen, inlier_factor(config, ratios, away[i])
+        variance = at_pixels(config, factor, variance, ratios.roughness, unseen, steep[i], share)
+        p = min(ratios.wrong * wrong_factor(config, away[i], scales[i]), MOST_WRONG)
+        p, wide = misscaled(config, share, p, elsewhere_variance(config, around[i], unseen))
+        means[i], wides[i], nodes[0, i], nodes[1, i] = mean, wide, grid.log_depth[i], offset
+        nodes[2, i], nodes[3, i] = second_moments(config, scales[i] * variance, p, offset, wide)
+        nodes[4, i], nodes[5, i] = p, away[i] / config.reach
+    return nodes, x, means, wides
+
+
+@kernel
+def at_every_pixel(maps, nodes, x, wide, motion, away, slopes, b, grid, config, outputs):
+    """Add motion and the mean ``slopes`` [3] of the stream, less the frame's, to the ``nodes`` [6, n], and interpolate
+    them.
+
+    Args:
+        maps: depth, valid, log of the depth, claimed variance [H, W].
+        nodes, x, wide: from :func:`nodes_of`; the first changes.
+        motion: [n] e and probability P (``motion.probability``).
+        away: [n] distance from evidence.
+        slopes: [3].
+        b: [4] coefficients.
+        grid: of the nodes.
+        config: of the posterior.
+        outputs: [4, H, W] y, variance, probability and inlier variance (``cells.interpolate``).
+    """
+    e, P = motion
+    for i in range(away.size):
+        if P[i] > 0:
+            tail = second_moments(config, nodes[2, i], 1.0, e[i], wide[i])[0]
+            nodes[2, i] = (1 - P[i]) * nodes[2, i] + P[i] * tail
+            nodes[4, i] = 1 - (1 - nodes[4, i]) * (1 - P[i])
+        nodes[1, i] += slopes_away(config, x, i, away[i], slopes)
+    divide(nodes[2], nodes[3], nodes[4])
+    depth, valid, logs, claimed = maps
+    interpolate(
+        depth, valid, logs, claimed, nodes, b, grid, config, outputs[0], outputs[1], outputs[3], outputs[2]
+    )  # fmt: skip

@@ -77,11 +77,7 @@ class Checked:
         Raises:
             ValueError: an unknown key, a missing field without a default, or an invalid value.
         """
-        by_name = {f.name: f for f in fields(cls)}
-        if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
-            raise ValueError(f"values must be a mapping of {cls.__name__}'s fields by name, got {values!r:.60}")
-        if unknown := sorted(set(values) - set(by_name)):
-            raise ValueError(f"{cls.__name__} has no {unknown}; it has {list(by_name)}")
+        by_name = _named_fields(cls, values)
         needed = [n for n, f in by_name.items() if f.default is MISSING and f.default_factory is MISSING]
         if missing := [name for name in needed if name not in values]:
             raise ValueError(f"{cls.__name__} needs {missing}")
@@ -122,8 +118,7 @@ class Checked:
         Raises:
             ValueError: an unknown name, or an invalid value.
         """
-        if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
-            raise ValueError(f"values must be a mapping of {type(self).__name__}'s fields by name, got {values!r:.60}")
+        by_name = _named_fields(type(self), values, dotted=True)
         changes: dict[str, Any] = {}
         within: dict[str, dict[str, Any]] = {}
         for name, value in values.items():
@@ -132,9 +127,6 @@ class Checked:
                 within.setdefault(group, {})[field_name] = value
             else:
                 changes[name] = value
-        by_name = {f.name: f for f in fields(self)}
-        if unknown := sorted((changes.keys() | within.keys()) - by_name.keys()):
-            raise ValueError(f"{type(self).__name__} has no {unknown}; it has {list(by_name)}")
         for group, inner in within.items():
             kind = by_name[group].metadata.get("section")
             if kind is None:
@@ -147,6 +139,17 @@ class Checked:
         """The settings as plain nested values, ready for JSON."""
         sections = {f.name: value for f in fields(self) if isinstance(value := getattr(self, f.name), Checked)}
         return {**asdict(self), **{name: value.to_dict() for name, value in sections.items()}}
+
+
+def _named_fields(owner: type[Checked], values: object, *, dotted: bool = False) -> dict[str, Field[Any]]:
+    """The fields of settings by name. Raises ValueError unless ``values`` is a mapping of such names, which may be
+    ``dotted`` (SECTION.NAME)."""
+    if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
+        raise ValueError(f"values must be a mapping of {owner.__name__}'s fields by name, got {values!r:.60}")
+    by_name = {f.name: f for f in fields(owner)}
+    if unknown := sorted({name.partition(".")[0] if dotted else name for name in values} - by_name.keys()):
+        raise ValueError(f"{owner.__name__} has no {unknown}; it has {list(by_name)}")
+    return by_name
 
 
 def _rich(owner: type, name: str, value: Any) -> Any:

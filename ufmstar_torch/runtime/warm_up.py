@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.frames import arguments
 from ufmstar_torch.frames.arguments import require_whole
+from ufmstar_torch.gaussians.camera import camera_of
 
 _DISTANCE = 2.0  # [m]
 _WALL, _SQUARE = (96, 128), 4  # [px] images of a wall, and its squares, by one of which the camera moves
@@ -87,12 +87,6 @@ def require_size(size: tuple[int, int], streams: int) -> None:
     """Raise a TypeError or ValueError unless ``size`` is (H, W) and all three numbers are positive."""
     arguments.require_size("size", size)
     require_whole("streams", streams, 1)
-
-
-def camera_of(size: tuple[int, int]) -> Tensor:
-    """[3, 3] intrinsics [px] of a camera with images of ``size`` (H, W), 53 degrees wide."""
-    height, width = size
-    return torch.tensor([[float(width), 0, width / 2], [0, float(width), height / 2], [0, 0, 1]])
 
 
 def along_wall(evidence: LandmarkTracker | DenseEvidence) -> None:

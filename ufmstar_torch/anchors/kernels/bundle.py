@@ -1,4 +1,4 @@
-"""Normal equations of a bundle adjustment, inverse depths eliminated, for ``anchors.bundle``; on the CPU (numba).
+"""A bundle adjustment of a window of views, inverse depths eliminated, for ``anchors.bundle``; on the CPU (numba).
 
 View W is the newest. A track with the ray n in view W lies in view k at
 
@@ -9,11 +9,13 @@ up to scale. ``tests/oracle_bundle.py`` is the same in NumPy, its Jacobian by di
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.anchors.kernels.cholesky import factored, inverted, substituted
-from ufmstar_torch.kernels.compile_cpu import empty, reordered
+from ufmstar_torch.anchors.kernels.cholesky import factored, inverted, reduced, substituted
+from ufmstar_torch.kernels.compile_cpu import empty, leaf, reordered, reordered_leaf
 
 # Parameters of a pose's error: a rotation about the camera's axes [rad] and a shift along the world's [m].
 POSE = 6
@@ -21,139 +23,200 @@ POSE = 6
 FAR, NEAR = 0.02, 20.0
 # Least depth of a point in a view, over its depth in the newest view; nearer points are not used.
 _AHEAD = 1e-3
+# [px] Standard deviation of a position by tracking from one view to the next (.25 to .4 on recordings and tours).
+_TRACKING = 0.35
+# A corner's position v views ago has 1 + _DRIFT (v - 1) times the variance of its position one view ago.
+_DRIFT = 0.6
+# Information of a position as a share of that of an independent one: errors of neighbouring corners are correlated, and
+# so are those of a corner in several views. On tours .3 is best with noisy poses, .05 with a rolling shutter.
+_INFORMATION = 0.15
+# Degrees of freedom of a position's distribution; Gauss-Newton steps; earlier steps on inverse depths alone.
+_STUDENT, _STEPS, _DEPTH_STEPS = 4.0, 4, 6
+# [px^2] Least mean square of a jump, as shifts of a position.
+_SHIFT = 1.0
+# Least number of corners for a refinement.
+_ENOUGH = 8
 
 
-def inverse_depths(
-    ray: NDArray[np.float64], precision: NDArray[np.float64], T_world_cam: NDArray[np.float64],
-    prior: float, student: float, steps: int,
-) -> NDArray[np.float64]:  # fmt: skip
-    """[N] inverse depths by Gauss-Newton steps with fixed poses; arguments as :func:`equations`."""
-    rho = np.full(len(ray), prior)
-    rotation, translation = _between(T_world_cam)
-    _inverse_depths(ray, precision, rotation, translation, prior, student, steps, rho)
-    return rho
+class Refined(NamedTuple):
+    """Refined poses of W views.
+
+    Attributes:
+        poses: [W, 4, 4] camera-to-world [m].
+        error: [6 W] of the input poses, beyond the shift.
+        covariance: [6 W, 6 W] of ``error``.
+        depth_variance: [N] variance of the corners' inverse depths by it [1/m^2].
+    """
+
+    poses: NDArray[np.float64]
+    error: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    depth_variance: NDArray[np.float64]
 
 
-def equations(
-    ray: NDArray[np.float64], precision: NDArray[np.float64], T_world_cam: NDArray[np.float64],
-    rho: NDArray[np.float64], prior: float, student: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
-    """The tracks' part of the normal equations of a Gauss-Newton step.
+def position_variance(views: NDArray[np.int64]) -> NDArray[np.float64]:
+    """[N] variance of a corner's position, seen some ``views`` [N] before the newest [px^2]."""
+    return np.asarray(_TRACKING**2 * (1 + _DRIFT * (views - 1)))
+
+
+def refined(
+    pixel: NDArray[np.float64], seen: NDArray[np.bool_], T_world_cam: NDArray[np.float64], K: NDArray[np.float64],
+    depth: float, shift: NDArray[np.float64], prior: NDArray[np.float64], most: float,
+) -> tuple[Refined | None, float, bool]:  # fmt: skip
+    """Most likely poses of W views.
 
     Args:
-        ray: [N, W, 2] x and y of the tracks' positions on the plane at depth 1; the newest view is the last.
-        precision: [N, W-1] of a position in the earlier views; 0 where a view does not show the track.
-        T_world_cam: [W, 4, 4] camera-to-world [m].
-        rho: [N] inverse depths in the newest view [1/m].
-        prior: prior mean of ``rho`` [1/m]; its prior standard deviation is twice as large.
-        student: degrees of freedom of the positions' distribution.
+        pixel: [N, W, 2] positions (u, v) of corners; the newest view is the last.
+        seen: [N, W] bool, True where the view shows the corner.
+        T_world_cam: [W, 4, 4] input poses, camera-to-world [m].
+        K: [3, 3] [px].
+        depth: prior mean of the corners' depths [m]; the prior standard deviation of an inverse depth is 2/depth.
+        shift: [W, 6] by which the input poses are corrected first, see :func:`move`.
+        prior: [6 W] precision of the poses' errors.
+        most: score, chi-squared with six degrees of freedom, above which the newest pose starts another trajectory.
 
     Returns:
-        A [6 W, 6 W] and b [6 W] of A d = b for the errors d of the poses; h [N, 6 W] and
-        v [N]: a track's inverse depth changes by v - h d.
+        The poses, None where they cannot be refined; the score of the newest pose, NaN without one; whether the newest
+        pose starts another trajectory.
     """
-    n, views = precision.shape
-    size = POSE * (views + 1)
-    A, b, h, v = np.zeros((size, size)), np.zeros(size), np.zeros((n, size)), np.zeros(n)
-    rotation, translation = _between(T_world_cam)
-    to_view = np.ascontiguousarray(T_world_cam[:, :3, :3].transpose(0, 2, 1))
-    _equations(ray, precision, rotation, translation, to_view, rho, prior, student, A, b, h, v)
-    return A, b, h, v
-
-
-def moved(T_world_cam: NDArray[np.float64], error: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Poses [W, 4, 4] rotated about their own axes [rad] and shifted along the world's [m] by ``error`` [6 W]."""
-    result = T_world_cam.copy()
-    _move(error, result)
-    return result
-
-
-def adjusted(
-    ray: NDArray[np.float64], precision: NDArray[np.float64], T_world_cam: NDArray[np.float64],
-    rho: NDArray[np.float64], prior: float, student: float, first: tuple[NDArray[np.float64], ...],
-    pose_precision: NDArray[np.float64], information: float, steps: int,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]] | None:  # fmt: skip
-    """Gauss-Newton steps on poses and inverse depths.
-
-    Args:
-        ray, precision, T_world_cam, rho, prior, student: as :func:`equations`; poses and ``rho`` are overwritten.
-        first: A, b, h and v of :func:`equations` for the first step, which are overwritten by those of the last one.
-        pose_precision: [6 W] of the prior of the poses' errors, whose mean is 0.
-        information: factor on A and b.
-        steps: number of steps.
-
-    Returns:
-        The errors [6 W], their covariance [6 W, 6 W], and the variance [N] of ``rho`` by it. None where the equations
-        are singular.
-    """
-    error, covariance, by_poses = np.zeros(len(pose_precision)), np.zeros_like(first[0]), np.zeros(len(rho))
-    arguments = ray, precision, T_world_cam, rho, prior, student, *first, pose_precision, information, steps
-    fine = _adjust(*arguments, error, covariance, by_poses)
-    return (error, covariance, by_poses) if fine else None
+    views, poses = len(seen[0]), T_world_cam.copy()
+    error, covariance = np.zeros(POSE * views), np.zeros((POSE * views, POSE * views))
+    by_poses, score = np.zeros(len(pixel)), np.full(1, np.nan)
+    arguments = pixel, seen, poses, K, depth, shift.ravel(), prior, most
+    count = _refine(*arguments, error, covariance, by_poses, score)
+    fine = count > 0 and bool(np.isfinite(poses).all() and np.isfinite(covariance).all())
+    result = Refined(poses, error, covariance, by_poses[:count]) if fine else None
+    return result, float(score[0]), count < 0
 
 
 @reordered
-def _adjust(
-    ray, precision, poses, rho, prior, student, A, b, h, v, pose_precision, information, steps, error, covariance,
-    by_poses,
-):  # fmt: skip
-    views, size = len(poses), len(b)
-    rotation, translation, to_view = (
-        empty((views - 1, 3, 3), np.float64),
-        empty((views - 1, 3), np.float64),
-        empty((views, 3, 3), np.float64),
-    )
-    for step in range(steps):
+def _refine(pixel, seen, poses, K, depth, shift, prior, most, error, covariance, by_poses, score):
+    """Number of corners that refined the poses; 0 = they cannot be refined, -1 = the newest starts a trajectory."""
+    views = seen.shape[1]
+    ray, precision = empty((len(seen), views, 2), np.float64), empty((len(seen), views - 1), np.float64)
+    tracks = _tracks(pixel, seen, K, ray, precision)
+    if tracks < _ENOUGH:
+        return 0
+    size, start = POSE * views, 1 / depth
+    rotation, translation = empty((views - 1, 3, 3), np.float64), empty((views - 1, 3), np.float64)
+    to_view, rho, v = empty((views, 3, 3), np.float64), empty(tracks, np.float64), empty(tracks, np.float64)
+    A, b = empty((size, size), np.float64), empty(size, np.float64)
+    h, weighted = empty((tracks, size), np.float64), empty((tracks, size), np.float64)
+    derivative = empty((2, 2, POSE), np.float64)
+    block, other, x = empty((POSE, POSE), np.float64), empty((POSE, POSE), np.float64), empty(POSE, np.float64)
+    move(shift, poses)
+    between(poses, rotation, translation, to_view)
+    inverse_depths(ray, precision, rotation, translation, start, _STUDENT, _DEPTH_STEPS, rho)
+    for step in range(_STEPS):
         if step > 0:
-            for k in range(views):
-                for i in range(3):
-                    for j in range(3):
-                        to_view[k, i, j] = poses[k, j, i]
-            for k in range(views - 1):
-                for i in range(3):
-                    translation[k, i] = 0.0
-                    for j in range(3):
-                        translation[k, i] += poses[k, j, i] * (poses[views - 1, j, 3] - poses[k, j, 3])
-                        rotation[k, i, j] = 0.0
-                        for m in range(3):
-                            rotation[k, i, j] += poses[k, m, i] * poses[views - 1, m, j]
-            A[:], b[:], h[:], v[:] = 0.0, 0.0, 0.0, 0.0
-            _equations(ray, precision, rotation, translation, to_view, rho, prior, student, A, b, h, v)
+            between(poses, rotation, translation, to_view)
+        equations(
+            ray, precision, rotation, translation, to_view, rho, start, _STUDENT, A, b, h, v, weighted, derivative
+        )
         for i in range(size):
-            b[i] = information * b[i] - pose_precision[i] * error[i]
+            b[i] *= _INFORMATION
             for j in range(i + 1):
-                A[i, j] *= information
-            A[i, i] += pose_precision[i]
+                A[i, j] *= _INFORMATION
+        if step == 0:
+            square = _jump(A, b, prior, depth / K[0, 0], 1 / K[0, 0], block, other, x, score)
+            if square < 0:
+                return 0
+            if square > 3 * _SHIFT and score[0] > most:
+                return -1
+        for i in range(size):
+            b[i] -= prior[i] * error[i]
+            A[i, i] += prior[i]
         if not factored(A):
-            return False
+            return 0
         substituted(A, b)
-        _move(b, poses)
+        move(b, poses)
         for i in range(size):
             error[i] += b[i]
-        for n in range(len(rho)):
+        for n in range(tracks):
             change = v[n]
             for i in range(size):
                 change -= h[n, i] * b[i]
-            rho[n] = min(max(rho[n] + change, FAR * prior), NEAR * prior)
+            rho[n] = min(max(rho[n] + change, FAR * start), NEAR * start)
     inverted(A, covariance)
-    for n in range(len(rho)):
+    for n in range(tracks):
         for i in range(size):
             total = 0.0
             for j in range(size):
                 total += covariance[i, j] * h[n, j]
             by_poses[n] += total * h[n, i]
-    return True
+    return tracks
 
 
-def _between(T_world_cam: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """R_k^T R_W [W-1, 3, 3] and R_k^T (C_W - C_k) [W-1, 3]."""
-    R, C = T_world_cam[:, :3, :3], T_world_cam[:, :3, 3]
-    inverse = R[:-1].transpose(0, 2, 1)
-    return np.ascontiguousarray(inverse @ R[-1]), ((C[-1] - C[:-1])[:, None] @ R[:-1])[:, 0]
+@leaf
+def _tracks(pixel, seen, K, ray, precision):
+    """Write x and y on the plane at depth 1, and the precision in the earlier views, of the corners that the newest
+    view and another one show; return their number."""
+    views, tracks = seen.shape[1], 0
+    for n in range(len(seen)):
+        others = 0
+        for k in range(views - 1):
+            others += seen[n, k]
+        if not seen[n, views - 1] or others == 0:
+            continue
+        for k in range(views):
+            ray[tracks, k, 0] = (pixel[n, k, 0] - K[0, 2]) / K[0, 0]
+            ray[tracks, k, 1] = (pixel[n, k, 1] - K[1, 2]) / K[1, 1]
+            if k < views - 1:
+                full = (K[0, 0] / _TRACKING) ** 2 / (1 + _DRIFT * (views - 2 - k))
+                precision[tracks, k] = full if seen[n, k] else 0.0
+        tracks += 1
+    return tracks
 
 
-@reordered
-def _move(error, poses):
+@leaf
+def _jump(A, b, prior, metres, radians, block, other, x, score):
+    """Write the score of the newest pose's error, from its block of the equations A d = b, and return the sum of the
+    squares of the error's components, as shifts of a position [px^2]; -1 = singular."""
+    first = len(b) - POSE
+    for i in range(POSE):
+        for j in range(i + 1):
+            block[i, j] = block[j, i] = A[first + i, first + j]
+    for i in range(POSE):
+        x[i] = b[first + i]
+        for j in range(i + 1):  # earlier views have errors, too
+            other[i, j] = block[i, j]
+            for k in range(POSE):
+                other[i, j] += 2 * block[i, k] * block[k, j] / prior[first + k]
+    if not (factored(other) and factored(block)):
+        return -1.0
+    substituted(other, x)
+    total = square = 0.0
+    for i in range(POSE):
+        total += x[i] * b[first + i]
+        x[i] = b[first + i]
+    substituted(block, x)
+    for i in range(POSE):
+        square += (x[i] / (radians if i < 3 else metres)) ** 2
+    score[0] = total
+    return square
+
+
+@reordered_leaf
+def between(poses, rotation, translation, to_view):
+    """Write R_k^T R_W [W-1, 3, 3], R_k^T (C_W - C_k) [W-1, 3] and R_k^T [W, 3, 3] of poses [W, 4, 4]."""
+    last = len(poses) - 1
+    for k in range(last + 1):
+        for i in range(3):
+            for j in range(3):
+                to_view[k, i, j] = poses[k, j, i]
+    for k in range(last):
+        for i in range(3):
+            translation[k, i] = 0.0
+            for j in range(3):
+                translation[k, i] += poses[k, j, i] * (poses[last, j, 3] - poses[k, j, 3])
+                rotation[k, i, j] = 0.0
+                for m in range(3):
+                    rotation[k, i, j] += poses[k, m, i] * poses[last, m, j]
+
+
+@reordered_leaf
+def move(error, poses):
+    """Rotate poses [W, 4, 4] about their own axes [rad] and shift them along the world's [m] by ``error`` [6 W]."""
     for k in range(len(poses)):
         x, y, z = error[POSE * k], error[POSE * k + 1], error[POSE * k + 2]
         half = 0.5 * np.sqrt(x * x + y * y + z * z)
@@ -168,10 +231,13 @@ def _move(error, poses):
             poses[k, i, 3] += error[POSE * k + 3 + i]
 
 
-@reordered
-def _inverse_depths(ray, precision, rotation, translation, prior, student, steps, rho):
-    for n in range(len(ray)):
-        x, y = ray[n, -1, 0], ray[n, -1, 1]
+@reordered_leaf
+def inverse_depths(ray, precision, rotation, translation, prior, student, steps, rho):
+    """Write the inverse depths [N] by Gauss-Newton steps with fixed poses; arguments as :func:`equations`."""
+    last = precision.shape[1]
+    for n in range(len(rho)):
+        rho[n] = prior
+        x, y = ray[n, last, 0], ray[n, last, 1]
         for _ in range(steps):
             weight = 0.25 / (prior * prior)
             above = weight * (prior - rho[n])
@@ -193,15 +259,35 @@ def _inverse_depths(ray, precision, rotation, translation, prior, student, steps
             rho[n] = min(max(rho[n] + above / weight, FAR * prior), NEAR * prior)
 
 
-@reordered
-def _equations(ray, precision, rotation, translation, to_view, rho, prior, student, A, b, h, v):
-    views = precision.shape[1]
+@reordered_leaf
+def equations(
+    ray, precision, rotation, translation, to_view, rho, prior, student, A, b, h, v, weighted, derivative,
+):  # fmt: skip
+    """The tracks' part of the normal equations of a Gauss-Newton step.
+
+    Args:
+        ray: [N, W, 2] x and y of the tracks' positions on the plane at depth 1; the newest view is the last.
+        precision: [N, W-1] of a position in the earlier views; 0 where a view does not show the track.
+        rotation, translation, to_view: see :func:`between`.
+        rho: [N] inverse depths in the newest view [1/m].
+        prior: prior mean of ``rho`` [1/m]; its prior standard deviation is twice as large.
+        student: degrees of freedom of the positions' distribution.
+        A, b: overwritten, the lower triangle of A [6 W, 6 W] and b [6 W] of A d = b for the errors d of the poses.
+        h, v: overwritten, [N, 6 W] and [N]: a track's inverse depth changes by v - h d.
+        weighted, derivative: buffers, [N, 6 W] and [2, 2, 6].
+    """
+    views, tracks = precision.shape[1], len(rho)
     last = POSE * views
     # Derivatives of u and v (rows) by the newest pose and by view k's.
-    J, J_k, weighted = empty((2, POSE), np.float64), empty((2, POSE), np.float64), empty(h.shape, np.float64)
-    for n in range(len(ray)):
-        x, y = ray[n, -1, 0], ray[n, -1, 1]
-        row = h[n]
+    J, J_k = derivative[0], derivative[1]
+    for i in range(last + POSE):
+        b[i] = 0.0
+        for j in range(i + 1):
+            A[i, j] = 0.0
+    for n in range(tracks):
+        x, y = ray[n, views, 0], ray[n, views, 1]
+        for i in range(last + POSE):
+            weighted[n, i] = 0.0
         total = 0.25 / (prior * prior)
         above = total * (prior - rho[n])
         for k in range(views):
@@ -233,8 +319,8 @@ def _equations(ray, precision, rotation, translation, to_view, rho, prior, stude
             for c in range(POSE):
                 newest_u, newest_v = p * J[0, c], p * J[1, c]
                 k_u, k_v = p * J_k[0, c], p * J_k[1, c]
-                row[last + c] += newest_u * du + newest_v * dv
-                row[first + c] += k_u * du + k_v * dv
+                weighted[n, last + c] += newest_u * du + newest_v * dv
+                weighted[n, first + c] += k_u * du + k_v * dv
                 b[last + c] += newest_u * right + newest_v * down
                 b[first + c] += k_u * right + k_v * down
                 for d in range(POSE):
@@ -243,10 +329,7 @@ def _equations(ray, precision, rotation, translation, to_view, rho, prior, stude
                     A[last + c, last + d] += newest_u * J[0, d] + newest_v * J[1, d]
                     A[first + c, first + d] += k_u * J_k[0, d] + k_v * J_k[1, d]
         v[n] = above / total
-        weighted[n] = row
-        row /= total
-    for c in range(last + POSE):
-        for d in range(c):
-            A[d, c] = A[c, d]
-    A -= weighted.T @ h
-    b -= weighted.T @ v
+        for i in range(last + POSE):
+            h[n, i] = weighted[n, i] / total
+            b[i] -= weighted[n, i] * v[n]
+    reduced(A, weighted, h)

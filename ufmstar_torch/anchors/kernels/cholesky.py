@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import reordered
+from ufmstar_torch.kernels.compile_cpu import reordered_leaf
 
 
-@reordered
+@reordered_leaf
 def factored(A):
     """Overwrite the lower triangle of A [n, n] with L of L L^T = A; False where A is not positive definite."""
     for j in range(len(A)):
@@ -24,7 +24,7 @@ def factored(A):
     return True
 
 
-@reordered
+@reordered_leaf
 def substituted(L, b):
     """Overwrite b [n] with the solution x of L L^T x = b."""
     n = len(b)
@@ -39,21 +39,41 @@ def substituted(L, b):
             b[k] -= L[i, k] * b[i]
 
 
-@reordered
+@reordered_leaf
 def inverted(L, inverse):
     """Write the inverse of L L^T to ``inverse`` [n, n]."""
     size = len(L)
-    lower = np.zeros((size, size))  # the columns of L^-1, as rows
-    for j in range(size):
-        lower[j, j] = 1 / L[j, j]
+    for j in range(size):  # the columns of L^-1, as rows of the upper triangle
+        inverse[j, j] = 1 / L[j, j]
         for i in range(j + 1, size):
             total = 0.0
             for k in range(j, i):
-                total += L[i, k] * lower[j, k]
-            lower[j, i] = -total / L[i, i]
+                total += L[i, k] * inverse[j, k]
+            inverse[j, i] = -total / L[i, i]
     for i in range(size):
-        for j in range(i + 1):
+        for j in range(i + 1):  # the diagonal last, as it is read
             total = 0.0
             for k in range(i, size):
-                total += lower[i, k] * lower[j, k]
-            inverse[i, j] = inverse[j, i] = total
+                total += inverse[i, k] * inverse[j, k]
+            inverse[i, j] = total
+    for i in range(size):
+        for j in range(i):
+            inverse[j, i] = inverse[i, j]
+
+
+@reordered_leaf
+def reduced(A, left, right):
+    """Subtract left^T right from the lower triangle of A [n, n], for ``left`` and ``right`` [m, n]."""
+    size, count = len(A), len(left)
+    whole = count - count % 4
+    for n in range(0, whole, 4):  # four rows at a time: A is read and written once for them
+        for i in range(size):
+            one, two, three, four = left[n, i], left[n + 1, i], left[n + 2, i], left[n + 3, i]
+            for j in range(i + 1):
+                A[i, j] -= (one * right[n, j] + two * right[n + 1, j]) + (
+                    three * right[n + 2, j] + four * right[n + 3, j]
+                )
+    for n in range(whole, count):
+        for i in range(size):
+            for j in range(i + 1):
+                A[i, j] -= left[n, i] * right[n, j]

@@ -14,12 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.anchors import FARTHEST_OFF, FEW, Checked
+from ufmstar_torch.anchors.anchors import Anchors
+from ufmstar_torch.anchors.check import FARTHEST_OFF, FEW, Checked
 from ufmstar_torch.anchors.evidence import CLAIM, COUNTS, LEAST_SIGMA, Evidence
 from ufmstar_torch.anchors.kernels.neighbours import grid, supported
 from ufmstar_torch.anchors.learn import Learnt
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.frames.frame import AnchorInput, FrameInput
+from ufmstar_torch.frames.frame import FrameInput
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, part
 from ufmstar_torch.kernels.cpu.calls import array, each
 from ufmstar_torch.kernels.cpu.regress import Seen, View
@@ -35,7 +36,7 @@ _NEGLIGIBLE = 1e-30  # smaller means become 0, before single precision loses the
 def check_anchor_values(
     pixel: Tensor, depth: Tensor, variance: Tensor, mask: Tensor | None, frame: FrameInput
 ) -> Checked:  # fmt: skip
-    """As :func:`ufmstar_torch.anchors.anchors.check_anchor_values`, for CPU tensors; the same values."""
+    """As :func:`ufmstar_torch.anchors.check.check_anchor_values`, for CPU tensors; the same values."""
     streams, n = depth.shape
     values = [array(x) for x in (pixel, depth, variance)]
     used = np.ones((streams, n), np.bool_) if mask is None else array(mask)
@@ -83,10 +84,10 @@ def _check(
         contradiction[0] = square / rejected[0]
 
 
-def inliers(anchors: AnchorInput) -> Tensor:
+def inliers(anchors: Anchors) -> Tensor:
     """As :func:`ufmstar_torch.anchors.evidence.inliers`, for CPU tensors; the same result."""
-    out = np.empty(anchors.valid.shape, np.bool_)
-    fields = (anchors.pixel, anchors.predicted, anchors.depth, anchors.variance, anchors.valid)
+    out = np.empty(anchors.mask.shape, np.bool_)
+    fields = (anchors.pixel, anchors.predicted, anchors.depth, anchors.variance, anchors.mask)
     each(_inliers, list(zip(*map(array, fields), out, strict=True)))
     return torch.from_numpy(out)
 
@@ -121,8 +122,8 @@ def learn_in_view(
     if anchors is None:
         fields = [np.empty((b, 0), np.int64), np.empty((b, 0, 2)), *np.empty((4, b, 0)), np.empty((b, 0), np.bool_)]
     else:
-        columns = (anchors.pixel, anchors.predicted, anchors.depth, anchors.variance, anchors.own_variance)
-        fields = [array(anchors.index), *map(array, columns), array(anchors.valid)]
+        columns = (anchors.pixel, anchors.predicted, anchors.depth, anchors.variance, anchors.network_variance)
+        fields = [array(anchors.index), *map(array, columns), array(anchors.mask)]
     features = [one.features for one in seen]
     assert config.anchors is not None
     settings = frame.size[1], 0.5 ** (1 / config.anchors.half_life), config.anchors.shrinkage

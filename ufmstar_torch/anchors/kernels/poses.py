@@ -8,86 +8,182 @@ distortion, x (1 + k r^2). ``tests/oracle_dense.py`` has the same by differences
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.anchors.kernels.cholesky import factored, inverted
-from ufmstar_torch.anchors.kernels.dense import Views
+from ufmstar_torch.anchors.kernels.dense import Measured, Views
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
-from ufmstar_torch.kernels.compile_cpu import empty, leaf, reordered
+from ufmstar_torch.kernels.compile_cpu import empty, leaf, reordered, reordered_leaf
 
 # Rounds of Student-t weights, and their degrees of freedom.
 ROUNDS, STUDENT = 3, 4.0
+# Number of linearisations: the correction changes the depths at which the positions are linearised.
+_LINEARISATIONS = 2
 
 # Parameters of a pose and of the camera.
 POSE, CAMERA = 6, 4
 EACH = POSE + CAMERA
 
 
-def linearised(
-    pixel: NDArray[np.float64],
-    rho: NDArray[np.float64],
-    along: NDArray[np.float64],
-    slope: NDArray[np.float64],
-    views: Views,
-    K: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Derivatives of the matches' positions by the errors.
+class Corrected(NamedTuple):
+    """Errors of V poses and of the camera, and the depths of N pixels without them.
+
+    Attributes:
+        error: [6 V + 4] of the poses, one after the other, and of the camera.
+        covariance: [6 V + 4, 6 V + 4] of the errors; NaN where the equations are singular.
+        rho: [N] inverse depth [1/m].
+        match: [N] least variance of an inverse depth in a view by its match [1/m^2]; infinite without a match.
+        common: [N] variance of ``rho`` from the remaining errors [1/m^2].
+        residual: [V, N] squared residual of the inverse depth in each view, over its variance; 0 without a match.
+        across_residual: [V, N] squared distance from the line [px^2]; 0 where the match does not show it.
+        off_line: [N] largest ``across_residual`` over its variance; NaN where no view shows it.
+    """
+
+    error: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    rho: NDArray[np.float64]
+    match: NDArray[np.float64]
+    common: NDArray[np.float64]
+    residual: NDArray[np.float64]
+    across_residual: NDArray[np.float64]
+    off_line: NDArray[np.float64]
+
+
+def corrected(
+    pixel: NDArray[np.float64], found: NDArray[np.int64], measured: Measured, views: Views, K: NDArray[np.float64],
+    unexplained: NDArray[np.float64], precision: NDArray[np.float64], start: NDArray[np.float64],
+) -> Corrected:  # fmt: skip
+    """The most likely errors by ``ROUNDS`` rounds of Student-t weights, with the depths eliminated.
 
     Args:
-        pixel: [N, 2] (u, v).
-        rho: [N] [1/m].
-        along: [N, V, 2] unit direction of the line in the view.
-        slope: [N, V] shift of the match along the line per unit of error across it.
+        pixel: [M, 2] (u, v).
+        found: [N] indices of the pixels to use, each measured in at least one view.
+        measured: matches of the M pixels.
         views: V keyframes.
         K: [3, 3] [px].
-
-    Returns:
-        [N, V, 10] by the errors of the pose (rad, m) and of the camera (1, px, px, 1): of the position that a search
-        along the line returns [px], and of the position across the line [px].
+        unexplained: [V] variance of a position that errors of poses and camera do not explain [px^2].
+        precision, start: [6 V + 4, 6 V + 4] and [6 V + 4] of the errors' prior.
     """
-    shape = (*slope.shape, EACH)
-    on_line, across = np.zeros(shape), np.zeros(shape)
-    _linearised(pixel, rho, along, slope, views.H, views.b, K, inverse_intrinsics(K), on_line, across)
-    return on_line, across
+    n, v, size = len(found), len(views.H), len(start)
+    error, covariance, rho, (match, common) = (
+        np.zeros(size),
+        np.zeros((size, size)),
+        measured.rho[found],
+        np.zeros((2, n)),
+    )
+    residual, across_residual, off_line = np.zeros((v, n)), np.zeros((v, n)), np.full(n, np.nan)
+    columns = measured.value, measured.noise, measured.along, measured.speed, measured.slope
+    across = measured.across, measured.across_noise
+    cameras = views.H, views.b, K, inverse_intrinsics(K)
+    results = Corrected(error, covariance, rho, match, common, residual, across_residual, off_line)
+    _correct(pixel, found, *columns, *across, *cameras, unexplained, precision, precision @ start, *results)
+    return results
 
 
 @reordered
-def _linearised(pixel, rho, along, slope, H, b, K, K_inverse, on_line, across):
-    fx, fy = K[0, 0], K[1, 1]
-    change, R, t = empty((2, EACH), np.float64), empty((3, 3), np.float64), empty(3, np.float64)
-    for k in range(len(H)):
-        _rotated(H[k], b[k], K, K_inverse, R, t)
-        for n in range(len(pixel)):
-            x, y = (pixel[n, 0] - K[0, 2]) / fx, (pixel[n, 1] - K[1, 2]) / fy
-            z = R[2, 0] * x + R[2, 1] * y + R[2, 2] + rho[n] * t[2]
-            over = 1 / z
-            p = (R[0, 0] * x + R[0, 1] * y + R[0, 2] + rho[n] * t[0]) * over
-            q = (R[1, 0] * x + R[1, 1] * y + R[1, 2] + rho[n] * t[1]) * over
-            change[0, 0], change[0, 1], change[0, 2] = -p * q * fx, (1 + p * p) * fx, -q * fx
-            change[1, 0], change[1, 1], change[1, 2] = -(1 + q * q) * fy, p * q * fy, p * fy
-            per = rho[n] * over
-            change[0, 3], change[0, 4], change[0, 5] = per * fx, 0.0, -p * per * fx
-            change[1, 3], change[1, 4], change[1, 5] = 0.0, per * fy, -q * per * fy
-            # Derivatives of the position in the view by the ray's x and y.
-            ux, uy = (R[0, 0] - p * R[2, 0]) * over * fx, (R[0, 1] - p * R[2, 1]) * over * fx
-            vx, vy = (R[1, 0] - q * R[2, 0]) * over * fy, (R[1, 1] - q * R[2, 1]) * over * fy
-            r2, r2_view = x * x + y * y, p * p + q * q
-            change[0, 6], change[1, 6] = p * fx - x * ux - y * uy, q * fy - x * vx - y * vy
-            change[0, 7], change[1, 7] = 1 - ux / fx, -vx / fx
-            change[0, 8], change[1, 8] = -uy / fy, 1 - vy / fy
-            change[0, 9] = r2_view * p * fx - r2 * (x * ux + y * uy)
-            change[1, 9] = r2_view * q * fy - r2 * (x * vx + y * vy)
-            eu, ev = along[n, k, 0], along[n, k, 1]
+def _correct(
+    pixel, found, value, noise, along, speed, slope, across, across_noise, H, b, K, K_inverse,
+    unexplained, precision, right_side, error, covariance, rho, match, common, residual, across_residual, off_line,
+):  # fmt: skip
+    count, views, size = len(found), len(H), len(error)
+    change, across_change = empty((views, EACH, count), np.float64), empty((views, EACH, count), np.float64)
+    offset, weight = empty((views, count), np.float64), empty((views, count), np.float64)
+    shift, across_weight = empty((views, count), np.float64), empty((views, count), np.float64)
+    R, t, moved, one = (
+        empty((3, 3), np.float64), empty(3, np.float64), empty((2, EACH), np.float64), empty((2, EACH), np.float64),
+    )  # fmt: skip
+    by, rows, delta = empty((2, EACH, count), np.float64), empty((4, count), np.float64), empty(count, np.float64)
+    A, r, weighted = empty((size, size), np.float64), empty(size, np.float64), empty((size, count), np.float64)
+    mean_change = empty((size, count), np.float64)
+    for i in range(count):
+        n, delta[i] = found[i], 0.0
+        for k in range(views):
+            used, shows = np.isfinite(value[n, k]), np.isfinite(value[n, k]) and np.isfinite(across[n, k])
+            offset[k, i], shift[k, i] = value[n, k] - rho[i] if used else 0.0, across[n, k] if shows else 0.0
+            scale = (1 + slope[n, k] * slope[n, k]) / (speed[n, k] * speed[n, k])
+            weight[k, i] = 1 / (noise[n, k] / (speed[n, k] * speed[n, k]) + unexplained[k] * scale) if used else 0.0
+            across_weight[k, i] = 1 / (across_noise[n, k] + unexplained[k]) if shows else 0.0
             for c in range(EACH):
-                across[n, k, c] = eu * change[1, c] - ev * change[0, c]
-                on_line[n, k, c] = eu * change[0, c] + ev * change[1, c] + slope[n, k] * across[n, k, c]
+                change[k, c, i] = across_change[k, c, i] = 0.0
+    for _ in range(_LINEARISATIONS):
+        for k in range(views):
+            rotated(H[k], b[k], K, K_inverse, R, t)
+            for i in range(count):
+                n = found[i]
+                if weight[k, i] > 0:
+                    geometry = pixel[n], rho[i] + delta[i], along[n, k], slope[n, k]
+                    linearised(*geometry, R, t, K, moved, one[0], one[1])
+                    over = 1 / speed[n, k]
+                    for c in range(EACH):
+                        change[k, c, i], across_change[k, c, i] = one[0, c] * over, one[1, c]
+        if not solve(
+            change, offset, weight, across_change, shift, across_weight, precision, right_side, error, covariance,
+            mean_change, delta, residual, across_residual, by, rows, A, r, weighted,
+        ):  # fmt: skip
+            covariance[0, 0] = np.nan
+            return
+    for i in range(count):
+        rho[i] += delta[i]
+        most = 0.0
+        for k in range(views):
+            most = max(most, weight[k, i])
+            if across_weight[k, i] > 0:
+                ratio = across_residual[k, i] * across_weight[k, i]
+                off_line[i] = ratio if np.isnan(off_line[i]) else max(off_line[i], ratio)
+        match[i] = 1 / most
+    row = rows[0]
+    for p in range(size):
+        row[:] = 0.0
+        for q in range(size):
+            for i in range(count):
+                row[i] += covariance[p, q] * mean_change[q, i]
+        for i in range(count):
+            common[i] += row[i] * mean_change[p, i]
+
+
+@reordered_leaf
+def linearised(pixel, rho, along, slope, R, t, K, change, on_line, across):
+    """Write the derivatives of a match's position by the errors of the pose (rad, m) and of the camera (1, px, px, 1):
+    ``on_line`` [10] of the position that a search along the line returns, ``across`` [10] of that across the line [px].
+
+    Args:
+        pixel: [2] (u, v).
+        rho: inverse depth [1/m].
+        along: [2] unit direction of the line in the view.
+        slope: shift of the match along the line per unit of error across it.
+        R, t: of the view, see :func:`rotated`.
+        K: [3, 3] [px].
+        change: [2, 10] buffer.
+    """
+    fx, fy = K[0, 0], K[1, 1]
+    x, y = (pixel[0] - K[0, 2]) / fx, (pixel[1] - K[1, 2]) / fy
+    over = 1 / (R[2, 0] * x + R[2, 1] * y + R[2, 2] + rho * t[2])
+    p = (R[0, 0] * x + R[0, 1] * y + R[0, 2] + rho * t[0]) * over
+    q = (R[1, 0] * x + R[1, 1] * y + R[1, 2] + rho * t[1]) * over
+    change[0, 0], change[0, 1], change[0, 2] = -p * q * fx, (1 + p * p) * fx, -q * fx
+    change[1, 0], change[1, 1], change[1, 2] = -(1 + q * q) * fy, p * q * fy, p * fy
+    per = rho * over
+    change[0, 3], change[0, 4], change[0, 5] = per * fx, 0.0, -p * per * fx
+    change[1, 3], change[1, 4], change[1, 5] = 0.0, per * fy, -q * per * fy
+    # Derivatives of the position in the view by the ray's x and y.
+    ux, uy = (R[0, 0] - p * R[2, 0]) * over * fx, (R[0, 1] - p * R[2, 1]) * over * fx
+    vx, vy = (R[1, 0] - q * R[2, 0]) * over * fy, (R[1, 1] - q * R[2, 1]) * over * fy
+    r2, r2_view = x * x + y * y, p * p + q * q
+    change[0, 6], change[1, 6] = p * fx - x * ux - y * uy, q * fy - x * vx - y * vy
+    change[0, 7], change[1, 7] = 1 - ux / fx, -vx / fx
+    change[0, 8], change[1, 8] = -uy / fy, 1 - vy / fy
+    change[0, 9] = r2_view * p * fx - r2 * (x * ux + y * uy)
+    change[1, 9] = r2_view * q * fy - r2 * (x * vx + y * vy)
+    for c in range(EACH):
+        across[c] = along[0] * change[1, c] - along[1] * change[0, c]
+        on_line[c] = along[0] * change[0, c] + along[1] * change[1, c] + slope * across[c]
 
 
 @leaf
-def _rotated(H, b, K, K_inverse, R, t):
+def rotated(H, b, K, K_inverse, R, t):
     """Write R = K^-1 H K and t = K^-1 b; K and its inverse have the last row (0, 0, 1)."""
     for i in range(3):
         t[i] = K_inverse[i, 0] * b[0] + K_inverse[i, 1] * b[1] + K_inverse[i, 2] * b[2]
@@ -100,72 +196,28 @@ def _rotated(H, b, K, K_inverse, R, t):
         R[i, 2] = x * K[0, 2] + y * K[1, 2] + z
 
 
-@dataclass(frozen=True, eq=False)
-class Shown:
-    """Positions of N pixels along and across their lines in V views.
-
-    Attributes:
-        change: [N, V, 10] derivative of ``value`` by the errors.
-        value: [N, V] inverse depth, from an arbitrary origin for each pixel [1/m].
-        variance: [N, V] of ``value`` [1/m^2]; infinite where a view measures nothing.
-        across_change, across, across_variance: the same of the position across the line [px].
-    """
-
-    change: NDArray[np.float64]
-    value: NDArray[np.float64]
-    variance: NDArray[np.float64]
-    across_change: NDArray[np.float64]
-    across: NDArray[np.float64]
-    across_variance: NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """Errors and depths.
-
-    Attributes:
-        error: [6 V + 4] of the poses, one after the other, and of the camera.
-        covariance: [6 V + 4, 6 V + 4] of the errors.
-        rho: [N] inverse depth from its origin [1/m]; 0 where no view measures it.
-        common: [N] variance of ``rho`` from the remaining errors [1/m^2].
-        residual: [N, V] squared residual of ``value``, over its variance.
-        across_residual: [N, V] squared residual of ``across`` [px^2].
-    """
-
-    error: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    rho: NDArray[np.float64]
-    common: NDArray[np.float64]
-    residual: NDArray[np.float64]
-    across_residual: NDArray[np.float64]
-
-
-def solved(shown: Shown, precision: NDArray[np.float64], start: NDArray[np.float64]) -> Solution:
-    """The most likely errors for a prior of mean ``start`` [6 V + 4] and precision [6 V + 4, 6 V + 4], by ``ROUNDS``
-    rounds of Student-t weights with the depths eliminated."""
-    n, v = shown.value.shape
-    size = len(start)
-    error, covariance, mean_change = np.zeros(size), np.zeros((size, size)), np.zeros((n, size))
-    rho, residual, across_residual = np.zeros(n), np.zeros((n, v)), np.zeros((n, v))
-    _solved(
-        *(shown.change, shown.value, 1 / shown.variance),
-        *(shown.across_change, shown.across, 1 / shown.across_variance),
-        *(precision, precision @ start, error, covariance, mean_change, rho, residual, across_residual),
-    )
-    common = (mean_change @ covariance * mean_change).sum(1)
-    return Solution(error, covariance, rho, common, residual, across_residual)
-
-
-@reordered
-def _solved(
-    change, value, weight, across_change, across, across_weight,
-    precision, right_side, error, covariance, mean_change, rho, residual, across_residual,
+@reordered_leaf
+def solve(
+    change, value, weight, across_change, across, across_weight, precision, right_side, error, covariance,
+    mean_change, rho, residual, across_residual, by, rows, A, r, weighted,
 ):  # fmt: skip
-    count, views, _ = change.shape
-    size = len(error)
-    mean, total, view_error = empty(count, np.float64), empty(count, np.float64), empty(EACH, np.float64)
-    A, r, by_view = empty((size, size), np.float64), empty(size, np.float64), empty((EACH, EACH), np.float64)
-    weighted = empty((count, size), np.float64)
+    """The most likely errors of N pixels in V views, S = 6 V + 4, and the depths; False if the equations are singular.
+
+    Args:
+        change: [V, 10, N] derivative of ``value`` by the errors.
+        value: [V, N] inverse depth, from an arbitrary origin for each pixel [1/m].
+        weight: [V, N] inverse of the variance of ``value`` [m^2]; 0 where a view measures nothing.
+        across_change, across, across_weight: the same of the position across the line [px].
+        precision, right_side: [S, S] of the prior, and its product with the prior's mean.
+        error, covariance: overwritten, [S] and [S, S].
+        mean_change: overwritten, [S, N] derivative of a pixel's weighted mean by the errors.
+        rho: overwritten, [N] inverse depth from its origin; 0 where no view measures it.
+        residual: overwritten, [V, N] squared residual of ``value``, over its variance.
+        across_residual: overwritten, [V, N] squared residual of ``across``.
+        by, rows, A, r, weighted: buffers, [2, 10, N], [4, N], [S, S], [S], [S, N].
+    """
+    views, count, size = len(value), len(rho), len(error)
+    mean = rows[0]
     for iteration in range(ROUNDS):
         for i in range(size):
             r[i] = right_side[i]
@@ -174,85 +226,92 @@ def _solved(
         student = 0.0 if iteration == 0 else STUDENT
         _equations(
             *(change, value, weight, residual, across_change, across, across_weight, across_residual, student),
-            *(A, r, mean_change, mean, total, by_view, weighted),
+            *(A, r, mean_change, by, rows, weighted),
         )
         if not factored(A):
-            covariance[0, 0] = np.nan
-            return
+            return False
         inverted(A, covariance)
         for i in range(size):
             error[i] = 0.0
             for j in range(size):
                 error[i] += covariance[i, j] * r[j]
         for n in range(count):
-            change_of_mean = 0.0
-            for i in range(size):
-                change_of_mean += mean_change[n, i] * error[i]
-            rho[n] = mean[n] - change_of_mean
-        for k in range(views):
-            for c in range(EACH):
-                view_error[c] = error[POSE * (k if c < POSE else views - 1) + c]
+            rho[n] = mean[n]
+        for i in range(size):
             for n in range(count):
-                e, e_across = value[n, k] - rho[n], across[n, k]
-                for c in range(EACH):
-                    e -= change[n, k, c] * view_error[c]
-                    e_across -= across_change[n, k, c] * view_error[c]
-                residual[n, k], across_residual[n, k] = e * e * weight[n, k], e_across * e_across
+                rho[n] -= mean_change[i, n] * error[i]
+        for k in range(views):
+            off, off_across = residual[k], across_residual[k]
+            for n in range(count):
+                off[n] = value[k, n] - rho[n]
+                off_across[n] = across[k, n]
+            for c in range(EACH):
+                e = error[POSE * (k if c < POSE else views - 1) + c]
+                for n in range(count):
+                    off[n] -= change[k, c, n] * e
+                for n in range(count):
+                    off_across[n] -= across_change[k, c, n] * e
+            for n in range(count):
+                off[n] = off[n] * off[n] * weight[k, n]
+                off_across[n] *= off_across[n]
+    return True
 
 
-@reordered
+# Loops over all pixels, each with one result, so that they are vectorised.
+@reordered_leaf
 def _equations(
     change, value, weight, residual, across_change, across, across_weight, across_residual, student,
-    A, r, mean_change, mean, total, by_view, weighted,
+    A, r, mean_change, by, rows, weighted,
 ):  # fmt: skip
-    """Add the pixels to the normal equations A d = r, and write the precision-weighted means over the views.
-    ``student`` = 0: weights without Student's t. ``total``, ``by_view`` and ``weighted`` are buffers."""
-    count, views, _ = change.shape
-    size = len(r)
+    """Add the pixels to the normal equations A d = r (lower triangle), and write the precision-weighted means over the
+    views: ``mean_change`` and ``rows[0]``. ``student`` = 0: weights without Student's t."""
+    views, count, size = len(value), len(rows[0]), len(r)
+    mean, total, w, a = rows[0], rows[1], rows[2], rows[3]
     for n in range(count):
         mean[n] = total[n] = 0.0
-        for i in range(size):
-            mean_change[n, i] = 0.0
+    for i in range(size):
+        for n in range(count):
+            mean_change[i, n] = 0.0
     for k in range(views):
         first, camera = POSE * k, POSE * (views - 1)  # added to c: its index among the errors
-        for c in range(EACH):
-            for d in range(EACH):
-                by_view[c, d] = 0.0
         for n in range(count):
-            w, a = weight[n, k], across_weight[n, k]
-            if w == 0 and a == 0:
-                continue
+            w[n], a[n] = weight[k, n], across_weight[k, n]
             if student > 0:
-                w *= (student + 1) / (student + residual[n, k])
-                a *= (student + 1) / (student + across_residual[n, k] * a)
-            total[n] += w
-            mean[n] += w * value[n, k]
-            for c in range(EACH):
-                index = c + (first if c < POSE else camera)
-                by, by_across = w * change[n, k, c], a * across_change[n, k, c]
-                mean_change[n, index] += by
-                r[index] += by * value[n, k] + by_across * across[n, k]
-                for d in range(c + 1):  # a lower triangle, which :func:`factored` reads
-                    by_view[c, d] += by * change[n, k, d] + by_across * across_change[n, k, d]
+                w[n] *= (student + 1) / (student + residual[k, n])
+                a[n] *= (student + 1) / (student + across_residual[k, n] * a[n])
+            total[n] += w[n]
+            mean[n] += w[n] * value[k, n]
         for c in range(EACH):
-            for d in range(c + 1):
-                A[c + (first if c < POSE else camera), d + (first if d < POSE else camera)] += by_view[c, d]
+            at, along, over = c + (first if c < POSE else camera), by[0, c], by[1, c]
+            for n in range(count):
+                along[n] = w[n] * change[k, c, n]
+            for n in range(count):
+                over[n] = a[n] * across_change[k, c, n]
+            for n in range(count):
+                mean_change[at, n] += along[n]
+            right = 0.0
+            for n in range(count):
+                right += along[n] * value[k, n] + over[n] * across[k, n]
+            r[at] += right
+            for d in range(c + 1):  # a lower triangle, which :func:`factored` reads
+                product = 0.0
+                for n in range(count):
+                    product += along[n] * change[k, d, n] + over[n] * across_change[k, d, n]
+                A[at, d + (first if d < POSE else camera)] += product
     for n in range(count):
-        over = 1 / total[n] if total[n] > 0 else 0.0
-        mean[n] *= over
-        for i in range(size):
-            weighted[n, i] = mean_change[n, i]
-            mean_change[n, i] *= over
-            r[i] -= weighted[n, i] * mean[n]
-    whole = count - count % 4
-    for n in range(0, whole, 4):  # four pixels at a time: A is read and written once for them
-        for i in range(size):
-            one, two, three, four = weighted[n, i], weighted[n + 1, i], weighted[n + 2, i], weighted[n + 3, i]
-            for j in range(i + 1):
-                A[i, j] -= (one * mean_change[n, j] + two * mean_change[n + 1, j]) + (
-                    three * mean_change[n + 2, j] + four * mean_change[n + 3, j]
-                )
-    for n in range(whole, count):
-        for i in range(size):
-            for j in range(i + 1):
-                A[i, j] -= weighted[n, i] * mean_change[n, j]
+        total[n] = 1 / total[n] if total[n] > 0 else 0.0
+        mean[n] *= total[n]
+    for i in range(size):
+        right = 0.0
+        for n in range(count):
+            weighted[i, n] = mean_change[i, n]
+        for n in range(count):
+            mean_change[i, n] *= total[n]
+        for n in range(count):
+            right += weighted[i, n] * mean[n]
+        r[i] -= right
+        for j in range(i + 1):
+            product = 0.0
+            for n in range(count):
+                product += weighted[i, n] * mean_change[j, n]
+            A[i, j] -= product

@@ -65,7 +65,7 @@ def _statistics(values, out, counts):
         if count > 1:
             out[1, row] = folded(terms) / (number - values.dtype.type(1))
         if count > 0:
-            out[2, row] = _smallest(present, count, (count - 1) // 2)
+            out[2, row] = smallest(present, count, (count - 1) // 2)
             largest = present[0]
             for i in range(1, count):
                 largest = max(largest, present[i])
@@ -89,7 +89,7 @@ def folded(values):
 
 
 @leaf
-def _smallest(values, count, rank):
+def smallest(values, count, rank):
     """The value of a ``rank``, from 0, among the first ``count``, which are reordered."""
     low, high = 0, count - 1
     while low < high:

@@ -118,8 +118,68 @@ def _floor(covariance, floor, lifted, count, chunk: tl.constexpr):
 
 
 @triton.jit
-def _view(view):
-    return tl.load(view), tl.load(view + 1), tl.load(view + 2), tl.load(view + 3)
+def _number(pointer, mask):
+    """A number of every lane, 0 outside the mask."""
+    return tl.load(pointer, mask=mask, other=0.0).to(tl.float64)
+
+
+@triton.jit
+def _vector(pointer, mask):
+    """Three successive numbers of every lane."""
+    return _number(pointer, mask), _number(pointer + 1, mask), _number(pointer + 2, mask)
+
+
+@triton.jit
+def _increase(
+    view, reference, k, inside, x, y, z,
+    baseline: tl.constexpr, near: tl.constexpr, least: tl.constexpr, lanes: tl.constexpr,
+):  # fmt: skip
+    """The weight w of a comparison (``steps.fuse.view_weights``)."""
+    w = tl.full([lanes], 1.0, tl.float64)
+    if baseline > 0:
+        vx, vy, vz = tl.load(view), tl.load(view + 1), tl.load(view + 2)
+        rx, ry, rz = _vector(reference + 5 * k, inside)
+        squared = (vx - rx) * (vx - rx) + (vy - ry) * (vy - ry) + (vz - rz) * (vz - rz)
+        reach = (x - vx) * (x - vx) + (y - vy) * (y - vy) + (z - vz) * (z - vz)
+        reach = tl.maximum(reach, exact(near * near, reach)) * exact(baseline * baseline, reach)
+        increase = 1 - tl.exp(-squared / reach) - _number(reference + 5 * k + 4, inside)
+        other = _number(reference + 5 * k + 3, inside) != tl.load(view + 3)
+        w = tl.where(other, 1.0, tl.where(increase >= exact(least, increase), increase, 0.0))
+    return w
+
+
+@triton.jit
+def _write_reference(view, reference, reference_o, k, inside, any_match, w, complete: tl.constexpr):
+    """Add the change of the view to the matched components, whose reference it becomes where the change is complete."""
+    change = _number(reference + 5 * k + 4, inside)
+    change = tl.where(any_match, change + w, change)
+    new = any_match & (change >= exact(complete, change))
+    for i in tl.static_range(4):
+        entry = tl.where(new, tl.load(view + i), _number(reference + 5 * k + i, inside))
+        tl.store(reference_o + 5 * k + i, entry, mask=inside)
+    tl.store(reference_o + 5 * k + 4, tl.where(new, 0.0, change), mask=inside)
+
+
+@triton.jit
+def _or_unit(use, xx, xy, xz, yy, yz, zz):
+    """Symmetric matrices, the identity outside the mask."""
+    return (
+        tl.where(use, xx, 1.0), tl.where(use, xy, 0.0), tl.where(use, xz, 0.0),
+        tl.where(use, yy, 1.0), tl.where(use, yz, 0.0), tl.where(use, zz, 1.0),
+    )  # fmt: skip
+
+
+@triton.jit
+def _updated(use, new, old, pointer):
+    """``new`` where the mask is True, rounded to the precision in which it is stored, else ``old``."""
+    return tl.where(use, new.to(pointer.dtype.element_ty).to(tl.float64), old)
+
+
+@triton.jit
+def _next_match(remaining, index_c, first, use):
+    """The next match of every lane in the bits ``remaining``, and the bits without it."""
+    bit, rest = lowest_bit(tl.where(use, remaining, 1))
+    return tl.load(index_c + first + bit, mask=use, other=0), tl.where(use, rest, 0)
 
 
 @triton.jit
@@ -134,42 +194,24 @@ def _fuse(
     word: tl.constexpr, lanes: tl.constexpr,
 ):  # fmt: skip
     b = tl.program_id(1).to(tl.int64)
-    stored = mean.dtype.element_ty
     slot = tl.program_id(0) * lanes + tl.arange(0, lanes)
     inside = slot < capacity_k
     k = b * capacity_k + slot
-    R, t = R + 9 * b, t + 3 * b
-    f = tl.arange(0, padded)
-    x = tl.load(mean + 3 * k, mask=inside, other=0.0).to(tl.float64)
-    y = tl.load(mean + 3 * k + 1, mask=inside, other=0.0).to(tl.float64)
-    z = tl.load(mean + 3 * k + 2, mask=inside, other=0.0).to(tl.float64)
+    R, t, view = R + 9 * b, t + 3 * b, view + 4 * b
+    x, y, z = _vector(mean + 3 * k, inside)
     xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * k, 1, inside)
     # A rotation rounds mirrored entries differently. Components without matches retain both triangles.
-    yx = tl.load(covariance + 9 * k + 3, mask=inside, other=0.0).to(tl.float64)
-    zx = tl.load(covariance + 9 * k + 6, mask=inside, other=0.0).to(tl.float64)
-    zy = tl.load(covariance + 9 * k + 7, mask=inside, other=0.0).to(tl.float64)
-    pi = tl.load(weight + k, mask=inside, other=0.0).to(tl.float64)
-    m = tl.load(disagreement + k, mask=inside, other=0.0).to(tl.float64)
-    compared_k = tl.load(compared + k, mask=inside, other=0.0).to(tl.float64)
-    n_k = tl.load(views + k, mask=inside, other=0.0).to(tl.float64)
-    vx, vy, vz, v_member = _view(view + 4 * b)
-    rx = tl.load(reference + 5 * k, mask=inside, other=0.0).to(tl.float64)
-    ry = tl.load(reference + 5 * k + 1, mask=inside, other=0.0).to(tl.float64)
-    rz = tl.load(reference + 5 * k + 2, mask=inside, other=0.0).to(tl.float64)
-    r_member = tl.load(reference + 5 * k + 3, mask=inside, other=0.0).to(tl.float64)
-    change = tl.load(reference + 5 * k + 4, mask=inside, other=0.0).to(tl.float64)
-    w = tl.full([lanes], 1.0, tl.float64)
-    if baseline > 0:
-        squared = (vx - rx) * (vx - rx) + (vy - ry) * (vy - ry) + (vz - rz) * (vz - rz)
-        reach = (x - vx) * (x - vx) + (y - vy) * (y - vy) + (z - vz) * (z - vz)
-        reach = tl.maximum(reach, exact(near * near, reach)) * exact(baseline * baseline, reach)
-        increase = 1 - tl.exp(-squared / reach) - change
-        w = tl.where(r_member != v_member, 1.0, tl.where(increase >= exact(least, increase), increase, 0.0))
+    yx, zx = _number(covariance + 9 * k + 3, inside), _number(covariance + 9 * k + 6, inside)
+    zy = _number(covariance + 9 * k + 7, inside)
+    pi, m = _number(weight + k, inside), _number(disagreement + k, inside)
+    compared_k, n_k = _number(compared + k, inside), _number(views + k, inside)
+    w = _increase(view, reference, k, inside, x, y, z, baseline, near, least, lanes)
     any_match = slot < 0
+    f = tl.arange(0, padded)
     in_f = inside[:, None] & (f < channels)[None, :]
     h = tl.zeros([lanes, padded], tl.float64)
     if channels > 0:
-        h = tl.load(features + k[:, None] * channels + f[None, :], mask=in_f, other=0.0).to(tl.float64)
+        h = _number(features + k[:, None] * channels + f[None, :], in_f)
     row = tl.where(w > 0, tl.load(position + k, mask=inside, other=-1), -1)
     n = tl.load(listed_c + b)
     for part in range(tl.cdiv(n, word)):
@@ -177,51 +219,38 @@ def _fuse(
         while tl.max(remaining, 0) > 0:
             use = remaining != 0
             any_match = any_match | use
-            bit, rest = lowest_bit(tl.where(use, remaining, 1))
-            remaining = tl.where(use, rest, 0)
-            c = tl.load(index_c + b * capacity_c + part * word + bit, mask=use, other=0)
+            c, remaining = _next_match(remaining, index_c, b * capacity_c + part * word, use)
             index = b * capacity_c + c
-            cx = tl.load(mean_c + 3 * index, mask=use, other=0.0).to(tl.float64)
-            cy = tl.load(mean_c + 3 * index + 1, mask=use, other=0.0).to(tl.float64)
-            cz = tl.load(mean_c + 3 * index + 2, mask=use, other=0.0).to(tl.float64)
+            cx, cy, cz = _vector(mean_c + 3 * index, use)
             c0, c1, c2, c3, c4, c5 = load_symmetric(covariance_c + 9 * index, 1, use)
             cx, cy, cz = moved(R, t, cx, cy, cz)
             c0, c1, c2, c3, c4, c5 = turned(R, c0, c1, c2, c3, c4, c5)
-            pi_c = tl.load(weight_c + index, mask=use, other=0.0).to(tl.float64)
+            pi_c = _number(weight_c + index, use)
             if weighted:
-                pi_c = pi_c * tl.load(overlap + index * capacity_k + slot, mask=use, other=0.0).to(tl.float64)
+                pi_c = pi_c * _number(overlap + index * capacity_k + slot, use)
             lam = pi_c / tl.where(use, pi + pi_c, 1.0)
+            a0, a1, a2, a3, a4, a5 = _or_unit(use, xx, xy, xz, yy, yz, zz)
+            c0, c1, c2, c3, c4, c5 = _or_unit(use, c0, c1, c2, c3, c4, c5)
             nx, ny, nz, n0, n1, n2, n3, n4, n5, d = geodesic(
-                x, y, z, tl.where(use, xx, 1.0), tl.where(use, xy, 0.0), tl.where(use, xz, 0.0),
-                tl.where(use, yy, 1.0), tl.where(use, yz, 0.0), tl.where(use, zz, 1.0),
-                cx, cy, cz, tl.where(use, c0, 1.0), tl.where(use, c1, 0.0), tl.where(use, c2, 0.0),
-                tl.where(use, c3, 1.0), tl.where(use, c4, 0.0), tl.where(use, c5, 1.0), lam,
-            )  # fmt: skip
+                x, y, z, a0, a1, a2, a3, a4, a5, cx, cy, cz, c0, c1, c2, c3, c4, c5, lam
+            )
             if has_distance:
-                d = tl.load(distances + index * capacity_k + slot, mask=use, other=0.0).to(tl.float64)
+                d = _number(distances + index * capacity_k + slot, use)
             n0, n1, n2, n3, n4, n5 = floored(n0, n1, n2, n3, n4, n5, epsilon * (n0 + n3 + n5))
             # After each match, the values are rounded to the stored precision.
-            x = tl.where(use, nx.to(stored).to(tl.float64), x)
-            y = tl.where(use, ny.to(stored).to(tl.float64), y)
-            z = tl.where(use, nz.to(stored).to(tl.float64), z)
-            xx = tl.where(use, n0.to(stored).to(tl.float64), xx)
-            xy = tl.where(use, n1.to(stored).to(tl.float64), xy)
-            xz = tl.where(use, n2.to(stored).to(tl.float64), xz)
-            yy = tl.where(use, n3.to(stored).to(tl.float64), yy)
-            yz = tl.where(use, n4.to(stored).to(tl.float64), yz)
-            zz = tl.where(use, n5.to(stored).to(tl.float64), zz)
+            x, y, z = _updated(use, nx, x, mean), _updated(use, ny, y, mean), _updated(use, nz, z, mean)
+            xx, xy, xz = _updated(use, n0, xx, mean), _updated(use, n1, xy, mean), _updated(use, n2, xz, mean)
+            yy, yz, zz = _updated(use, n3, yy, mean), _updated(use, n4, yz, mean), _updated(use, n5, zz, mean)
             yx, zx, zy = tl.where(use, xy, yx), tl.where(use, xz, zx), tl.where(use, yz, zy)
-            pi = tl.where(use, (pi + pi_c).to(stored).to(tl.float64), pi)
+            pi = _updated(use, pi + pi_c, pi, mean)
             added = w * pi_c
             total = compared_k + added
             rho = added / tl.where(use, total, 1.0)
-            m = tl.where(use, ((1 - rho) * m + rho * d).to(stored).to(tl.float64), m)
-            compared_k = tl.where(use, total.to(stored).to(tl.float64), compared_k)
+            m = _updated(use, (1 - rho) * m + rho * d, m, mean)
+            compared_k = _updated(use, total, compared_k, mean)
             if channels > 0:
-                from_c = features_c + index[:, None] * channels + f[None, :]
-                new = tl.load(from_c, mask=in_f & use[:, None], other=0.0).to(tl.float64)
-                mixed = ((1 - lam)[:, None] * h + lam[:, None] * new).to(stored).to(tl.float64)
-                h = tl.where(use[:, None], mixed, h)
+                new = _number(features_c + index[:, None] * channels + f[None, :], in_f & use[:, None])
+                h = _updated(use[:, None], (1 - lam)[:, None] * h + lam[:, None] * new, h, mean)
     tl.store(mean_o + 3 * k, x, mask=inside)
     tl.store(mean_o + 3 * k + 1, y, mask=inside)
     tl.store(mean_o + 3 * k + 2, z, mask=inside)
@@ -233,12 +262,6 @@ def _fuse(
     tl.store(disagreement_o + k, m, mask=inside)
     tl.store(compared_o + k, compared_k, mask=inside)
     tl.store(views_o + k, tl.where(any_match, n_k + w, n_k), mask=inside)
-    change = tl.where(any_match, change + w, change)
-    new = any_match & (change >= exact(complete, change))
-    tl.store(reference_o + 5 * k, tl.where(new, vx, rx), mask=inside)
-    tl.store(reference_o + 5 * k + 1, tl.where(new, vy, ry), mask=inside)
-    tl.store(reference_o + 5 * k + 2, tl.where(new, vz, rz), mask=inside)
-    tl.store(reference_o + 5 * k + 3, tl.where(new, v_member, r_member), mask=inside)
-    tl.store(reference_o + 5 * k + 4, tl.where(new, 0.0, change), mask=inside)
+    _write_reference(view, reference, reference_o, k, inside, any_match, w, complete)
     if channels > 0:
         tl.store(features_o + k[:, None] * channels + f[None, :], h, mask=in_f)

@@ -144,8 +144,47 @@ def mixed(running, newest, alpha: tl.constexpr):
 
 
 @triton.jit
-def _bounds(means, fields, capacity, j, listed, cx, cy, cz, hx, hy, hz, slack: tl.constexpr):
+def _pixels(pixels, b, height, width, chosen, side: tl.constexpr, subset: tl.constexpr):
+    """The program's pixels: row, column, whether they exist, and their index in the image and in the output."""
+    lane = tl.arange(0, side * side)
+    if subset:
+        position = tl.program_id(0) * (side * side) + lane
+        inside = position < chosen
+        target = b * chosen + position
+        source = tl.load(pixels + target, mask=inside, other=0).to(tl.int64)
+        v, u = source // width, source % width
+        source += b * height * width
+    else:
+        tile = tl.program_id(0)
+        across = tl.cdiv(width, side)
+        v, u = tile // across * side + lane // side, tile % across * side + lane % side
+        inside = (v < height) & (u < width)
+        source = (b * height + v) * width + u
+        target = source
+    return v, u, inside, source, target
+
+
+@triton.jit
+def _extent(values, usable, some):
+    """Least and greatest usable value; 0 unless there is ``some``."""
+    low = tl.min(tl.where(usable, values, float("inf")), 0)
+    high = tl.max(tl.where(usable, values, -float("inf")), 0)
+    return tl.where(some, low, 0.0), tl.where(some, high, 0.0)
+
+
+@triton.jit
+def _side(extent, fields, slack: tl.constexpr):
+    """Centre, and half the length with a margin for rounding, of a side of a box, in the dtype of the fields."""
+    low, high = extent
+    centre, half = 0.5 * (low + high), 0.5 * (high - low)
+    half = half + slack * (half + tl.abs(centre))
+    return centre.to(fields.dtype.element_ty), half.to(fields.dtype.element_ty)
+
+
+@triton.jit
+def _bounds(means, fields, capacity, j, listed, box, slack: tl.constexpr):
     """log2 of lower and upper bounds of the densities of components j in the box c +- h; -1e30 if not ``listed``."""
+    cx, cy, cz, hx, hy, hz = box
     real = fields.dtype.element_ty
     mx = tl.load(means + j, mask=listed, other=0.0).to(real)
     my = tl.load(means + capacity + j, mask=listed, other=0.0).to(real)
@@ -171,8 +210,10 @@ def _bounds(means, fields, capacity, j, listed, cx, cy, cz, hx, hy, hz, slack: t
 
 
 @triton.jit
-def _gap(means, fields, capacity, j, x_0, y_0, z_0, x, y, z):
-    """Largest distance along an axis of points from the box of component j; (x_0, y_0, z_0) is their origin."""
+def _gap(means, fields, capacity, j, origin, point):
+    """Largest distance along an axis of points, relative to their origin, from the box of component j."""
+    x_0, y_0, z_0 = origin
+    x, y, z = point
     real = fields.dtype.element_ty
     dx = tl.abs(x - (tl.load(means + j) - x_0).to(real)) - tl.load(fields + 7 * capacity + j)
     dy = tl.abs(y - (tl.load(means + capacity + j) - y_0).to(real)) - tl.load(fields + 8 * capacity + j)
@@ -181,8 +222,9 @@ def _gap(means, fields, capacity, j, x_0, y_0, z_0, x, y, z):
 
 
 @triton.jit
-def _box_gap(means, fields, capacity, j, listed, cx, cy, cz, hx, hy, hz):
+def _box_gap(means, fields, capacity, j, listed, box):
     """Largest distance along an axis between the box c +- h and those of components j."""
+    cx, cy, cz, hx, hy, hz = box
     real = fields.dtype.element_ty
     dx = tl.abs(cx - tl.load(means + j, mask=listed, other=0.0).to(real)) - hx
     dy = tl.abs(cy - tl.load(means + capacity + j, mask=listed, other=0.0).to(real)) - hy
@@ -191,6 +233,85 @@ def _box_gap(means, fields, capacity, j, listed, cx, cy, cz, hx, hy, hz):
     dy -= tl.load(fields + 8 * capacity + j, mask=listed, other=0.0)
     dz -= tl.load(fields + 9 * capacity + j, mask=listed, other=0.0)
     return tl.maximum(dx, tl.maximum(dy, dz))
+
+
+@triton.jit
+def _density(means, fields, capacity, j, origin, point):
+    """Density of component j, times its weight, at points relative to their origin."""
+    x_0, y_0, z_0 = origin
+    x, y, z = point
+    real = fields.dtype.element_ty
+    dx = x - (tl.load(means + j) - x_0).to(real)
+    dy = y - (tl.load(means + capacity + j) - y_0).to(real)
+    dz = z - (tl.load(means + 2 * capacity + j) - z_0).to(real)
+    y0 = tl.load(fields + j) * dx
+    y1 = tl.load(fields + capacity + j) * dx + tl.load(fields + 2 * capacity + j) * dy
+    y2 = tl.load(fields + 3 * capacity + j) * dx + tl.load(fields + 4 * capacity + j) * dy
+    y2 += tl.load(fields + 5 * capacity + j) * dz
+    return tl.exp2(tl.load(fields + 6 * capacity + j) - (y0 * y0 + y1 * y1 + y2 * y2))
+
+
+@triton.jit
+def _bits(flags, chunk: tl.constexpr):
+    """The flags [chunk] as the bits of a number."""
+    return tl.sum(tl.where(flags, tl.full([chunk], 1, tl.int64) << tl.arange(0, chunk).to(tl.int64), 0), 0)
+
+
+@triton.jit
+def _radius(
+    means, fields, capacity, n, box, origin, point,
+    near_radius: tl.constexpr, far_radius: tl.constexpr, chunk: tl.constexpr,
+):  # fmt: skip
+    """The radius of each point's neighbourhood: the near one if it reaches the box of a component, else the far one."""
+    part = tl.arange(0, chunk)
+    least_gap = tl.full(point[0].shape, float("inf"), fields.dtype.element_ty)
+    for first in range(0, n, chunk):
+        listed = first + part < n
+        listed &= _box_gap(means, fields, capacity, first + part, listed, box) <= far_radius
+        remaining = _bits(listed, chunk)
+        while remaining != 0:
+            bit, remaining = lowest_bit(remaining)
+            least_gap = tl.minimum(least_gap, _gap(means, fields, capacity, first + bit, origin, point))
+    return tl.where(least_gap <= near_radius, near_radius, far_radius)
+
+
+@triton.jit
+def _threshold(
+    means, fields, capacity, n, box, least: tl.constexpr, share: tl.constexpr, slack: tl.constexpr, chunk: tl.constexpr
+):
+    """log2 of the density below which a component is negligible in the box."""
+    part = tl.arange(0, chunk)
+    real = fields.dtype.element_ty
+    greatest = tl.full([chunk], least, real)
+    for first in range(0, n, chunk):
+        lower, _ = _bounds(means, fields, capacity, first + part, first + part < n, box, slack)
+        greatest = tl.maximum(greatest, lower)
+    return tl.max(greatest, 0) + share - tl.log2(tl.maximum(n, 1).to(real))
+
+
+@triton.jit
+def _finished(
+    value, measured_share, usable, inside, source, target, depth, running, memory, measured, counts, b, streams,
+    alpha: tl.constexpr, mode: tl.constexpr, relative: tl.constexpr, half: tl.constexpr,
+):  # fmt: skip
+    """Write and count the measured shares; replace M where no two views were compared (``unmeasured``), and apply the
+    moving average. Returns M."""
+    nan = float("nan")
+    if mode == 1:
+        size = relative * tl.load(depth + source, mask=usable, other=0.0)
+        value += tl.maximum(1 - measured_share, 0.0) * (size * size)
+    if mode == 2:
+        value = tl.where(measured_share < half, nan, value)
+    tl.store(measured + target, tl.where(usable, measured_share, nan), mask=inside)
+    tl.atomic_add(counts + 6 * streams + b, tl.sum(usable.to(tl.int32), 0))
+    tl.atomic_add(counts + 7 * streams + b, tl.sum((usable & (measured_share < half)).to(tl.int32), 0))
+    value = tl.where(usable, value, nan)
+    if alpha < 1.0:
+        newest = value.to(memory.dtype.element_ty)
+        averaged = mixed(tl.load(running + target, mask=inside, other=0.0), newest, alpha)
+        tl.store(memory + target, averaged, mask=inside)
+        value = tl.where(newest != newest, newest, averaged).to(depth.dtype.element_ty)
+    return value
 
 
 @triton.jit
@@ -204,92 +325,50 @@ def _regress(
 ):  # fmt: skip
     real = depth.dtype.element_ty
     b = tl.program_id(1).to(tl.int64)
-    lane = tl.arange(0, side * side)
     camera, index = camera + 9 * b, index + b * capacity
     means, fields = means + 3 * b * capacity, fields + stride * b * capacity
-    if subset:
-        position = tl.program_id(0) * (side * side) + lane
-        inside = position < chosen
-        target = b * chosen + position
-        source = tl.load(pixels + target, mask=inside, other=0).to(tl.int64)
-        v, u = source // width, source % width
-        source += b * height * width
-    else:
-        tile = tl.program_id(0)
-        across = tl.cdiv(width, side)
-        v, u = tile // across * side + lane // side, tile % across * side + lane % side
-        inside = (v < height) & (u < width)
-        source = (b * height + v) * width + u
-        target = source
+    v, u, inside, source, target = _pixels(pixels, b, height, width, chosen, side, subset)
     usable = inside & (tl.load(valid + source, mask=inside, other=0) != 0)
     z = tl.load(depth + source, mask=usable, other=0.0).to(tl.float64)
     x = (u - tl.load(camera + 2)) / tl.load(camera) * z
     y = (v - tl.load(camera + 5)) / tl.load(camera + 4) * z
-    any_valid = tl.sum(usable.to(tl.int32), 0) > 0
-    n = tl.where(any_valid, tl.load(count + b), 0)
+    some = tl.sum(usable.to(tl.int32), 0) > 0
+    n = tl.where(some, tl.load(count + b), 0)
 
     # The box of the points, and the nearest point as the origin.
-    inf = float("inf")
-    x_low, x_high = tl.min(tl.where(usable, x, inf), 0), tl.max(tl.where(usable, x, -inf), 0)
-    y_low, y_high = tl.min(tl.where(usable, y, inf), 0), tl.max(tl.where(usable, y, -inf), 0)
-    z_low, z_high = tl.min(tl.where(usable, z, inf), 0), tl.max(tl.where(usable, z, -inf), 0)
-    x_low, x_high = tl.where(any_valid, x_low, 0.0), tl.where(any_valid, x_high, 0.0)
-    y_low, y_high = tl.where(any_valid, y_low, 0.0), tl.where(any_valid, y_high, 0.0)
-    z_low, z_high = tl.where(any_valid, z_low, 0.0), tl.where(any_valid, z_high, 0.0)
-    cx, cy, cz = 0.5 * (x_low + x_high), 0.5 * (y_low + y_high), 0.5 * (z_low + z_high)
-    hx, hy, hz = 0.5 * (x_high - x_low), 0.5 * (y_high - y_low), 0.5 * (z_high - z_low)
-    hx, hy, hz = hx + slack * (hx + tl.abs(cx)), hy + slack * (hy + tl.abs(cy)), hz + slack * (hz + tl.abs(cz))
-    cx, cy, cz, hx, hy, hz = cx.to(real), cy.to(real), cz.to(real), hx.to(real), hy.to(real), hz.to(real)
-    nearest = tl.min(tl.where(usable & (z == z_low), lane, side * side), 0)
+    z_extent = _extent(z, usable, some)
+    cx, hx = _side(_extent(x, usable, some), fields, slack)
+    cy, hy = _side(_extent(y, usable, some), fields, slack)
+    cz, hz = _side(z_extent, fields, slack)
+    box = cx, cy, cz, hx, hy, hz
+    lane, z_0 = tl.arange(0, side * side), z_extent[0]
+    nearest = tl.min(tl.where(usable & (z == z_0), lane, side * side), 0)
     x_0, y_0 = tl.sum(tl.where(lane == nearest, x, 0.0), 0), tl.sum(tl.where(lane == nearest, y, 0.0), 0)
-    x, y, z = (x - x_0).to(real), (y - y_0).to(real), (z - z_low).to(real)
+    origin, point = (x_0, y_0, z_0), ((x - x_0).to(real), (y - y_0).to(real), (z - z_0).to(real))
 
-    part = tl.arange(0, chunk)
     if near:
-        least_gap = tl.full([side * side], inf, real)
-        for first in range(0, n, chunk):
-            listed = first + part < n
-            listed &= _box_gap(means, fields, capacity, first + part, listed, cx, cy, cz, hx, hy, hz) <= far_radius
-            remaining = tl.sum(tl.where(listed, tl.full([chunk], 1, tl.int64) << part.to(tl.int64), 0), 0)
-            while remaining != 0:
-                bit, remaining = lowest_bit(remaining)
-                gap = _gap(means, fields, capacity, first + bit, x_0, y_0, z_low, x, y, z)
-                least_gap = tl.minimum(least_gap, gap)
-        radius = tl.where(least_gap <= near_radius, near_radius, far_radius)
+        limit = _radius(means, fields, capacity, n, box, origin, point, near_radius, far_radius, chunk)
     else:
-        greatest = tl.full([chunk], least, real)
-        for first in range(0, n, chunk):
-            lower, _ = _bounds(means, fields, capacity, first + part, first + part < n, cx, cy, cz, hx, hy, hz, slack)
-            greatest = tl.maximum(greatest, lower)
-        threshold = tl.max(greatest, 0) + share - tl.log2(tl.maximum(n, 1).to(real))
-
+        limit = _threshold(means, fields, capacity, n, box, least, share, slack, chunk)
+    part, f = tl.arange(0, chunk), tl.arange(0, padded)
     evidence = tl.full([side * side], prior, real)
     total = tl.full([side * side], prior_total, real)
     compared_sum = tl.zeros([side * side], real)
-    f = tl.arange(0, padded)
     sums = tl.zeros([side * side, padded], real)
     for first in range(0, n, chunk):
         listed = first + part < n
         if near:
-            listed &= _box_gap(means, fields, capacity, first + part, listed, cx, cy, cz, hx, hy, hz) <= far_radius
+            listed &= _box_gap(means, fields, capacity, first + part, listed, box) <= far_radius
         else:
-            _, upper = _bounds(means, fields, capacity, first + part, listed, cx, cy, cz, hx, hy, hz, slack)
-            listed &= upper > threshold
-        bits = tl.where(listed, tl.full([chunk], 1, tl.int64) << part.to(tl.int64), 0)
-        remaining = tl.sum(bits, 0)
+            _, upper = _bounds(means, fields, capacity, first + part, listed, box, slack)
+            listed &= upper > limit
+        remaining = _bits(listed, chunk)
         while remaining != 0:
             bit, remaining = lowest_bit(remaining)
             j = first + bit
-            dx = x - (tl.load(means + j) - x_0).to(real)
-            dy = y - (tl.load(means + capacity + j) - y_0).to(real)
-            dz = z - (tl.load(means + 2 * capacity + j) - z_low).to(real)
-            y0 = tl.load(fields + j) * dx
-            y1 = tl.load(fields + capacity + j) * dx + tl.load(fields + 2 * capacity + j) * dy
-            y2 = tl.load(fields + 3 * capacity + j) * dx + tl.load(fields + 4 * capacity + j) * dy
-            y2 += tl.load(fields + 5 * capacity + j) * dz
-            w = tl.exp2(tl.load(fields + 6 * capacity + j) - (y0 * y0 + y1 * y1 + y2 * y2))
+            w = _density(means, fields, capacity, j, origin, point)
             if near:
-                w = tl.where(_gap(means, fields, capacity, j, x_0, y_0, z_low, x, y, z) <= radius, w, 0.0)
+                w = tl.where(_gap(means, fields, capacity, j, origin, point) <= limit, w, 0.0)
             k = b * capacity + tl.load(index + j)
             evidence += w
             if stepped:
@@ -298,27 +377,16 @@ def _regress(
             if channels > 0:
                 value = tl.load(features + k * channels + f, mask=f < channels, other=0.0).to(real)
                 sums += w[:, None] * value[None, :]
-    nan = float("nan")
     value = total / evidence
     if stepped:
         measured_share = compared_sum / evidence * tl.load(informative + b).to(real)
-        if mode == 1:
-            size = relative * tl.load(depth + source, mask=usable, other=0.0)
-            value += tl.maximum(1 - measured_share, 0.0) * (size * size)
-        if mode == 2:
-            value = tl.where(measured_share < half, nan, value)
-        tl.store(measured + target, tl.where(usable, measured_share, nan), mask=inside)
-        tl.atomic_add(counts + 6 * streams + b, tl.sum(usable.to(tl.int32), 0))
-        tl.atomic_add(counts + 7 * streams + b, tl.sum((usable & (measured_share < half)).to(tl.int32), 0))
-        value = tl.where(usable, value, nan)
-        if alpha < 1.0:
-            newest = value.to(memory.dtype.element_ty)
-            averaged = mixed(tl.load(running + target, mask=inside, other=0.0), newest, alpha)
-            tl.store(memory + target, averaged, mask=inside)
-            value = tl.where(newest != newest, newest, averaged).to(real)
+        value = _finished(
+            value, measured_share, usable, inside, source, target, depth, running, memory, measured, counts, b, streams,
+            alpha, mode, relative, half,
+        )  # fmt: skip
+    nan = float("nan")
     tl.store(out + target, tl.where(usable, value, nan), mask=inside)
     if channels > 0:
         values = tl.where(usable[:, None], sums / evidence[:, None], nan)
-        tl.store(
-            out_f + target[:, None] * channels + f[None, :], values, mask=inside[:, None] & (f < channels)[None, :]
-        )
+        stored = inside[:, None] & (f < channels)[None, :]
+        tl.store(out_f + target[:, None] * channels + f[None, :], values, mask=stored)

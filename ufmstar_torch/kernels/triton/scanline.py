@@ -135,6 +135,23 @@ def _finish(
 
 
 @triton.jit
+def _near_line(
+    x, z, x_left, z_left, x_right, z_right, dx, dz, n, slope,
+    noise_floor: tl.constexpr, noise_thresh: tl.constexpr, line_thresh: tl.constexpr, n_check: tl.constexpr,
+):  # fmt: skip
+    """[R, Q] whether a row's pixel x, z [R, 1] continues its segments: near the last point of short ones, near the line
+    of longer ones."""
+    t = slope[:, None] * z * z
+    tau_z = tl.minimum(tl.maximum(6.0 * t, exact(noise_floor, t)), exact(noise_thresh, t))
+    tau_x = tl.minimum(tl.maximum(t, exact(noise_floor, t)), exact(line_thresh, t))
+    close = (tl.abs(z - z_right) < tau_z) & (tl.abs(x - x_right) < tau_x)
+    flat = dx == 0
+    line = z_left + dz * (x - x_left) / tl.where(flat, 1.0, dx)
+    straight = (tl.abs(line - z) < tau_z) & ~flat
+    return (close & (n <= n_check)) | (straight & (n > n_check))
+
+
+@triton.jit
 def _scanline(
     depth, camera, lengths2, bins, moments, integers, counts, owner, finished_index, rows, height, width, most,
     scale: tl.constexpr, reference: tl.constexpr, scaled: tl.constexpr, noise_floor: tl.constexpr,
@@ -169,17 +186,11 @@ def _scanline(
         x = (u - cx) / fx * z
         k = tl.load(bins + pixel, mask=use, other=0).to(tl.int32)
         length2 = tl.load(lengths2 + b * number + k, mask=use, other=0.0)[:, None]
-        t = slope * z * z
-        tau_z = tl.minimum(tl.maximum(6.0 * t, exact(noise_floor, t)), exact(noise_thresh, t))[:, None]
-        tau_x = tl.minimum(tl.maximum(t, exact(noise_floor, t)), exact(line_thresh, t))[:, None]
-        x, z, used = x[:, None], z[:, None], use[:, None]
-
-        near = (n > 0) & (u - u_right <= gap) & (w2 < length2)
-        close = (tl.abs(z - z_right) < tau_z) & (tl.abs(x - x_right) < tau_x)
-        flat = dx == 0
-        line = z_left + dz * (x - x_left) / tl.where(flat, 1.0, dx)
-        straight = (tl.abs(line - z) < tau_z) & ~flat
-        fits = near & ((close & (n <= n_check)) | (straight & (n > n_check))) & used
+        x, z = x[:, None], z[:, None]
+        fits = (n > 0) & (u - u_right <= gap) & (w2 < length2) & use[:, None]
+        fits = fits & _near_line(
+            x, z, x_left, z_left, x_right, z_right, dx, dz, n, slope, noise_floor, noise_thresh, line_thresh, n_check
+        )
         newest = tl.max(tl.where(fits, born, -1), 1)
         start = use & (newest < 0)
         # A new segment takes a free register, or that of the oldest one, which is finished.

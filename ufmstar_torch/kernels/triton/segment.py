@@ -190,6 +190,103 @@ def _most_active(counts, height, lanes: tl.constexpr):
 
 
 @triton.jit
+def _most_overlapping(u_left, u_right, h_left, h_right, open, single: tl.constexpr):
+    """The lanes of ``open`` Gaussians whose interval shares the largest part with a segment's."""
+    shared = tl.minimum(u_right, h_right) - tl.maximum(u_left, h_left)
+    span = tl.maximum(u_right, h_right) - tl.minimum(u_left, h_left)
+    over = open & (shared > 0)
+    rho = _ratio(tl.where(over, shared, 0), tl.where(over, span, 1), single)
+    return over & (rho == tl.max(rho, 0))
+
+
+@triton.jit
+def _coplanar(mean, line, offset, merged, segment, along, slope, noise_floor: tl.constexpr, angle2: tl.constexpr):
+    """[lanes] True where a segment with the line ``along`` is parallel to a Gaussian's line, and its mean is close to
+    the Gaussian's plane, or to the mean of a Gaussian of one row."""
+    mx, my, mz = mean
+    lx, ly, lz = line
+    px, py, pz = offset
+    hx, hy, hz = segment
+    hlx, hlz = along
+    dot = hlx * lx + hlz * lz
+    parallel = dot * dot > angle2 * (hlx * hlx + hlz * hlz) * (lx * lx + lz * lz)
+    dx, dy, dz = mx - hx, my - hy, mz - hz
+    first = tl.abs(dz) < 6.0 * (slope * mz * mz)
+    nx, ny, nz = ly * pz - lz * py, lz * px - lx * pz, lx * py - ly * px
+    distance = nx * dx + ny * dy + nz * dz
+    later = distance * distance < (nx * nx + ny * ny + nz * nz) * (noise_floor * noise_floor)
+    return parallel & ((first & (merged == 1)) | (later & (merged != 1)))
+
+
+@triton.jit
+def _joint(join, n, hn, mean, scatter, segment, segment_scatter):
+    """Means and scatters of the Gaussians [lanes], those of the mask ``join`` with a segment's pixels."""
+    mx, my, mz = mean
+    sxx, sxy, sxz, syy, syz, szz = scatter
+    hx, hy, hz = segment
+    hxx, hxy, hxz, hyy, hyz, hzz = segment_scatter
+    both = n + hn
+    share = hn.to(tl.float64) / both.to(tl.float64)
+    factor = n.to(tl.float64) * hn.to(tl.float64) / both.to(tl.float64)
+    dx, dy, dz = hx - mx, hy - my, hz - mz
+    sxx = tl.where(join, sxx + (hxx + factor * (dx * dx)), sxx)
+    sxy = tl.where(join, sxy + (hxy + factor * (dx * dy)), sxy)
+    sxz = tl.where(join, sxz + (hxz + factor * (dx * dz)), sxz)
+    syy = tl.where(join, syy + (hyy + factor * (dy * dy)), syy)
+    syz = tl.where(join, syz + (hyz + factor * (dy * dz)), syz)
+    szz = tl.where(join, szz + (hzz + factor * (dz * dz)), szz)
+    mx, my = tl.where(join, mx + share * dx, mx), tl.where(join, my + share * dy, my)
+    return mx, my, tl.where(join, mz + share * dz, mz), sxx, sxy, sxz, syy, syz, szz
+
+
+@triton.jit
+def _large_enough(gone, n, merged, min_pixels: tl.constexpr, min_rows: tl.constexpr, prune: tl.constexpr):
+    """The Gaussians ``gone`` that are not pruned."""
+    large, tall = n >= min_pixels, merged >= min_rows
+    if prune == 0:
+        keep = gone
+    elif prune == 1:
+        keep = gone & (large | tall)
+    else:
+        keep = gone & large & tall
+    return keep
+
+
+@triton.jit
+def _slots(keep, born, retained, lanes: tl.constexpr):
+    """Slots of the Gaussians ``keep`` in the order of their creation, -1 for others, after ``retained`` earlier ones;
+    and the new number of these."""
+    slot = tl.arange(0, lanes) * 0 - 1
+    waiting = keep
+    for _ in range(tl.sum(keep.to(tl.int32), 0)):
+        next_born = tl.min(tl.where(waiting, born, 2147483647), 0)
+        selected = waiting & (born == next_born)
+        slot = tl.where(selected, retained, slot)
+        waiting = waiting & ~selected
+        retained += 1
+    return slot, retained
+
+
+@triton.jit
+def _write(out, keep, n, mean, scatter, mean_o, covariance_o, weight_o, rounded: tl.constexpr):
+    """Write the Gaussians ``keep`` to slots ``out`` of the mixture."""
+    mx, my, mz = mean
+    sxx, sxy, sxz, syy, syz, szz = scatter
+    ratio = tl.where(n > 1, n - 1, 1).to(tl.float64)
+    several = n > 1
+    cxx, cxy = tl.where(several, sxx / ratio, 0.0), tl.where(several, sxy / ratio, 0.0)
+    cxz, cyy = tl.where(several, sxz / ratio, 0.0), tl.where(several, syy / ratio, 0.0)
+    cyz, czz = tl.where(several, syz / ratio, 0.0), tl.where(several, szz / ratio, 0.0)
+    cxx, cxy, cxz = _stored(cxx, rounded), _stored(cxy, rounded), _stored(cxz, rounded)
+    cyy, cyz, czz = _stored(cyy, rounded), _stored(cyz, rounded), _stored(czz, rounded)
+    tl.store(mean_o + 3 * out, _stored(mx, rounded), mask=keep)
+    tl.store(mean_o + 3 * out + 1, _stored(my, rounded), mask=keep)
+    tl.store(mean_o + 3 * out + 2, _stored(mz, rounded), mask=keep)
+    store_symmetric(covariance_o + 9 * out, cxx, cxy, cxz, cyy, cyz, czz, keep)
+    tl.store(weight_o + out, n.to(tl.float64), mask=keep)
+
+
+@triton.jit
 def _join(
     camera, moments, integers, counts, mean_o, covariance_o, weight_o, member, slot_of,
     height, most, capacity, total,
@@ -226,38 +323,18 @@ def _join(
             # Prefetch the next segment while this one is tested.
             prefetched = _loaded(moments, integers, tl.where(j + 1 < found, row * most + j + 1, following))
             hy, hly = ry * hz, ry * hlz
+            hxy, hyy, hyz = ry * hxz, ry * ry * hzz, ry * hzz
 
-            shared = tl.minimum(u_right, h_right) - tl.maximum(u_left, h_left)
-            span = tl.maximum(u_right, h_right) - tl.minimum(u_left, h_left)
-            over = (born >= 0) & (since < v) & (shared > 0)
-            rho = _ratio(tl.where(over, shared, 0), tl.where(over, span, 1), single)
-            best = over & (rho == tl.max(rho, 0))
+            best = _most_overlapping(u_left, u_right, h_left, h_right, (born >= 0) & (since < v), single)
             oldest = tl.min(tl.where(best, born, 2147483647), 0)
-
-            dot = hlx * lx + hlz * lz
-            along = dot * dot > angle2 * (hlx * hlx + hlz * hlz) * (lx * lx + lz * lz)
-            dx, dy, dz = mx - hx, my - hy, mz - hz
-            first = tl.abs(dz) < 6.0 * (slope * mz * mz)
-            nx, ny, nz = ly * pz - lz * py, lz * px - lx * pz, lx * py - ly * px
-            distance = nx * dx + ny * dy + nz * dz
-            later = distance * distance < (nx * nx + ny * ny + nz * nz) * (noise_floor * noise_floor)
-            plane = (first & (merged == 1)) | (later & (merged != 1))
-            join = best & (born == oldest) & (p2 < reach) & along & plane
-            joined = tl.sum(join.to(tl.int32), 0) > 0
-            if joined:
-                both = n + hn
-                share = hn.to(tl.float64) / both.to(tl.float64)
-                factor = n.to(tl.float64) * hn.to(tl.float64) / both.to(tl.float64)
-                dx, dy, dz = hx - mx, hy - my, hz - mz
-                sxx = tl.where(join, sxx + (hxx + factor * (dx * dx)), sxx)
-                sxy = tl.where(join, sxy + (ry * hxz + factor * (dx * dy)), sxy)
-                sxz = tl.where(join, sxz + (hxz + factor * (dx * dz)), sxz)
-                syy = tl.where(join, syy + (ry * ry * hzz + factor * (dy * dy)), syy)
-                syz = tl.where(join, syz + (ry * hzz + factor * (dy * dz)), syz)
-                szz = tl.where(join, szz + (hzz + factor * (dz * dz)), szz)
-                mx, my, mz = (
-                    tl.where(join, mx + share * dx, mx), tl.where(join, my + share * dy, my),
-                    tl.where(join, mz + share * dz, mz),
+            join = best & (born == oldest) & (p2 < reach)
+            join = join & _coplanar(
+                (mx, my, mz), (lx, ly, lz), (px, py, pz), merged, (hx, hy, hz), (hlx, hlz), slope, noise_floor, angle2
+            )
+            if tl.sum(join.to(tl.int32), 0) > 0:
+                mx, my, mz, sxx, sxy, sxz, syy, syz, szz = _joint(
+                    join, n, hn, (mx, my, mz), (sxx, sxy, sxz, syy, syz, szz), (hx, hy, hz),
+                    (hxx, hxy, hxz, hyy, hyz, hzz),
                 )  # fmt: skip
                 lx, ly, lz = tl.where(join, lx + hlx, lx), tl.where(join, ly + hly, ly), tl.where(join, lz + hlz, lz)
                 begun = join & (merged == 1)
@@ -265,7 +342,7 @@ def _join(
                 ex, ey, ez = hx - ox, hy - oy, hz - oz
                 px, py, pz = tl.where(join, px + ex, px), tl.where(join, py + ey, py), tl.where(join, pz + ez, pz)
                 p2 = tl.where(join, ex * ex + ey * ey + ez * ez, p2)
-                n = tl.where(join, both, n)
+                n = tl.where(join, n + hn, n)
                 merged = tl.where(join, merged + 1, merged)
                 u_left = tl.where(join, (u_left + h_left) // 2, u_left)
                 u_right = tl.where(join, (u_right + h_right) // 2, u_right)
@@ -275,9 +352,8 @@ def _join(
             else:
                 free = lane == tl.min(tl.where(born < 0, lane, lanes), 0)
                 mx, my, mz = tl.where(free, hx, mx), tl.where(free, hy, my), tl.where(free, hz, mz)
-                sxx, sxy, sxz = tl.where(free, hxx, sxx), tl.where(free, ry * hxz, sxy), tl.where(free, hxz, sxz)
-                syy, syz = tl.where(free, ry * ry * hzz, syy), tl.where(free, ry * hzz, syz)
-                szz = tl.where(free, hzz, szz)
+                sxx, sxy, sxz = tl.where(free, hxx, sxx), tl.where(free, hxy, sxy), tl.where(free, hxz, sxz)
+                syy, syz, szz = tl.where(free, hyy, syy), tl.where(free, hyz, syz), tl.where(free, hzz, szz)
                 lx, ly, lz = tl.where(free, hlx, lx), tl.where(free, hly, ly), tl.where(free, hlz, lz)
                 ox, oy, oz = tl.where(free, 0.0, ox), tl.where(free, 0.0, oy), tl.where(free, 0.0, oz)
                 px, py, pz = tl.where(free, 0.0, px), tl.where(free, 0.0, py), tl.where(free, 0.0, pz)
@@ -290,35 +366,13 @@ def _join(
         # Gaussians that the row did not extend end, and all after the last row. Slots follow the order of creation.
         gone = (born >= 0) & (tl.where(height - 1 - v == 0, -1, last) != v)
         if tl.sum(gone.to(tl.int32), 0) > 0:
-            large, tall = n >= min_pixels, merged >= min_rows
-            if prune == 0:
-                keep = gone
-            elif prune == 1:
-                keep = gone & (large | tall)
-            else:
-                keep = gone & large & tall
-            slot = lane * 0 - 1
-            waiting = keep
-            for _ in range(tl.sum(keep.to(tl.int32), 0)):
-                next_born = tl.min(tl.where(waiting, born, 2147483647), 0)
-                selected = waiting & (born == next_born)
-                slot = tl.where(selected, retained, slot)
-                waiting = waiting & ~selected
-                retained += 1
+            keep = _large_enough(gone, n, merged, min_pixels, min_rows, prune)
+            slot, retained = _slots(keep, born, retained, lanes)
             tl.store(slot_of + b * total + born, slot, mask=gone)
-            out = b * capacity + slot
-            ratio = tl.where(n > 1, n - 1, 1).to(tl.float64)
-            several = n > 1
-            cxx, cxy = tl.where(several, sxx / ratio, 0.0), tl.where(several, sxy / ratio, 0.0)
-            cxz, cyy = tl.where(several, sxz / ratio, 0.0), tl.where(several, syy / ratio, 0.0)
-            cyz, czz = tl.where(several, syz / ratio, 0.0), tl.where(several, szz / ratio, 0.0)
-            cxx, cxy, cxz = _stored(cxx, rounded), _stored(cxy, rounded), _stored(cxz, rounded)
-            cyy, cyz, czz = _stored(cyy, rounded), _stored(cyz, rounded), _stored(czz, rounded)
-            tl.store(mean_o + 3 * out, _stored(mx, rounded), mask=keep)
-            tl.store(mean_o + 3 * out + 1, _stored(my, rounded), mask=keep)
-            tl.store(mean_o + 3 * out + 2, _stored(mz, rounded), mask=keep)
-            store_symmetric(covariance_o + 9 * out, cxx, cxy, cxz, cyy, cyz, czz, keep)
-            tl.store(weight_o + out, n.to(tl.float64), mask=keep)
+            _write(
+                b * capacity + slot, keep, n, (mx, my, mz), (sxx, sxy, sxz, syy, syz, szz), mean_o, covariance_o,
+                weight_o, rounded,
+            )  # fmt: skip
             born = tl.where(gone, -1, born)
 
 
