@@ -1,14 +1,8 @@
 """Hundreds of invalid frames and damaged recordings: the state stays valid, streams independent, errors documented.
 
-<<<<<<< HEAD
-``pytest -m slow tests/test_hostile.py`` runs 1,000 frames, ``UFMSTAR_HOSTILE_FRAMES=10000`` that many. Every session of
-20 frames has its number as seed, so that a failure can be repeated. Damaged files: 300 of each layout, also with a seed
-each; of the output folder of a run, 400."""
-=======
 ``pytest -m slow tests/test_hostile.py`` runs 500 frames, ``UFMSTAR_HOSTILE_FRAMES=10000`` that many. Every session of
 20 frames has its number as seed, so that a failure can be repeated. Damaged files: 150 of each layout, also with a seed
-each."""
->>>>>>> main
+each; of the output folder of a run, 400."""
 
 from __future__ import annotations
 

@@ -44,13 +44,8 @@ class Mixture(SumMetric):
         weight, sigma, error = torch.stack([1 - p, p]), parts.sqrt(), g - d
         log_density = -(error.square() / parts + (2 * torch.pi * parts).log()) / 2
         confidence = (weight * torch.erf(_DELTA * d.abs() / (2**0.5 * sigma))).sum(0)
-<<<<<<< HEAD
         below = (weight * (1 + torch.erf(error / (2**0.5 * sigma)))).sum(0) / 2
-        bins = (confidence * _BINS).long().clamp_max(_BINS - 1)
-=======
-        below = (weight * torch.special.ndtr(error / sigma)).sum(0)
         bins, by_outlier = ((x * _BINS).long().clamp_max(_BINS - 1) for x in (confidence, p))
->>>>>>> main
         accurate = error.abs() <= _DELTA * d.abs()
         first = chosen.histogram((below * _BINS - 0.5).ceil().long(), _BINS + 1)  # number of levels below
         return {
