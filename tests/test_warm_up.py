@@ -109,7 +109,7 @@ def test_a_part_becomes_machine_code_in_its_kernel_alone(monkeypatch):
     [
         (codegen.JITCodeLibrary, "_optimize_functions _optimize_final_module _finalize_final_module"),
         (codegen.JITCodeLibrary, "_finalize_dynamic_globals get_pointer_to_function codegen enable_object_caching"),
-        (codegen.JITCPUCodegen, "_module_pass_manager set_env"),
+        (codegen.JITCPUCodegen, "set_env"),
         (untyped_passes, "TranslateByteCode FixupArgs IRProcessing GenericRewrites ReconstructSSA"),
         (typed_passes, "NopythonTypeInference PreLowerStripPhis IRLegalization NativeLowering NoPythonBackend"),
         (compiler.Flags, "values options copy"),
@@ -253,7 +253,7 @@ def test_every_kernel_has_a_stamp_of_its_own():
     modules = [importlib.import_module(m.name) for m in pkgutil.walk_packages(ufmstar_torch.__path__, "ufmstar_torch.")
                if m.name.split(".")[1] in ("kernels", "anchors", "posterior") and "triton" not in m.name]  # fmt: skip
     kernels = {one.py_func for m in modules for one in vars(m).values() if isinstance(one, Dispatcher)}
-    assert len(kernels) > 40
+    assert len(kernels) > 30
     assert len({compile_cpu.code_stamp(one) for one in kernels}) == len(kernels)
 
 
