@@ -5,9 +5,10 @@ by its own factor). ``camera.resize_intrinsics`` and ``crop_intrinsics`` convert
 half a pixel outside its outer pixel centres. UfM* works at the network's resolution, so predictions are not resized
 back.
 
-Colour is resampled linearly with antialiasing, like Pillow's bilinear filter, with which FastDepth was trained and
-validated, or cubically if a network was trained so (Depth Anything). Depth is sampled at the nearest pixel, since a
-mean over a depth edge lies on no surface.
+Colour is resampled linearly with antialiasing, as Pillow's bilinear filter does, or cubically if a network was trained
+so (Depth Anything). FastDepth's published loader takes the nearest pixel instead; on the four recordings (README.md)
+its depth has the same error either way. Depth is sampled at the nearest pixel, since a mean over a depth edge lies on
+no surface.
 """
 
 from __future__ import annotations
@@ -179,25 +180,16 @@ class Preprocess(Checked):
         return depth[..., rows.to(depth.device)[:, None], columns.to(depth.device)]
 
     def resampled(self, image: Tensor) -> Tensor:
-        """[B, 3, h, w] in [0, 1], resized, cropped and resized. Bytes on the CPU: a kernel resamples them linearly
-        (``preprocess_cpu``); torch cubically, rounding as the image processors of ``transformers`` do."""
+        """[B, 3, h, w] in [0, 1], resized, cropped and resized. Bytes on the CPU stay bytes until the last step, and are
+        rounded as by Pillow and by transformers' processors; other devices and types compute in floats."""
         _check(image)
-        as_bytes = image.dtype == torch.uint8 and image.is_cpu and self.antialias
-        if as_bytes and not self.cubic and torch.get_default_dtype() == torch.float32 and len(image):
-            from ufmstar_torch.models.preprocess_cpu import resample
-
-            g = self.geometry(*image.shape[-2:])
-            once = g.resized == g.cropped == g.image
-            steps = (g.final, 0, 0, g.final, g.final) if once else (g.resized, g.top, g.left, g.cropped, g.final)
-            pixels = image.permute(0, 2, 3, 1).contiguous().numpy()
-            return torch.stack([torch.from_numpy(resample(one, *steps)) for one in pixels])
-        return _unit(self._steps(image)) if as_bytes and self.cubic else self.by_torch(image)
-
-    def by_torch(self, image: Tensor) -> Tensor:
-        """As :meth:`resampled`, in floats: the reference for all devices, dtypes and filters."""
         if image.dtype in (torch.float16, torch.bfloat16):  # not supported by torch on the CPU
-            return self.by_torch(image.float()).to(image.dtype)
-        return self._steps(image if image.is_floating_point() else _unit(image))
+            return self.resampled(image.float()).to(image.dtype)
+        if image.dtype != torch.uint8:
+            return self._steps(image)
+        if image.is_cpu and self.antialias:  # torch has a fast path for bytes with interleaved channels
+            return _unit(self._steps(image.contiguous(memory_format=torch.channels_last)))
+        return self._steps(_unit(image))
 
     def _steps(self, x: Tensor) -> Tensor:
         g = self.geometry(*x.shape[-2:])

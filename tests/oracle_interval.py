@@ -6,7 +6,7 @@ import itertools
 import math
 
 NORMAL = {0.5: 0.6744897501960817, 0.9: 1.6448536269514722, 0.99: 2.5758293035489004}
-TRANSFER = {0.5: 1.13, 0.9: 1.19, 0.99: 1.05}
+TRANSFER = {0.5: 0.91, 0.9: 1.11, 0.99: 1.0}
 
 
 def phi(z: float) -> float:
@@ -80,5 +80,6 @@ def weights(distance, area, everywhere):
 
 
 def quantiles(state):
-    values = [z * math.exp(log) * f for z, log, f in zip(NORMAL.values(), state[1:], TRANSFER.values(), strict=True)]
+    levels = zip(NORMAL.values(), state[1:], TRANSFER.values(), strict=True)
+    values = [z * math.exp(log / 2) * f for z, log, f in levels]
     return [max(values[: i + 1]) if state[0] >= 3 else math.nan for i in range(3)]

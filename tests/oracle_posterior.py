@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import oracle_interval as interval
@@ -20,7 +21,7 @@ START = {
     "centre": (0.0, 0.0, -14.0, 14.0),
     "calibration": (0.0, 0.0, 0.0, 1e6),
 }
-PRIOR, DRIFT, MEMORY = np.array([0.5, 0.2, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
+PRIOR, DRIFT, MEMORY = np.array([0.5, 0.12, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
 REACH, RADIUS, NEAR, WEAK, CLIP, APART = 1.0, 0.15, 0.05, 0.25**2, 9.0, 0.5
 
 
@@ -90,7 +91,7 @@ def joint_prior(logs, state):
         for a, b, s in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
             Q[q + a, q + b] += s * w
     mean = np.zeros(q + n)
-    mean[:4] = T @ state["b"]
+    mean[:4] = T @ state["b"] + np.array([0, 0, *(0.2 * state["slopes"][1:] * (state["frames"] > 0))])
     return mean, Q
 
 
@@ -145,61 +146,89 @@ def update(state, depth, claimed, pixel, g, variance, motion=None):
     another [H, W].
     """
     logs = nodes(depth)
-    rows, cols = logs.shape
-    n, m0, (h, w_) = logs.size, logs.mean(), depth.shape
-    mean0, Q = joint_prior(logs, state)
-    X, N = node_features(logs), len(g)
-    u, v = (pixel[:, 0] + 0.5) / w_, (pixel[:, 1] + 0.5) / h
+    prior = joint_prior(logs, state)
+    seen = observed(state, depth, logs, pixel, g, variance)
+    fit = fitted(state, logs, *prior, seen)
+    after = learnt(state, logs, *prior, seen, fit)
+    offset, alone, spread, p, share = at_nodes(state, after, depth.shape, logs, seen, fit, motion)
+    b = fit.mean[:4]
+    posterior, variance, outlier = read(depth, np.nan_to_num(claimed), logs, b, offset, spread, p, share)
+    _, inlier, _ = read(depth, 0 * depth, logs, b, offset, alone, p, share)
+    return after, posterior, variance, inlier, outlier
+
+
+def observed(state, depth, logs, pixel, g, variance):
+    """The anchors: y = log(g / d), design H, cell, position, and variances of the noise."""
+    (rows, cols), (h, w), N = logs.shape, depth.shape, len(g)
+    u, v = (pixel[:, 0] + 0.5) / w, (pixel[:, 1] + 0.5) / h
     node = np.minimum((v * rows).astype(int), rows - 1) * cols + np.minimum((u * cols).astype(int), cols - 1)
     at = np.rint(pixel).astype(int)
     d = np.array([depth[r, c] for c, r in at])
-    y = np.log(g / d)
-    stated, roughness = ratio(state, "noise") * variance / g**2 + 1 / N, ratio(state, "roughness")
-    blur = np.zeros(N)
+    stated, blur = ratio(state, "noise") * variance / g**2 + 1 / N, np.zeros(N)
     for k, (c, r) in enumerate(at):
         around = depth[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2]
         around = np.log(around[around > 0])
         blur[k] = (around.max() - around.min()) / 2
-    noise = stated + roughness + blur**2
-    x = np.array([features(math.log(d[k]) - m0, u[k], v[k]) for k in range(N)])
-    H = design(x, node, n)
-    weight, prior = 1 / noise, Q
+    x = np.array([features(math.log(d[k]) - logs.mean(), u[k], v[k]) for k in range(N)])
+    noise = stated + ratio(state, "roughness") + blur**2
+    return SimpleNamespace(
+        y=np.log(g / d), H=design(x, node, logs.size), node=node, u=u, v=v, stated=stated, noise=noise
+    )
+
+
+def fitted(state, logs, mean0, Q, seen):
+    """Mean and covariance of (b, f) after a fit and one with new weights, and each anchor's residual without itself."""
+    weight, prior = 1 / seen.noise, Q
     for round_ in range(2):
-        mean, C = condition(mean0, prior, H, y, weight)
-        fit, var = H @ mean, np.einsum("ij,jk,ik->i", H, C, H)
+        mean, C = condition(mean0, prior, seen.H, seen.y, weight)
+        var = np.einsum("ij,jk,ik->i", seen.H, C, seen.H)
         remainder = np.maximum(1 - weight * var, 0.05)
-        residual, var = (y - fit) / remainder, var / remainder
-        total = var + noise
+        residual, var = (seen.y - seen.H @ mean) / remainder, var / remainder
+        total = var + seen.noise
         if round_ < 1:
-            weight = 1 / (noise + np.maximum(residual**2 / total - 1, 0) * total / 3)
+            weight = 1 / (seen.noise + np.maximum(residual**2 / total - 1, 0) * total / 3)
             prior = loosened(Q, logs, mean[FEATURES:], ratio(state, "amplitude"))
-    away = distances(logs, set(node[weight * WEAK >= 1]))
-    count = np.bincount(node, minlength=n)[node]
-    square = np.minimum(residual**2, CLIP * total)
-    new = {}
-    for name, part in (("roughness", np.full(N, roughness)), ("noise", stated)):
-        weights = (part / total) ** 2 / count
+    away, z2 = distances(logs, set(seen.node[weight * WEAK >= 1])), np.minimum(residual**2 / total, CLIP)
+    return SimpleNamespace(mean=mean, C=C, weight=weight, residual=residual, total=total, away=away, z2=z2)
+
+
+def learnt(state, logs, mean0, Q, seen, fit):
+    """The state after the frame."""
+    node, N, new = seen.node, len(seen.y), {}
+    count, square = np.bincount(node, minlength=logs.size)[node], np.minimum(fit.residual**2, CLIP * fit.total)
+    roughness = ratio(state, "roughness")
+    for name, part in (("roughness", np.full(N, roughness)), ("noise", seen.stated)):
+        weights = (part / fit.total) ** 2 / count
         unit = ratio(state, name) / np.maximum(part, 1e-12)
-        new[name] = (weights * (part + square - total) * unit).sum(), weights.sum()
-    z2 = np.minimum(residual**2 / total, CLIP)
-    new |= discs(state, logs, Q, mean0, H, y, weight, noise, z2, node, u, v, stated - 1 / N, away)
-    c, new["centre"], new["between"] = surfaces(state, node, y - H[:, 2:4] @ mean[2:4], noise)
+        new[name] = (weights * (part + square - fit.total) * unit).sum(), weights.sum()
+    new |= discs(state, logs, Q, mean0, seen.H, seen.y, fit.weight, seen.noise, fit.z2, node, seen.u, seen.v,
+                 seen.stated - 1 / N, fit.away)  # fmt: skip
+    c, new["centre"], new["between"] = surfaces(state, node, seen.y - seen.H[:, 2:4] @ fit.mean[2:4], seen.noise)
     weights = 3 + sum(MEMORY**k for k in range(state["frames"] + 1))
-    slopes = state["slopes"] * (1 - 1 / weights) + mean[1:4] / weights
-    after = {"frames": state["frames"] + 1, "m0": m0, "slopes": slopes, "b": mean[:4], "C": C[:4, :4], "sums": {}}
-    after["scores"] = new.pop("scores")
+    slopes = state["slopes"] * (1 - 1 / weights) + fit.mean[1:4] / weights
+    after = {"frames": state["frames"] + 1, "m0": logs.mean(), "slopes": slopes, "b": fit.mean[:4],
+             "C": fit.C[:4, :4], "sums": {}, "scores": new.pop("scores"), "most": c}  # fmt: skip
     for name, (value, prior, low, high) in START.items():
         above, below = state["sums"][name]
         below = MEMORY * below + (1 - MEMORY) * prior + new[name][1]
         above = MEMORY * above + (1 - MEMORY) * prior * value + new[name][0]
         after["sums"][name] = [min(max(above, low * below), high * below), below]
+    return after
+
+
+def at_nodes(state, after, size, logs, seen, fit, motion):
+    """Offset of log depth, relative variances on the evidence's surface and in all, probability of another surface, and
+    distance, at the nodes."""
+    mean, C, n = fit.mean, fit.C, logs.size
+    X, used = node_features(logs), np.ones(len(seen.y), bool)
     HX = design(X, np.arange(n), n)
-    field, unseen = np.einsum("ij,jk,ik->i", HX, C, HX), away * ratio(after, "unseen")
-    scale, steep = local_scale(logs.shape, node, z2, noise, np.ones(N, bool)), steepness(logs.shape, mean[FEATURES:])
-    unmeasured = min(C[0, 0] / PRIOR[0], 1) ** 2
-    spread = scale * at_pixels(inlier_factor(after, away), field, ratio(after, "roughness"), unseen, steep, unmeasured)
-    offset, share = HX[:, 4:] @ mean[4:], away / REACH
-    around = y_variance(logs.shape, node, y, noise, np.ones(N, bool), mean[0])
+    field, unseen = np.einsum("ij,jk,ik->i", HX, C, HX), fit.away * ratio(after, "unseen")
+    scale = local_scale(logs.shape, seen.node, fit.z2, seen.noise, used)
+    steep, unmeasured = steepness(logs.shape, mean[FEATURES:]), min(C[0, 0] / PRIOR[0], 1) ** 2
+    factor = inlier_factor(after, fit.away)
+    spread = scale * at_pixels(factor, field, ratio(after, "roughness"), unseen, steep, unmeasured)
+    offset, share = HX[:, 4:] @ mean[4:], fit.away / REACH
+    around = y_variance(logs.shape, seen.node, seen.y, seen.noise, used, mean[0])
     p = np.minimum(ratio(after, "wrong") * wrong_factor(share, scale), 0.5)
     wide = [elsewhere(*each) for each in zip(around, unseen, strict=True)]
     p = np.where(p < 0.1, p + unmeasured * (0.1 - p), p)
@@ -207,19 +236,17 @@ def update(state, depth, claimed, pixel, g, variance, motion=None):
     alone = [second_moment(0.0, *each) for each in zip(spread, offset, wide, strict=True)]
     spread = [second_moment(*each) for each in zip(p, spread, offset, wide, strict=True)]
     if motion is not None:
-        e = offset + mean[0] + X[:, 1] * mean[1] - c
-        P = moving(motion, depth.shape, logs, e, share, ratio(after, "between"))
+        e = offset + mean[0] + X[:, 1] * mean[1] - after["most"]
+        P = moving(motion, size, logs, e, share, ratio(after, "between"))
         elsewhere_ = [second_moment(1.0, 0.1, *each) for each in zip(e, wide, strict=True)]
         p, spread = 1 - (1 - p) * (1 - P), (1 - P) * np.array(spread) + P * np.array(elsewhere_)
     alone, spread = np.array(alone), np.array(spread)
     beyond = np.maximum((spread - (1 - p) * alone) / np.maximum(p, 1e-12), alone)
     alone = np.minimum(alone, np.quantile(alone, 0.7))
-    p = np.maximum(p, np.clip((spread - alone) / np.maximum(np.maximum(beyond, 4 * alone) - alone, 1e-12), 0, 1))
+    p = np.maximum(p, np.clip((spread - alone) / np.maximum(np.maximum(beyond, 16 * alone) - alone, 1e-12), 0, 1))
     for k, x in enumerate(HX[:, 1:4]):
-        offset[k] += share[k] ** 2 / (share[k] ** 2 + 0.3**2) * (x @ (slopes - mean[1:4]))
-    posterior, variance, outlier = read(depth, np.nan_to_num(claimed), logs, mean[:4], offset, spread, p, share)
-    _, inlier, _ = read(depth, 0 * depth, logs, mean[:4], offset, alone, p, share)
-    return after, posterior, variance, inlier, outlier
+        offset[k] += share[k] ** 2 / (share[k] ** 2 + 0.5**2) * (x @ (after["slopes"] - mean[1:4]))
+    return offset, alone, spread, p, share
 
 
 def surfaces(state, node, y, noise):

@@ -82,12 +82,13 @@ def test_errors_and_depths_agree_with_the_whole_system(seed):
     root = rng.normal(size=(22, 22))
     measurements = change, value, variance, across_change, across, across_variance
     prior = root @ root.T + np.eye(22), rng.normal(size=22)
-    rho, error, covariance, mean_change = np.zeros(n), np.zeros(22), np.zeros((22, 22)), np.zeros((n, 22))
-    buffers = (np.zeros(shape) for shape in (n, n, 10, (22, 22), 22, (10, 10), (n, 22)))
+    rho, error, covariance, mean_change = np.zeros(n), np.zeros(22), np.zeros((22, 22)), np.zeros((22, n))
+    buffers = (np.zeros(shape) for shape in ((2, 10, n), (4, n), (22, 22), 22, (22, n)))
     weights = change, value, 1 / variance, across_change, across, 1 / across_variance
-    results = error, covariance, mean_change, rho, *np.zeros((2, n, 3))
-    assert solve(*weights, prior[0], prior[0] @ prior[1], *results, *buffers)
-    common = (mean_change @ covariance * mean_change).sum(1)
+    by_view = (np.moveaxis(x, 0, -1) for x in weights)
+    results = error, covariance, mean_change, rho, *np.zeros((2, 3, n))
+    assert solve(*by_view, prior[0], prior[0] @ prior[1], *results, *buffers)
+    common = (mean_change * (covariance @ mean_change)).sum(0)
     expected_error, expected_covariance, expected_rho, spread = oracle_dense.errors_and_depths(*measurements, *prior)
     np.testing.assert_allclose(error, expected_error, rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(covariance, expected_covariance, rtol=1e-7, atol=1e-10)

@@ -1,7 +1,7 @@
-"""Thousands of invalid frames and damaged recordings: the state stays valid, streams independent, errors documented.
+"""Hundreds of invalid frames and damaged recordings: the state stays valid, streams independent, errors documented.
 
-``pytest -m slow tests/test_hostile.py`` runs 1,000 frames, ``UFMSTAR_HOSTILE_FRAMES=10000`` that many. Every session of
-20 frames has its number as seed, so that a failure can be repeated. Damaged files: 300 of each layout, also with a seed
+``pytest -m slow tests/test_hostile.py`` runs 500 frames, ``UFMSTAR_HOSTILE_FRAMES=10000`` that many. Every session of
+20 frames has its number as seed, so that a failure can be repeated. Damaged files: 150 of each layout, also with a seed
 each."""
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.eval.sequences import open_sequence
 
 H, W, LENGTH = 24, 32, 20
-FRAMES = int(os.environ.get("UFMSTAR_HOSTILE_FRAMES", "1000"))
+FRAMES = int(os.environ.get("UFMSTAR_HOSTILE_FRAMES", "500"))
 DOCUMENTED = (TypeError, ValueError)  # UfMStar.forward's "Raises"
 EXTREME = (0.0, -1.0, np.nan, np.inf, -np.inf, 1e-45, 1e-30, 1e-7, 1e-6, 1e-3, 1e3, 1e6, 1.1e6, 1e12, 1e20, 3e38)
 K = scenes.intrinsics(H, W)
@@ -217,7 +217,7 @@ def test_a_few_hostile_frames(session):
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("part", range(10))
-def test_thousands_of_hostile_frames(part):
+def test_hundreds_of_hostile_frames(part):
     sessions = range(part, max(FRAMES // LENGTH, 10), 10)
     accepted = sum(run_session(session) for session in sessions)
     assert accepted > 0.3 * LENGTH * len(sessions), "most frames must reach the algorithm"
@@ -279,7 +279,7 @@ def test_a_few_damaged_recordings(layout, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", WRITERS)
 def test_hundreds_of_damaged_recordings(layout, tmp_path):
-    assert read_damaged(layout, tmp_path, range(100, 400)) > 60
+    assert read_damaged(layout, tmp_path, range(100, 250)) > 30
 
 
 @pytest.mark.slow

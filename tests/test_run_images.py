@@ -12,7 +12,7 @@ from ufmstar_torch.eval.run.colours import INVALID_GREY
 from ufmstar_torch.eval.run.panels import FramePanel, map_columns
 from ufmstar_torch.eval.run.pictures import field_of_view
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
+from ufmstar_torch.eval.sequences.ground_truth import nearest_pixels, resample_nearest, truth_at
 from ufmstar_torch.models import Preprocess
 
 
@@ -25,6 +25,15 @@ def test_resampling_by_rays_equals_the_preprocessing_of_depth(size, preprocess):
     expected = preprocess.apply_depth(labels).numpy()
     actual = resample_nearest(labels.numpy(), K.numpy(), K_net, expected.shape)
     np.testing.assert_array_equal(actual, expected)
+
+
+def test_every_position_belongs_to_the_pixel_around_it_or_lies_outside():
+    u = np.array([0, 1.49, 1.5, -0.5, -0.51, 3.49, 3.51, np.nan, np.inf, 2])
+    v = np.array([0, 0, 0, 2, 2, 1, 1, 1, 1, -1e30])
+    index, inside = nearest_pixels(u, v, (3, 4))
+    assert inside.tolist() == [True, True, True, True, False, True, False, False, False, False]
+    assert index[inside].tolist() == [0, 1, 2, 8, 7]
+    assert ((index >= 0) & (index < 12)).all(), "what lies outside has an index that can be read"
 
 
 def test_outside_of_the_other_camera_there_is_nothing():

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 import torch
 from layouts import write_generic
-from runs import job_of, outputs, read_summary, records
+from runs import job_of, read_summary, records
 
 from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStarConfig, cli
 from ufmstar_torch.anchors import Landmarks, sensor_landmarks
 from ufmstar_torch.anchors.sensor import completed
 from ufmstar_torch.eval.engine.anchors import landmarks_of, sensor_of
 from ufmstar_torch.eval.engine.maps import MapSource
-from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences.frame import in_memory
@@ -163,19 +162,6 @@ def test_depth_that_served_as_anchors_is_not_judged(finished):
     assert not any(record["ground_truth"] for record in records(out))
     assert summary["anchors"]["used_per_frame"] > 300
     assert summary["source"]["sensor"] == "stereo"
-
-
-def test_a_stopped_run_begins_again_with_the_same_results(tour, finished, tmp_path):
-    out, _ = finished
-
-    def stop():
-        return (tmp_path / "out" / "frames.jsonl").read_bytes().count(b"\n") >= 4
-
-    assert run(sensor_job(holed(tour), tour), tmp_path / "out", stop=stop)["state"] == "interrupted"
-    with pytest.raises(FolderError, match="source"):
-        run(replace(sensor_job(holed(tour), tour), sensor="tof"), tmp_path / "out")
-    run(sensor_job(holed(tour), tour), tmp_path / "out")
-    assert outputs(tmp_path / "out") == outputs(out)
 
 
 def test_frames_without_depth_or_images_have_what_is_there(tour, tmp_path):

@@ -25,13 +25,15 @@ reveal_type(UfMStar()(torch.ones(1, 48, 64), pose, K).std)
 model(image, pose)
 UncertainDepth(torch.nn.Identity(), mode="al", anchors="cornes")
 """
-# Errors inside the package are `make types`'; without these parts of torch, mypy takes half the time.
-MYPY = """
+# Errors inside the package are `make types`' affair. mypy reads torch and numpy, and takes other packages as Any.
+MYPY = f"""
 [mypy]
 strict = true
 follow_imports = silent
 [mypy-ufmstar_torch.*]
 ignore_errors = true
+[mypy-{",".join(f"{name}.*" for name in sorted(EXTRAS))}]
+follow_imports = skip
 [mypy-torch._dynamo.*,torch._inductor.*,torch._export.*,torch.distributed.*,torch.export.*,torch.fx.*,torch.onnx.*]
 follow_imports = skip
 """

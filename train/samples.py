@@ -90,7 +90,7 @@ def make_sample(frame: Frame, preprocess: Preprocess) -> Sample:
     parts = (frame.image, frame.depth, frame.intrinsics, frame.T_world_cam)
     image, depth, K, pose = (torch.from_numpy(np.array(part)) for part in parts)
     depth = torch.where(depth.isfinite() & (depth > 0), depth, 0.0).to(torch.float32)
-    x = preprocess.by_torch(image.permute(2, 0, 1).contiguous()[None])[0]
+    x = preprocess.resampled(image.permute(2, 0, 1)[None])[0].contiguous()
     K_network = preprocess.apply_intrinsics(K, *depth.shape)
     return Sample(image=x, depth=preprocess.apply_depth(depth).contiguous(), intrinsics=K_network, T_world_cam=pose)
 

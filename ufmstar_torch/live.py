@@ -25,20 +25,12 @@ from ufmstar_torch.frames.arguments import (
     as_pose,
     require_number,
 )
-from ufmstar_torch.frames.clock import PoseBuffer, StreamClock, Verdict, require_stamp
+from ufmstar_torch.frames.clock import require_stamp
 from ufmstar_torch.frames.frame import FRAME_FAULTS, NOT_FINITE
+from ufmstar_torch.frames.image_queue import CLOSED, ImageQueue, QueuedImage
 from ufmstar_torch.frames.output import UncertaintyOutput
-from ufmstar_torch.frames.warnings import LOGGER
-from ufmstar_torch.gaussians.trajectory import SAME_TIME
 from ufmstar_torch.kernels.cpu.check import pose_fault
 from ufmstar_torch.uncertain_depth import UncertainDepth
-
-# Reasons for which an image is dropped (NEWER, CLOSED) or skipped (the others).
-NEWER, CLOSED = "a newer image was ready", "closed"
-BACKWARDS, LATE, GAP = "its stamp is not after the image before", "no pose in time", "poses too far apart around it"
-LOST = "a pose around it is not finite"
-DOUBTFUL = "its stamp is far from those before it"
-_WAITING = 16  # most images that wait for their poses: half a second at 30 frames/s
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,16 +63,6 @@ class LiveStatistics:
     skipped: Mapping[str, int]  # by reason: unusable images
     saved: int  # how often the state was saved
     restarts: int  # how often an image of another size or camera restarted the anchors' evidence
-
-
-@dataclass(frozen=True, eq=False)
-class _Waiting:
-    """An image that waits for its pose."""
-
-    stamp: float
-    image: ImageLike
-    intrinsics: Tensor
-    received: float
 
 
 class LiveDepth:
@@ -136,12 +118,11 @@ class LiveDepth:
         self._intrinsics = None if intrinsics is None else as_intrinsics(intrinsics)
         self._state = None if state is None else StateFile(as_path("state", state), model)
         self.model, self._on_result = model, on_result
-        self._max_wait, self._max_gap, self._save_every = max_wait, max_gap, save_every
+        self._save_every = save_every
         self._changed = Condition()  # guards everything below
-        self._waiting: list[_Waiting] = []  # images, the oldest first
-        self._poses, self._image_clock, self._last_image = PoseBuffer(), StreamClock(), -math.inf
+        self._queue = ImageQueue(max_wait, max_gap)
         self._busy = self._ending = self._ended = self._resetting = False
-        self._counts, self._dropped, self._skipped = Counter[str](), Counter[str](), Counter[str]()
+        self._counts = Counter[str]()
         self._error: BaseException | None = None
         self._worker = Thread(target=self._run, name="ufmstar live", daemon=True)
         self._worker.start()
@@ -169,20 +150,8 @@ class LiveDepth:
         with self._changed:
             self._counts["images"] += 1
             if self._ending:
-                self._dropped[CLOSED] += 1
-            elif (verdict := self._image_clock.judge(stamp, received)) == Verdict.WAIT:
-                self._skip(DOUBTFUL, stamp)
-            elif verdict == Verdict.USE and stamp <= self._last_image:
-                self._skip(BACKWARDS, stamp)
-            else:
-                if verdict == Verdict.JUMPED:
-                    LOGGER.warning("the images' clock jumped from %.3f s to %.3f s", self._last_image, stamp)
-                    self._drop_waiting(len(self._waiting), NEWER)
-                self._last_image = stamp
-                if len(self._waiting) == _WAITING:  # drop the newest: older images get their poses first
-                    self._waiting.pop()
-                    self._dropped[NEWER] += 1
-                self._waiting.append(_Waiting(stamp, image, K, received))
+                self._queue.dropped[CLOSED] += 1
+            elif self._queue.add(QueuedImage(stamp, image, K, received)):
                 self._changed.notify_all()
 
     def push_pose(self, stamp: float, T: CameraLike) -> None:
@@ -201,8 +170,8 @@ class LiveDepth:
         stamp, pose = require_stamp(stamp), _pose(T, self.model.ufm.config.rotation_tolerance)
         with self._changed:
             self._counts["poses"] += 1
-            self._counts["dropped_poses"] += self._poses.add(stamp, pose, perf_counter(), self._image_clock.newest)
-            if self._waiting:  # a worker without an image has no use for a pose
+            self._counts["dropped_poses"] += self._queue.add_pose(stamp, pose, perf_counter())
+            if self._queue:  # a worker without an image has no use for a pose
                 self._changed.notify_all()
 
     @property
@@ -212,15 +181,16 @@ class LiveDepth:
             names = ("images", "poses", "dropped_poses", "results", "saved")
             counts = {name: self._counts[name] for name in names}
             restarts = 0 if self.model.landmarks is None else self.model.landmarks.restarts
-            return LiveStatistics(**counts, restarts=restarts, dropped=dict(self._dropped), skipped=dict(self._skipped))
+            return LiveStatistics(
+                **counts, restarts=restarts, dropped=dict(self._queue.dropped), skipped=dict(self._queue.skipped)
+            )
 
     def reset(self) -> None:
         """Drop poses and waiting images, and reset the model before its next image. Call this after a loop closure that
         moved old poses."""
         self._raise()
         with self._changed:
-            self._drop_waiting(len(self._waiting), NEWER)
-            self._poses, self._image_clock, self._last_image = PoseBuffer(), StreamClock(), -math.inf
+            self._queue.restart()
             self._resetting = True
 
     def wait_idle(self, timeout: float | None = None) -> bool:
@@ -228,7 +198,7 @@ class LiveDepth:
         a timeout. Raises BaseException: the model or ``on_result`` failed."""
         timeout = None if timeout is None else require_number("timeout", timeout)
         with self._changed:
-            idle = self._changed.wait_for(lambda: not (self._waiting or self._busy) or self._ended, timeout)
+            idle = self._changed.wait_for(lambda: not (self._queue or self._busy) or self._ended, timeout)
         self._raise()
         return idle
 
@@ -282,37 +252,21 @@ class LiveDepth:
         if unsaved:
             self._save()
 
-    def _next(self) -> tuple[_Waiting, np.ndarray, bool] | None:
+    def _next(self) -> tuple[QueuedImage, np.ndarray, bool] | None:
         """Wait for the next image; returns it, its pose, and whether to reset the model first. None = the end."""
         with self._changed:
             self._busy = False
             while not self._ending:
-                if (chosen := self._choose(perf_counter())) is not None:
+                if (chosen := self._queue.take(perf_counter())) is not None:
                     self._busy, resetting, self._resetting = True, self._resetting, False
                     return *chosen, resetting
                 self._changed.notify_all()
-                oldest = self._waiting[0].received if self._waiting else math.inf
-                wait = oldest + self._max_wait - perf_counter()
+                wait = self._queue.due - perf_counter()
                 self._changed.wait(None if wait == math.inf else max(wait, 0))
-            self._drop_waiting(len(self._waiting), CLOSED)
+            self._queue.drop(CLOSED)
             return None
 
-    def _choose(self, now: float) -> tuple[_Waiting, np.ndarray] | None:
-        """The newest image that needs no further wait, and its pose; drops older images."""
-        for n in reversed(range(len(self._waiting))):
-            frame = self._waiting[n]
-            late = self._poses.latest < frame.stamp - SAME_TIME
-            if late and now - frame.received < self._max_wait:
-                continue
-            del self._waiting[n]
-            T = self._poses.at(frame.stamp, self._max_gap)
-            if T is not None and np.isfinite(T).all():
-                self._drop_waiting(n, NEWER)
-                return frame, T
-            self._skip(LOST if T is not None else LATE if late else GAP, frame.stamp)
-        return None
-
-    def _process(self, frame: _Waiting, T: np.ndarray, resetting: bool) -> bool:
+    def _process(self, frame: QueuedImage, T: np.ndarray, resetting: bool) -> bool:
         """Predict and deliver an image. Returns whether the state has changed."""
         if resetting:
             self.model.reset()
@@ -321,7 +275,7 @@ class LiveDepth:
         finished = perf_counter()
         if fault := int(out.statistics.fault[0]):
             with self._changed:
-                self._skip(FRAME_FAULTS[fault], frame.stamp)
+                self._queue.skip(FRAME_FAULTS[fault], frame.stamp)
             return False
         with self._changed:
             self._counts["results"] += 1
@@ -333,18 +287,6 @@ class LiveDepth:
             self._state.save(self.model)
             with self._changed:
                 self._counts["saved"] += 1
-
-    def _skip(self, reason: str, stamp: float) -> None:
-        """Count an unusable image; logs the first one for each reason with the time range of the poses."""
-        self._skipped[reason] += 1
-        if self._skipped[reason] == 1:
-            LOGGER.warning("image at %.3f s skipped: %s (poses: %s; logged once)", stamp, reason, self._poses.span)
-
-    def _drop_waiting(self, count: int, reason: str) -> None:
-        """Drop the ``count`` oldest waiting images."""
-        del self._waiting[:count]
-        if count:
-            self._dropped[reason] += count
 
 
 def _pose(T: CameraLike, tolerance: float) -> np.ndarray:

@@ -177,8 +177,9 @@ class UncertainDepth(NetworksInTurn):
             TypeError, ValueError: see the class.
         """
         members = modules_of(networks)
-        shared = isinstance(preprocess, str) and preprocess == "own"
-        return members, shared_preprocess(members) if shared else preprocess
+        if isinstance(preprocess, str) and preprocess == "own":
+            return members, shared_preprocess(members)
+        return members, preprocess
 
     def forward(
         self,
@@ -378,8 +379,8 @@ class UncertainDepth(NetworksInTurn):
         average: bool = False,
     ) -> MeanUncertainty:
         """Like :meth:`forward`, but computes the average of V per image, for active learning. The default source of
-        anchors is not asked: V has B only from a source that the constructor was passed, or from earlier calls of
-        :meth:`forward`.
+        anchors does not search the image: V has B only from a source that the constructor was passed, or from earlier
+        calls of :meth:`forward`.
 
         Args:
             image, pose, intrinsics, valid, features, anchors: as in :meth:`forward`.

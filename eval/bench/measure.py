@@ -20,9 +20,9 @@ from ufmstar_torch.eval.bench.energy import CPU, GPU, Energy, EnergyMeter, diffe
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, timed_networks
 from ufmstar_torch.eval.bench.parts import ANCHORS, MULTIVIEW, SAMPLE, Part, TimedParts, inference_of, time_parts
 from ufmstar_torch.eval.bench.timing import CLOCKS, most_threads, paired_ratio, pinned_threads, spread
-from ufmstar_torch.eval.engine.evaluate import require_usable
 from ufmstar_torch.eval.engine.files import write_json_atomic
 from ufmstar_torch.eval.engine.load import NetworkChoice
+from ufmstar_torch.eval.engine.stream import require_camera
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.run.machine import device_of, hardware, load_average, versions
@@ -141,8 +141,10 @@ def _timed(
 
 def _usable(frame: Frame) -> bool:
     """True if the frame has an image, and a pose and intrinsics that UfM* can use."""
+    if frame.image is None:
+        return False
     try:
-        require_usable(frame, (), tracked=True)
+        require_camera(frame, frame.intrinsics, (frame.image.shape[0], frame.image.shape[1]))
     except FrameError:
         return False
     return True

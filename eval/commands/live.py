@@ -61,8 +61,8 @@ class LiveOptions(MachineOptions):
         max_wait: An image waits at most this long for a pose after it [s].
         state: Save the state to this file, from which the next command continues.
         save_every: Save the state at this interval [s].
-        out: Write realtime.json to this folder and, for each image, a .npz with depth and variance (corrected unless
-            --plain), those before the correction, disagreement, pose and intrinsics.
+        out: Write realtime.json to this folder and, for each image, a .npz of maps, pose and intrinsics, as `ufmstar
+            run` does.
         overwrite: Replace the results in --out.
         view: Show the images, depth and plots in rerun, on this computer alone.
         json: Print a line of JSON per image instead of the status.

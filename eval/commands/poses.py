@@ -122,13 +122,11 @@ def _plain(name: str) -> str:
 
 
 def _reconstruct(options: PosesOptions, images: list[Any], size: tuple[int, int]) -> dict[str, Any]:
+    """Write keyframes, models, landmarks and poses.json. Returns the content of the last."""
     import numpy as np
 
-    from ufmstar_torch.eval.engine.files import write_atomic, write_bytes_atomic, write_json_atomic
-    from ufmstar_torch.eval.engine.progress import Progress
-    from ufmstar_torch.eval.reconstruct.keyframes import write_keyframes
-    from ufmstar_torch.eval.reconstruct.reconstruct import POSES, gaps, landmarks, reconstruct, scale_model
-    from ufmstar_torch.eval.run.machine import available_cores
+    from ufmstar_torch.eval.engine.files import write_atomic, write_json_atomic
+    from ufmstar_torch.eval.reconstruct.reconstruct import POSES, gaps, landmarks, scale_model
     from ufmstar_torch.eval.sequences.poses import read_trajectory
 
     root = Path(options.source) if Path(options.source).is_dir() else Path(options.source).parent
@@ -136,23 +134,8 @@ def _reconstruct(options: PosesOptions, images: list[Any], size: tuple[int, int]
     if lens is not None:  # COLMAP's mapper fails on some lenses; `run` need not undistort again
         images = [lens.see(entry) for entry in images]
     trajectory = None if options.trajectory is None else read_trajectory(resolve(root, options.trajectory))
-    named = {_plain(word.partition(":")[0]) for word in options.length[:2]}
-    always = {entry.name for entry in images if _plain(entry.name) in named}
-    if unknown := sorted(named - {_plain(name) for name in always}):
-        raise ValueError(f"--length: there is no image {', '.join(unknown)}; they are {images[0].name}, ...")
-    out = options.out
-    (out / "images").mkdir(exist_ok=True)
-    with Bars() as bars, stop_signals(bars.say) as stop:
-        how: dict[str, Any] = {"progress": lambda done: bars.show(Progress("frames", done, len(images))), "stop": stop}
-        chosen, broken = write_keyframes(images, out / "images", always=always, **how)
-        keyframes = [images[index] for index in chosen]
-        names = [entry.name for entry in keyframes]
-        if keyframes and keyframes[0].timestamp is not None:
-            lines = "".join(f"{entry.timestamp:.9f} images/{entry.name}.jpg\n" for entry in keyframes)
-            write_bytes_atomic(out / "rgb.txt", lines.encode())
-        K, threads = None if lens is None else lens.K, options.threads or available_cores()
-        models = reconstruct(out, names, K, threads=threads, say=bars.say)
-    opening = Options(fps=options.fps, max_pose_gap=options.max_pose_gap)
+    names, broken, models = _models(options, images, None if lens is None else lens.K)
+    opening, out = Options(fps=options.fps, max_pose_gap=options.max_pose_gap), options.out
     scale = scale_model(models[0], images, length=options.known_length, trajectory=trajectory, options=opening)
     for number, model in enumerate(models):
         (out / "sparse" / str(number)).mkdir(exist_ok=True)
@@ -173,6 +156,34 @@ def _reconstruct(options: PosesOptions, images: list[Any], size: tuple[int, int]
     }
     write_json_atomic(out / POSES.manifest, result)
     return result
+
+
+def _models(options: PosesOptions, images: list[Any], K: Any) -> tuple[list[str], int, list[Any]]:
+    """Write the keyframes of images with intrinsics ``K`` [3, 3] (None = unknown), and rgb.txt with their times.
+    Returns their names, the number of images that cannot be read, and the models of the keyframes, the largest first.
+    Raises ValueError: an image of --length does not exist, or no model fits."""
+    from ufmstar_torch.eval.engine.files import write_bytes_atomic
+    from ufmstar_torch.eval.engine.progress import Progress
+    from ufmstar_torch.eval.reconstruct.keyframes import write_keyframes
+    from ufmstar_torch.eval.reconstruct.reconstruct import reconstruct
+    from ufmstar_torch.eval.run.machine import available_cores
+
+    named = {_plain(word.partition(":")[0]) for word in options.length[:2]}
+    always = {entry.name for entry in images if _plain(entry.name) in named}
+    if unknown := sorted(named - {_plain(name) for name in always}):
+        raise ValueError(f"--length: there is no image {', '.join(unknown)}; they are {images[0].name}, ...")
+    out = options.out
+    (out / "images").mkdir(exist_ok=True)
+    with Bars() as bars, stop_signals(bars.say) as stop:
+        how: dict[str, Any] = {"progress": lambda done: bars.show(Progress("frames", done, len(images))), "stop": stop}
+        chosen, broken = write_keyframes(images, out / "images", always=always, **how)
+        keyframes = [images[index] for index in chosen]
+        names = [entry.name for entry in keyframes]
+        if keyframes and keyframes[0].timestamp is not None:
+            lines = "".join(f"{entry.timestamp:.9f} images/{entry.name}.jpg\n" for entry in keyframes)
+            write_bytes_atomic(out / "rgb.txt", lines.encode())
+        threads = options.threads or available_cores()
+        return names, broken, reconstruct(out, names, K, threads=threads, say=bars.say)
 
 
 def _lens(options: PosesOptions, root: Path, size: tuple[int, int]) -> Any:

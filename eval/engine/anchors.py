@@ -58,13 +58,9 @@ class Tracks:
         image = None if frame.image is None else image_tensor(frame)
         started = perf_counter()
         pose, K = torch.from_numpy(T_world_cam), torch.from_numpy(frame.intrinsics)
-        self._streams.update(image, pose, K, UfMStarConfig.rotation_tolerance)  # rows skip frames with faults
+        self._streams.update(image, pose, K, UfMStarConfig.rotation_tolerance)
         self._last = frame, self._streams.last[0], 1000 * (perf_counter() - started)
         return self._last[1:]
-
-    def undo(self) -> None:
-        """Remove the last frame, which UfM* skipped."""
-        self._streams.undo()
 
     @property
     def bytes(self) -> int:

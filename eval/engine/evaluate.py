@@ -7,16 +7,13 @@ the pixels with ground truth and a prediction of that row; ``left_out_share`` is
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 
 import torch
 
-from ufmstar_torch.anchors.sources import DENSE
-from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.anchors import anchor_sources
 from ufmstar_torch.eval.engine.estimators import make_estimator
 from ufmstar_torch.eval.engine.examples import ExampleWriter
@@ -28,13 +25,8 @@ from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import frame_progress, frame_results
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import CORNERS
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.plugins import Plugins
-from ufmstar_torch.frames.frame import FRAME_FAULTS, check_frame
-
-_TOLERANCE = UfMStarConfig().rotation_tolerance
-
 
 # Errors of a sequence that cannot be used. Any other error is a bug and ends the program.
 BROKEN = (SequenceError, FrameError, RuntimeError, ValueError)
@@ -90,11 +82,9 @@ def evaluate_sequence(
         runners.append(RowRunner(row.slug, source, estimator, every=every, setting=setting, anchors=anchors.get(row)))
         named = {other.slug: other.method.name for other in references(row, rows)}
         judges.append(RowJudge(row, runners[-1], named, judge.bins, judge.plugins.metrics))
-    tracked = any(row.setting.anchors in (CORNERS, DENSE) for row in rows)
-    check = partial(require_usable, sources=sources.values(), tracked=tracked)
     shown = frame_progress(progress, len(indices))
     writer = None if examples is None else ExampleWriter(examples, len(indices))
-    stream = frame_results(sequence, indices, runners, cache=judge.store, device=judge.device, check=check, stop=stop)
+    stream = frame_results(sequence, indices, runners, cache=judge.store, device=judge.device, stop=stop)
     with closing(stream) as results:
         for result in results:
             for one in judges:
@@ -105,21 +95,6 @@ def evaluate_sequence(
     opened = dict(sorted(Counter(skipped.reason for skipped in sequence.skipped).items()))
     records = [one.record() for one in judges]
     return [replace(one, frames={**one.frames, "left_out_on_opening": opened}) for one in records]
-
-
-def require_usable(frame: Frame, sources: Collection[DepthSource], tracked: bool) -> None:
-    """Raises FrameError unless all sources, UfM* and, if anchors are ``tracked``, a tracker can use the frame."""
-    if frame.image is None and (tracked or any(source.needs_image for source in sources)):
-        raise FrameError(frame.name, "no image")
-    if frame.depth is None and not all(source.needs_image for source in sources):
-        raise FrameError(frame.name, "no depth map")
-    pixels = frame.image if frame.image is not None else frame.depth
-    height, width = (1, 1) if pixels is None else pixels.shape[:2]
-    depth = torch.ones(1, 1, 1).expand(1, height, width)
-    pose, K = torch.from_numpy(frame.T_world_cam), torch.from_numpy(frame.intrinsics)
-    checked = check_frame(depth, pose, K, None, None, None, None, feature_count=0, rotation_tolerance=_TOLERANCE)
-    if int(checked.fault[0]):
-        raise FrameError(frame.name, FRAME_FAULTS[int(checked.fault[0])])
 
 
 def _check(sequence: FrameSequence, rows: Sequence[Row], indices: range) -> None:

@@ -129,7 +129,7 @@ class RowJudge:
         depth, variance, target = (
             torch.where(result.valid, result.depth, torch.nan), result.variance, torch.from_numpy(result.truth)
         )  # fmt: skip
-        how = {"with_variance": variance is not None, "bins": self._bins, "plugins": self._plugins}
+        how: dict[str, Any] = {"with_variance": variance is not None, "bins": self._bins, "plugins": self._plugins}
         level = None if variance is None else result.level
         add_to(self._metrics, METRICS, result, (depth, variance), mixture=result.mixture, level=level, **how)
         if variance is None:

@@ -17,7 +17,7 @@ from ufmstar_torch.eval.sequences.depth_folder import DepthMaps, depth_maps
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
 from ufmstar_torch.eval.sequences.ground_truth import depth_camera, resample_nearest
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics, scale_intrinsics
-from ufmstar_torch.eval.sequences.own_output import own_output
+from ufmstar_torch.eval.sequences.own_output import OwnOutput, own_output
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.gaussians.camera import resize_intrinsics
 
@@ -87,14 +87,7 @@ def folder_source(
         ValueError: no maps, maps that fit no frame, or a first map with another aspect ratio than the images.
     """
     run = own_output(Path(folder))
-    if variance is not None and own_output(Path(variance)) is not None:
-        raise ValueError(
-            f"{variance} is the output of a run, whose variance contains M: --variance takes what the network states"
-        )
-    if run and scale is not None:
-        raise ValueError(
-            f"{folder} is the output of a run, whose maps are in metres: --depth-scale does not go with it"
-        )
+    _require_no_run(run, folder, scale, variance)
     chosen = range(len(sequence)) if indices is None else indices
     selected = [name for index in chosen if (name := sequence.names[index]) not in (run.skipped if run else ())]
     if not selected:
@@ -126,6 +119,18 @@ def folder_source(
         "size": size,
     }
     return MapSource(read, identity, size=size)
+
+
+def _require_no_run(
+    run: OwnOutput | None, folder: str | Path, scale: float | None, variance: str | Path | None
+) -> None:
+    """Raises ValueError: a scale for maps of a ``run``, or variances of one."""
+    if variance is not None and own_output(Path(variance)) is not None:
+        takes = "whose variance contains M: --variance takes what the network states"
+        raise ValueError(f"{variance} is the output of a run, {takes}")
+    if run and scale is not None:
+        in_metres = "whose maps are in metres: --depth-scale does not go with it"
+        raise ValueError(f"{folder} is the output of a run, {in_metres}")
 
 
 def _check_first(sequence: FrameSequence, maps: DepthMaps) -> None:

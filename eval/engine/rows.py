@@ -18,9 +18,8 @@ from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.progress import timed
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError
+from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.ground_truth import moving_at
-from ufmstar_torch.frames.frame import FRAME_FAULTS
 from ufmstar_torch.frames.output import UncertaintyOutput
 from ufmstar_torch.frames.prediction import DepthPrediction
 
@@ -132,7 +131,6 @@ class RowRunner:
         every: True if all members (or samples) predict on every image, instead of alternating.
         setting: skipped images, noise on poses and anchors.
         anchors: their source; None = no anchors.
-        skips_faults: True to skip frames with bad poses or intrinsics; they count as images when members alternate.
     """
 
     def __init__(
@@ -144,17 +142,15 @@ class RowRunner:
         every: bool = False,
         setting: Setting = DEFAULT,
         anchors: AnchorSource | None = None,
-        skips_faults: bool = False,
     ) -> None:
         self.key, self.source, self.estimator, self.every, self.setting = key, source, estimator, every, setting
-        self.anchors, self._skips_faults = anchors, skips_faults
+        self.anchors = anchors
         self._tracks = None if anchors is None else anchors.tracks
         self.images = 0
         self._drift = Drift(setting) if setting.rotation_drift or setting.translation_drift else None
 
     def update(self, frame: Frame, prediction: DepthPrediction, truth: NDArray[np.float32] | None) -> RowResult:
-        """Process the next frame. Ground truth [h, w] is used for anchors alone. Raises FrameError: ``skips_faults``,
-        and the pose or the intrinsics are bad."""
+        """Process the next frame. Ground truth [h, w] is used for anchors alone."""
         drifted = frame.T_world_cam if self._drift is None else self._drift.of(frame.T_world_cam, frame.index)
         T = perturbed(drifted, self.setting, frame.index)
         landmarks, anchors, tracking_ms = (
@@ -166,12 +162,6 @@ class RowRunner:
         with timed(times, "uncertainty", prediction.depth.device):
             out = on_cpu(self.estimator.update(prediction, torch.from_numpy(T), anchors))
         self.images += 1
-        faults = out.statistics.fault  # None: a method that does not check frames
-        fault = 0 if faults is None else int(faults[0])
-        if self._skips_faults and fault:
-            if self._tracks is not None:
-                self._tracks.undo()
-            raise FrameError(frame.name, FRAME_FAULTS[fault])
         prediction = prediction.to(out.depth.device)
         return RowResult(
             out=replace(out, prediction=prediction, member=member),

@@ -15,14 +15,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ufmstar_torch.anchors.names import CORNERS, DENSE
+from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.predictions import FramePredictions, PredictionCache, sequence_digest
 from ufmstar_torch.eval.engine.progress import Progress, timed
 from ufmstar_torch.eval.engine.rows import RowResult, RowRunner
 from ufmstar_torch.eval.engine.threads import read_ahead
 from ufmstar_torch.eval.methods.perturb import selects
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
+from ufmstar_torch.frames.frame import FRAME_FAULTS
 from ufmstar_torch.frames.prediction import DepthPrediction
+from ufmstar_torch.kernels.cpu.check import intrinsics_fault, pose_fault
 
 _CPU = torch.device("cpu")
 
@@ -40,7 +44,7 @@ class FrameResult:
     name: str  # of the frame
     frame: Frame | None = None  # None if no row selects it, or it cannot be used
     rows: Mapping[str, RowResult] = field(default_factory=dict)  # by key, of the rows that used the frame
-    skipped: Mapping[str, str] = field(default_factory=dict)  # by key, why a row that selects the frame cannot use it
+    skipped: Mapping[str, str] = field(default_factory=dict)  # by key of a row that selects it, why it cannot be used
     # [ms]: "read" (the wait for the thread that reads ahead), "predict", "truth", "cycle" (since the previous result).
     ms: Mapping[str, float] = field(default_factory=dict)
 
@@ -52,11 +56,11 @@ def frame_results(
     *,
     cache: PredictionCache | None = None,
     device: torch.device = _CPU,
-    check: Callable[[Frame], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Generator[FrameResult]:
     """Yield the result of every frame, in order. A frame that no row selects is not decoded. If a frame cannot be read
-    or predicted from, all rows skip it. Close the generator to end the thread that reads ahead.
+    or predicted from, lacks what a row needs, or has an unusable pose or unusable intrinsics, all rows skip it, so that
+    their figures can be compared. Close the generator to end the thread that reads ahead.
 
     Args:
         sequence: posed frames.
@@ -64,7 +68,6 @@ def frame_results(
         rows: with different keys, in their initial state.
         cache: of predictions; None = compute all.
         device: of the rows' estimators and their maps.
-        check: raises ``FrameError`` for a frame that all rows must skip.
         stop: called before every frame.
 
     Raises:
@@ -87,30 +90,35 @@ def frame_results(
                 raise Stopped
             active, ms = [row for row in rows if selects(row.setting, number)], dict[str, float]()
             results, skipped, frame = dict[str, RowResult](), dict[str, str](), None
-            if active:
-                try:
+            try:
+                if active:
                     with timed(ms, "read", device):
                         predictions = next(reading).result()
-                        check(predictions.frame)
+                    _require_inputs(predictions.frame, rows)
                     predicted, truths = _predicted(predictions, active, ms, device)
                     frame = predictions.frame
-                except FrameError as error:
-                    skipped, active = {row.key: error.reason for row in active}, []
-            for row in active:
-                try:
-                    results[row.key] = row.update(predictions.frame, predicted[row.key], truths[row.key])
-                except FrameError as error:
-                    skipped[row.key] = error.reason
+                    results = {row.key: row.update(frame, predicted[row.key], truths[row.key]) for row in active}
+            except FrameError as error:
+                skipped = {row.key: error.reason for row in active}
             now = perf_counter()
             ms["cycle"], last = 1000 * (now - last), now
             yield FrameResult(number, index, names[index], frame, results, skipped, ms)
+
+
+def _require_inputs(frame: Frame, rows: Sequence[RowRunner]) -> None:
+    """Raises FrameError: the frame lacks the image or the depth that a row needs."""
+    tracked = any(row.setting.anchors in (CORNERS, DENSE) for row in rows)
+    if frame.image is None and (tracked or any(row.source.needs_image for row in rows)):
+        raise FrameError(frame.name, "no image")
+    if frame.depth is None and any(row.source.is_truth for row in rows):
+        raise FrameError(frame.name, "no depth map")
 
 
 def _predicted(
     predictions: FramePredictions, rows: Sequence[RowRunner], ms: dict[str, float], device: torch.device
 ) -> tuple[dict[str, DepthPrediction], dict[str, NDArray[np.float32] | None]]:
     """The rows' predictions, and the ground truth at their pixels, by key; adds their times to ``ms``. Raises
-    FrameError: there is nothing to predict from, or the depth map has no camera."""
+    FrameError: there is nothing to predict from, or a camera is missing or unusable."""
     with timed(ms, "predict", device):
         predicted = {row.key: predictions.of(row.source, row.images, row.every) for row in rows}
     with timed(ms, "truth", device):
@@ -118,17 +126,27 @@ def _predicted(
 
 
 def _truths(frame: Frame, predictions: Mapping[str, DepthPrediction]) -> dict[str, NDArray[np.float32] | None]:
-    """Ground truth at the pixels of every row's maps, computed once per camera. Raises FrameError: the depth map has no
-    ground truth."""
+    """Ground truth at the pixels of every row's maps, computed once per camera. Raises FrameError: a camera is
+    unusable."""
     computed: dict[tuple[object, ...], NDArray[np.float32] | None] = {}
     truths = {}
+    if frame.image is not None:
+        require_camera(frame, frame.intrinsics, (frame.image.shape[0], frame.image.shape[1]))
     for key, prediction in predictions.items():
         K = prediction.K[0].numpy()
         camera = (prediction.size, K.tobytes())
         if camera not in computed:
+            require_camera(frame, K, prediction.size)
             computed[camera] = truth_at(frame, K, prediction.size)
         truths[key] = computed[camera]
     return truths
+
+
+def require_camera(frame: Frame, K: NDArray[np.float64], size: Size) -> None:
+    """Raises FrameError: UfM* cannot use the frame's pose, or intrinsics K [3, 3] [px] of images of ``size`` (h, w)."""
+    pose, tolerance = frame.T_world_cam.tolist(), UfMStarConfig.rotation_tolerance
+    if fault := pose_fault(pose, tolerance) or intrinsics_fault(K.tolist(), *size):
+        raise FrameError(frame.name, FRAME_FAULTS[fault])
 
 
 def frame_progress(show: Callable[[Progress], object], total: int) -> Callable[[FrameResult], None]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ufmstar_torch.eval.engine.judge import CONFIDENCE
 from ufmstar_torch.eval.engine.record import FORMAT, METRICS, Record, ResultsError, Sums
@@ -16,14 +16,6 @@ from ufmstar_torch.eval.suite.folder import FAILED, EvalFolder
 from ufmstar_torch.files.limits import read_text
 
 Curves = Mapping[str, list[float]]
-
-
-class Failed(NamedTuple):
-    """A sequence that could not be evaluated, and why."""
-
-    dataset: str
-    sequence: str
-    reason: str
 
 
 @dataclass(frozen=True)
@@ -36,7 +28,8 @@ class Results:
     # ``SequenceMetrics.curves()`` and "nll_by_error:REFERENCE" over all pixels of a data set, by (dataset, row); only
     # if the sums of all sequences exist.
     merged: Mapping[tuple[str, Row], Curves] = field(default_factory=dict)
-    failed: tuple[Failed, ...] = ()
+    # By (dataset, sequence), why it could not be evaluated.
+    failed: Mapping[tuple[str, str], str] = field(default_factory=dict)
     missing: tuple[tuple[str, str, Row], ...] = ()  # (dataset, sequence, row) not evaluated yet
     efficiency: Mapping[str, Any] | None = None  # efficiency.json
     notes: tuple[str, ...] = ()  # problems of the folder, one sentence each
@@ -129,11 +122,10 @@ def load_results(out: Path, *, with_sums: bool = True) -> Results:
 
     records = tuple(sorted(loaded, key=key))
     _check(out, records)
-    failed = tuple(sorted(Failed(*where, reason) for where, reason in EvalFolder(out).failures().items()))
+    failed = dict(sorted(EvalFolder(out).failures().items()))
     done = {(r.dataset, r.sequence, r.row) for r in records}
-    broken = {(f.dataset, f.sequence) for f in failed}
     expected = sorted((s["dataset"], s["sequence"]) for s in about.get("sequences", []))
-    missing = tuple((*s, row) for s in expected if s not in broken for row in order if (*s, row) not in done)
+    missing = tuple((*s, row) for s in expected if s not in failed for row in order if (*s, row) not in done)
     merged, notes = _merged(records) if with_sums else ({}, [])
     return Results(out, about, records, merged, failed, missing, _read_json(out / "efficiency.json"), tuple(notes))
 

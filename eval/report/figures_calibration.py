@@ -1,4 +1,4 @@
-"""Calibration diagrams over all pixels: confidence, quantiles, central intervals; and sparsification, for training."""
+"""Calibration diagrams over all pixels: confidence, quantiles, intervals, outliers; for training, sparsification."""
 
 from __future__ import annotations
 
@@ -22,19 +22,25 @@ PER_LINE, MOST_SEQUENCES = 4, 12
 
 
 class Shares(NamedTuple):
-    """A calibration diagram: the curves of stated and found shares, and the labels of its axes."""
+    """A calibration diagram: the curves of stated and found shares, the labels of its axes, and the curve of the bins'
+    pixels, "" = all are shown."""
 
     stated: str
     found: str
     x: str
     y: str
+    pixels: str = ""
 
 
-DELTA = Shares("ece_delta_confidence", "ece_delta_accuracy", "predicted share within 25 %", "true share")
+DELTA = Shares(
+    "ece_delta_confidence", "ece_delta_accuracy", "predicted share within 25 %", "true share", "ece_delta_pixels"
+)
 QUANTILE = Shares("ece_q_levels", "ece_q_observed", "predicted quantile", "share of truth below")
 INTERVAL = Shares("coverage_levels", "coverage_found", "stated probability of the interval", "share of truth in it")
-# Colours and markers, in order, for methods without a ``Method``.
-_BY_ORDER = (("#6b6b6b", "^"), ("#E69F00", "s"), ("#0072B2", "o"), ("#009E73", "D"), ("#CC79A7", "v"), ("#D55E00", "P"))
+OUTLIER = Shares(
+    "outlier_predicted", "outlier_found", "posterior_outlier", "share beyond 3 σ of inliers", "outlier_pixels"
+)
+KINDS = DELTA, QUANTILE, INTERVAL, OUTLIER
 
 
 def draw_calibration(results: Results, dataset: str) -> Any | None:
@@ -84,22 +90,22 @@ def _has_curves(curves: Mapping[str, Any]) -> bool:
 
 
 def _draw_columns(title: str, panels: Sequence[tuple[tuple[str, str], Mapping[Row, Curves]]]) -> Any | None:
-    """Delta calibration above quantile calibration in each column, above central intervals if a row has some;
-    ``PER_LINE`` columns side by side. ``panels`` has the titles of the first two, and curves by row; UfM* is drawn
-    last, on top."""
+    """Delta calibration above quantile calibration in each column, above central intervals and outliers if a row has
+    some; ``PER_LINE`` columns side by side. ``panels`` has the titles of the first two, and curves by row; UfM* is
+    drawn last, on top."""
     if not panels:
         return None
     columns = min(len(panels), PER_LINE)
     lines = -(-len(panels) // columns)
-    bounded = any(INTERVAL.found in curves for _, by_row in panels for curves in by_row.values())
-    kinds = (DELTA, QUANTILE, INTERVAL) if bounded else (DELTA, QUANTILE)
+    every = [curves for _, by_row in panels for curves in by_row.values()]
+    kinds = [kind for kind in KINDS if any(kind.found in curves for curves in every)]
     # A single column needs width for the title and the legend.
     figure = style.new_figure(max(5.0, 0.4 + 2.6 * columns), 0.7 + 2.6 * len(kinds) * lines, title)
     axes = style.hidden_panels(figure, len(kinds) * lines, columns)
     for n, (titles, curves) in enumerate(panels):
         rows = sorted(curves, key=lambda row: (row.method.fusion == UFM_STAR, row.setting.posterior, row.method.full))
         drawn = {style.row_style(row): curves[row] for row in rows}
-        for below, (kind, words) in enumerate(zip(kinds, (*titles, ""), strict=False)):
+        for below, (kind, words) in enumerate(zip(kinds, (*titles, "", ""), strict=False)):
             panel = axes[len(kinds) * (n // columns) + below, n % columns]
             _draw_shares(panel, kind, drawn, words, named=n % columns == 0)
     style.legend_below(figure)
@@ -113,8 +119,8 @@ def _draw_shares(axes: Any, kind: Shares, lines: Mapping[LineStyle, Curves], tit
     for line_style, values in lines.items():
         if kind.found in values:
             x, y = (np.array(values[name], float) for name in (kind.stated, kind.found))
-            if kind is DELTA:
-                pixels = np.array(values["ece_delta_pixels"], float)
+            if kind.pixels:
+                pixels = np.array(values[kind.pixels], float)
                 filled = pixels > 0.001 * pixels.sum()  # bins with more than 0.1 % of the pixels
                 x, y = x[filled], y[filled]
             axes.plot(x, y, clip_on=False, markevery=max(1, len(x) // 10), **line_style.line)
@@ -126,11 +132,13 @@ def write_curves(path: Path, curves: Mapping[str, Curves], *, title: str = "") -
     """Draw delta calibration, quantile calibration and sparsification (``SequenceMetrics.curves()`` by the name in the
     legend) side by side, and write the picture (PNG). Raises ValueError: there are no curves, or more than line
     styles."""
-    if not 1 <= len(curves) <= len(_BY_ORDER):
-        raise ValueError(f"curves must hold 1 to {len(_BY_ORDER)} methods, got {len(curves)}")
+    if not 1 <= len(curves) <= len(style.BY_ORDER):
+        raise ValueError(f"curves must hold 1 to {len(style.BY_ORDER)} methods, got {len(curves)}")
     figure = style.new_figure(12.6, 4.6, title)
     delta, quantiles, sparse = figure.subplots(1, 3)
-    lines = {LineStyle(name, *line_style): curves[name] for name, line_style in zip(curves, _BY_ORDER, strict=False)}
+    lines = {
+        LineStyle(name, *line_style): curves[name] for name, line_style in zip(curves, style.BY_ORDER, strict=False)
+    }
     _draw_shares(delta, DELTA, lines, "δ calibration")
     _draw_shares(quantiles, QUANTILE, lines, "quantile calibration")
     for line_style, values in lines.items():

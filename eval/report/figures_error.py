@@ -29,8 +29,6 @@ ENVIRONMENTS = {
     "driving": ("driving", "kitti"),
     "city": ("city", "soulcity", "neighborhood", "oldtown", "japanesealley"),
 }
-# Colours and markers of the lines, in order. Rows of one method differ in their settings, so each has a line.
-_STYLES = (("#0072B2", "o"), ("#D55E00", "s"), ("#009E73", "D"), ("#E69F00", "^"), ("#CC79A7", "v"), ("#6b6b6b", "P"))
 # Gates that are written at the curve.
 _NAMED = (0.05, 0.1, 0.2)
 
@@ -90,7 +88,7 @@ def _lines(results: Results, dataset: str) -> dict[str, Curves]:
     rows = [row for row, curves in found.items() if "coverage_found" in curves]
     rows += [row for row in plain if row not in rows]
     lines = {labels[row]: found[row] for row in rows if np.isfinite(_values(found[row], "gate_kept")).any()}
-    return dict(list(lines.items())[: len(_STYLES)])
+    return dict(list(lines.items())[: len(style.BY_ORDER)])
 
 
 def gates_figure(lines: Mapping[str, Curves], title: str) -> Any | None:
@@ -100,7 +98,7 @@ def gates_figure(lines: Mapping[str, Curves], title: str) -> Any | None:
         return None
     figure = style.new_figure(12.6, 4.6, title)
     panels = figure.subplots(1, 3)
-    styled = [(LineStyle(name, *how), lines[name]) for name, how in zip(lines, _STYLES, strict=False)]
+    styled = [(LineStyle(name, *how), lines[name]) for name, how in zip(lines, style.BY_ORDER, strict=False)]
     names = {"error": "median relative error", "delta1": "share within 25 %", "coverage": "share in the 90 % interval"}
     for axes, (name, label) in zip(panels, names.items(), strict=True):
         for line_style, curves in styled:

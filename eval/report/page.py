@@ -134,7 +134,7 @@ def limits(results: Results, undrawn: Mapping[str, str]) -> list[tuple[str, tupl
                 idle.append((dataset, label, *map(str, counted)))
     where, uncompared = ("data set", "sequence"), ("data set", "row", "frames", "without a segment", "without a match")
     tables: list[tuple[str, tuple[str, ...], list[tuple[str, ...]]]] = [
-        ("Sequences that failed", (*where, "reason"), [*results.failed]),
+        ("Sequences that failed", (*where, "reason"), [(*key, reason) for key, reason in results.failed.items()]),
         ("Frames in which UfM* compared no views", uncompared, idle),
         ("Frames that were skipped", (*where, "frames", "used", "reasons"), list(skipped)),
         ("Rows not evaluated yet", (*where, "rows"), [(*key, str(n)) for key, n in missing.items()]),

@@ -13,6 +13,8 @@ from ufmstar_torch.eval.run.colours import FAINT, INK, plain, require_matplotlib
 GRID = "#e6e6e6"
 TITLE, LABEL, TICK = 11, 9, 8  # font sizes [pt]
 DPI = 130
+# Colours and markers of lines that are no methods of the paper, in order.
+BY_ORDER = (("#0072B2", "o"), ("#D55E00", "s"), ("#009E73", "D"), ("#E69F00", "^"), ("#CC79A7", "v"), ("#6b6b6b", "P"))
 
 
 class LineStyle(NamedTuple):

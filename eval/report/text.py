@@ -38,7 +38,7 @@ def summary(results: Results) -> str:
     shown = [None] if None in results.tabulated else results.tabulated
     parts = [main_table(results, dataset).text() for dataset in shown]
     if results.failed:
-        parts.append("failed:\n" + "\n".join(f"  {f.dataset}, {f.sequence}: {f.reason}" for f in results.failed))
+        parts.append("\n".join(["failed:", *(f"  {', '.join(key)}: {why}" for key, why in results.failed.items())]))
     if results.missing:
         counts = Counter((dataset, sequence) for dataset, sequence, _ in results.missing)
         lines = [f"  {dataset}, {sequence}: {rows} row(s)" for (dataset, sequence), rows in counts.items()]

@@ -62,7 +62,7 @@ class RunJob:
         anchors = None
         if self.config.anchors is not None:
             anchors = AnchorSource(Setting(anchors=CORNERS), Tracks(landmark_source(self.landmarks)), self.sensor)
-        row = RowRunner(UFM, self.source, estimator, every=self.every, anchors=anchors, skips_faults=True)
+        row = RowRunner(UFM, self.source, estimator, every=self.every, anchors=anchors)
         return row, estimator.ufm
 
     @property

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ufmstar_torch.files.limits import require_pixels
+from ufmstar_torch.frames.frame import FARTHEST
 
 Loader = Callable[[], np.ndarray]
 Size = tuple[int, int]
@@ -179,10 +180,12 @@ def make_sequence(
         names.append(frame.name)
         if isinstance(frame, Skipped):
             skipped.append(frame)
-        elif np.isfinite(frame.T_world_cam).all():
-            entries.append(frame)
-        else:
+        elif not np.isfinite(frame.T_world_cam).all():
             skipped.append(Skipped(frame.name, "non-finite pose"))
+        elif np.abs(frame.T_world_cam).max() > FARTHEST:
+            skipped.append(Skipped(frame.name, f"pose farther than {FARTHEST:g} m from the origin"))
+        else:
+            entries.append(frame)
     if not entries:
         reasons = Counter(frame.reason for frame in skipped).most_common(3)
         summary = "; ".join(f"{count} x {reason}" for reason, count in reasons) or "no frame was found"

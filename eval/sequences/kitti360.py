@@ -266,7 +266,8 @@ def read_scan(path: Path) -> np.ndarray:
         raise FrameError(path, f"cannot be read: {error}") from error
     if values.size == 0 or path.stat().st_size % (4 * _COLUMNS):
         raise FrameError(path, f"is no scan: its size must be a multiple of {4 * _COLUMNS} bytes, and not 0")
-    points = values.reshape(-1, _COLUMNS)[:, :3].T.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # NaN of a damaged file
+        points = values.reshape(-1, _COLUMNS)[:, :3].T.astype(np.float64)
     distance = np.linalg.norm(points, axis=0)
     return points[:, np.isfinite(distance) & (distance > _MIN_RANGE)]
 

@@ -194,22 +194,10 @@ def json_lines(
         if not line.strip():
             continue
         try:
-            try:
-                event = json.loads(line)
-            except json.JSONDecodeError:
-                raise ValueError(f"no JSON: {line.strip():.60}") from None
-            if not isinstance(event, dict) or event.keys() - {"stamp", "pose", "image", "intrinsics"}:
-                raise ValueError('expected {"stamp": s, "pose": [...], "image": "file", "intrinsics": [...]}')
-            if "intrinsics" in event:
-                K = _intrinsics(event["intrinsics"])
-                if len(event) == 1:
-                    continue
-            if "stamp" not in event or not event.keys() & {"pose", "image"}:
-                raise ValueError("a stamp and a pose or an image are needed")
-            if not isinstance(stamp := event["stamp"], int | float):
-                raise ValueError(f"a stamp is a number [s], got {stamp!r:.40}")
-            if not math.isfinite(stamp := float(stamp)):
-                raise ValueError(f"stamp must be finite [s], got {stamp}")
+            event = _fields(line)
+            K = _intrinsics(event["intrinsics"]) if "intrinsics" in event else K
+            if event.keys() == {"intrinsics"}:
+                continue
             pose = _pose(event["pose"], convert, scale) if "pose" in event else None
             if "image" in event and K is None:
                 raise ValueError("an image needs intrinsics, in its line, an earlier one or --intrinsics fx fy cx cy")
@@ -222,9 +210,27 @@ def json_lines(
         except (ValueError, TypeError, OverflowError, RecursionError, binascii.Error) as error:
             raise ValueError(f"line {number}: {error}") from error
         if image is not None or pose is not None:
-            yield LiveEvent(stamp, image, pose, K)
+            yield LiveEvent(float(event["stamp"]), image, pose, K)
     if unreadable:
         LOGGER.warning("%d images could not be read", unreadable)
+
+
+def _fields(line: str) -> dict[str, Any]:
+    """The fields of a line of JSON: intrinsics alone, or a stamp with a pose, an image or both. Raises ValueError:
+    another form."""
+    try:
+        event = json.loads(line)
+    except json.JSONDecodeError:
+        raise ValueError(f"no JSON: {line.strip():.60}") from None
+    if not isinstance(event, dict) or event.keys() - {"stamp", "pose", "image", "intrinsics"}:
+        raise ValueError('expected {"stamp": s, "pose": [...], "image": "file", "intrinsics": [...]}')
+    if event.keys() == {"intrinsics"}:
+        return event
+    if "stamp" not in event or not event.keys() & {"pose", "image"}:
+        raise ValueError("a stamp and a pose or an image are needed")
+    if not (isinstance(event["stamp"], int | float) and math.isfinite(event["stamp"])):
+        raise ValueError(f"a stamp is a finite number [s], got {event['stamp']!r:.40}")
+    return event
 
 
 def _intrinsics(values: Any) -> NDArray[np.float64]:

@@ -144,7 +144,9 @@ class Anchors:
         return replace(self, pixel=pixel * scale + offset, motion=motion)
 
     def to(self, device: torch.device | str) -> Anchors:
-        """Copy the anchors to another device."""
+        """The anchors on a device."""
+        if self.pixel.device == torch.device(device):
+            return self
         moved = {name: value.to(device) for name, value in vars(self).items() if value is not None}
         return replace(self, **moved)
 

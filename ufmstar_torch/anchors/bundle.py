@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.anchors.epipolar import FAR, NEAR, median, off_lines, on_lines
-from ufmstar_torch.anchors.saved_state import SavedState
+from ufmstar_torch.anchors.saved_state import POSITIVE, SavedState
 from ufmstar_torch.anchors.time_offset import TimeOffset
 
 # [px] Standard deviations of a position by errors of the poses: at first (best on tours whose poses err by .05 to .15
@@ -64,6 +64,7 @@ class PoseRefinement(SavedState):
         "shared": "remaining_pose_variance",
         "_offset_variance": "pose_variance_by_offset",
     }
+    RANGES: ClassVar = {"_variance": POSITIVE}
 
     def __init__(self) -> None:
         self.offset = TimeOffset()
@@ -116,11 +117,11 @@ class PoseRefinement(SavedState):
         if len(views) < _VIEWS:
             return T_world_cam
         unit = np.array([[1], [depth]]) / K[0, 0]  # w [rad] and s [m] that shift a position by a pixel
-        given, prior = T_world_cam[views], np.tile(np.repeat(1 / (self._variance * unit[:, 0] ** 2), 3), len(views))
-        shift, most = self.offset.shift(given), max(_SCORE, _TIMES * self._recent_score)
+        stated, prior = T_world_cam[views], np.tile(np.repeat(1 / (self._variance * unit[:, 0] ** 2), 3), len(views))
+        shift, most = self.offset.shift(stated), max(_SCORE, _TIMES * self._recent_score)
         pixel, seen = pixel[:, views], seen[:, views]
-        seen = seen & _static(pixel, seen, given, K, depth)[:, None]
-        result, score, self.jumped = refined(pixel, seen, given, K, depth, shift, prior, most)
+        seen = seen & _static(pixel, seen, stated, K, depth)[:, None]
+        result, score, self.jumped = refined(pixel, seen, stated, K, depth, shift, prior, most)
         if score == score:
             self._recent_score = max(score, _MEMORY * self._recent_score)
         if result is None:
@@ -128,7 +129,7 @@ class PoseRefinement(SavedState):
         self.shared = median(result.depth_variance)
         self._offset_variance = float(np.square(shift[-1].reshape(2, 3) / unit).sum()) / 3
         self._learn(result.error[-6:].reshape(2, 3) / unit, result.covariance.diagonal()[-6:].reshape(2, 3) / unit**2)
-        self.offset.learn(given, prior, result.error, result.covariance)
+        self.offset.learn(stated, prior, result.error, result.covariance)
         poses = T_world_cam.copy()
         poses[views] = result.poses
         return poses

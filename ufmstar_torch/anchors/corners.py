@@ -29,9 +29,9 @@ _HALVED_FROM = 480
 _HARRIS, _WEAKEST = 0.04, 1e-4
 
 # Adaptation to another exposure: logarithm of the ratio of brightness from which the first image is adapted; most
-# rounds; share of corners that must be tracked to measure the ratio at them; rows and columns of the local means, from
-# a corner [px]; range of the means in use [gray levels].
-_LOG_RATIO, _ROUNDS, _SHARE, _MEAN_OVER, _MEAN_RANGE = 0.03, 3, 0.15, np.arange(-8, 9, 4), (8, 240)
+# rounds; share of corners that must be tracked to measure the ratio at them; window of the local means [px]; range of
+# the means in use [gray levels].
+_LOG_RATIO, _ROUNDS, _SHARE, _MEAN_WINDOW, _MEAN_RANGE = 0.03, 3, 0.15, (17, 17), (8, 240)
 
 
 def follow(
@@ -80,19 +80,15 @@ def _ratio_at(
     before: NDArray[np.uint8], after: NDArray[np.uint8], position: NDArray[np.float64], found: NDArray[np.float64]
 ) -> float:
     """Ratio of brightness around tracked corners, their median."""
-    mean_before, mean_after = _means(before, position), _means(after, found)
+    cv2 = opencv()
+    means = []
+    for image, corners in ((before, position), (after, found)):
+        u, v = np.rint(corners).astype(np.int64).T
+        means.append(cv2.blur(image, _MEAN_WINDOW)[v, u].astype(np.float64))
+    mean_before, mean_after = means
     low, high = np.minimum(mean_before, mean_after), np.maximum(mean_before, mean_after)
     usable = (low > _MEAN_RANGE[0]) & (high < _MEAN_RANGE[1])
     return median(mean_after[usable] / mean_before[usable]) if usable.any() else 1.0
-
-
-def _means(image: NDArray[np.uint8], position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[N] mean brightness around positions [N, 2]."""
-    u, v = np.rint(position).astype(np.int64).T
-    row = (v[:, None] + _MEAN_OVER).clip(0, image.shape[0] - 1)
-    column = (u[:, None] + _MEAN_OVER).clip(0, image.shape[1] - 1)
-    pixels = image.ravel()[row[:, :, None] * image.shape[1] + column[:, None]]
-    return np.asarray(pixels.reshape(len(position), -1).mean(1), np.float64)
 
 
 def _followed(

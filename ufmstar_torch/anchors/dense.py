@@ -28,7 +28,7 @@ from ufmstar_torch.anchors.dense_poses import Fit, PoseErrors
 from ufmstar_torch.anchors.epipolar import median
 from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, OtherCameraError, checked, opencv
 from ufmstar_torch.anchors.motion import LANDMARK, LINE, OFF_LINE, SEARCH, MotionTests, Tested, located, moves
-from ufmstar_torch.anchors.saved_state import SavedState
+from ufmstar_torch.anchors.saved_state import POSITIVE, SavedState
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
 from ufmstar_torch.runtime.checked import Checked, number
@@ -146,6 +146,7 @@ class DenseEvidence(SavedState):
         "_contradicted": "contradicted",
         "_baseline": "baseline",
     }
+    RANGES: ClassVar = {"_depth": POSITIVE}
 
     def __init__(self, config: DenseConfig | None = None) -> None:
         self.config = config if config is not None else DenseConfig()
@@ -347,7 +348,8 @@ class DenseEvidence(SavedState):
         matched.
         """
         from ufmstar_torch.anchors.kernels.check import confirmed
-        from ufmstar_torch.anchors.kernels.dense import MARGIN, Views, measure
+        from ufmstar_torch.anchors.kernels.dense import Views, measure
+        from ufmstar_torch.anchors.kernels.windows import MARGIN
 
         half, (views, _, images) = halved(small), compared
         H, b = _HALVED @ views.H @ _DOUBLED, views.b @ _HALVED.T

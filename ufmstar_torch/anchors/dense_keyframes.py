@@ -20,6 +20,8 @@ _MOVED, _TURNED = 0.015, np.deg2rad(4.0)
 _MAX_FACTOR = 2.5
 # Least share of a grid of points, at the median depth in the present view, that a keyframe must show.
 _OVERLAP = 0.5
+# [3, 16] (u, v, 1) of a grid of points in an image of width and height 1.
+_GRID = np.stack([*(np.indices((4, 4)).reshape(2, -1)[::-1] + 0.5) / 4, np.ones(16)])
 
 
 class Keyframes(SavedState):
@@ -114,11 +116,11 @@ class Keyframes(SavedState):
     ) -> NDArray[np.float64]:
         """[n] share of a grid of points, at a depth in the camera T, that the views show."""
         height, width = self._image[0].shape
-        v, u = (np.indices((4, 4)).reshape(2, -1) + 0.5) / 4
-        rays = inverse_intrinsics(K) @ np.stack([u * width, v * height, np.ones(16)])
+        rays = inverse_intrinsics(K) @ (_GRID * [[width], [height], [1]])
         K_R = K @ pose[:, :3, :3].transpose(0, 2, 1)
         moved = K_R @ (T[:3, 3] - pose[:, :3, 3])[..., None]
-        x, y, z = np.moveaxis(K_R @ (depth * T[:3, :3] @ rays) + moved, 1, 0)
+        point = K_R @ (depth * T[:3, :3] @ rays) + moved
+        x, y, z = point[:, 0], point[:, 1], point[:, 2]
         inside = (z > 0.2 * depth) & (x > 0) & (y > 0) & (x < (width - 1) * z) & (y < (height - 1) * z)
         return np.asarray(inside.mean(1))
 

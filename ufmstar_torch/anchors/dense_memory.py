@@ -77,7 +77,7 @@ class Memory(SavedState):
 
     def reset(self) -> None:
         """Forget everything."""
-        from ufmstar_torch.anchors.kernels.dense import SIDE
+        from ufmstar_torch.anchors.kernels.windows import SIDE
 
         n = self._count
         self._point, self._pose = np.zeros((n, 3)), np.tile(np.eye(4), (n, 1, 1))

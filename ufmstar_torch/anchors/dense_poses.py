@@ -145,8 +145,8 @@ class PoseErrors(SavedState):
         if trusted:
             self._learn_camera(result, prior[0][-CAMERA:, -CAMERA:], views.image.shape[2])
         compared = np.isfinite(measured.value[found]) & (measured.agreed[found] > 1)[:, None]
-        self._learn_noise(result.residual[compared], result.across_residual, measured.across_noise[found], shares)
-        dispersion = (self._disagreement + result.residual.sum(1)) / np.maximum(measured.agreed[found], 1)
+        self._learn_noise(result.residual.T[compared], result.across_residual.T, measured.across_noise[found], shares)
+        dispersion = (self._disagreement + result.residual.sum(0)) / np.maximum(measured.agreed[found], 1)
         return Fit(result.rho, _PATCH * dispersion * result.match + result.common, result.off_line)
 
     def _prior(self, shares: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -161,14 +161,13 @@ class PoseErrors(SavedState):
     def _learn_poses(
         self, solution: Corrected, shares: NDArray[np.int64], K: NDArray[np.float64], depth: float
     ) -> None:
-        posterior = solution.covariance.diagonal()[:-CAMERA].reshape(-1, 2, 3).sum(2)
+        remaining = solution.covariance.diagonal()[:-CAMERA].reshape(-1, 2, 3).sum(2)
         square = np.square(solution.error[:-CAMERA]).reshape(-1, 2, 3).sum(2)
         least = np.square(_LEAST / K[0, 0]) * np.array([1, depth**2])
-        for share, remaining, error2 in zip(shares, posterior, square, strict=True):
-            before = self._variance[share]
-            determined = 3 - remaining / before  # how many of 3 components
-            step = (1 - self._memory) * (error2 - determined * before) / np.maximum(determined, 1)
-            self._variance[share] = np.maximum(before + step, least)
+        before = self._variance[shares]
+        determined = 3 - remaining / before  # how many of 3 components
+        step = (1 - self._memory) * (square - determined * before) / np.maximum(determined, 1)
+        self._variance[shares] = np.maximum(before + step, least)
 
     def _learn_camera(self, solution: Corrected, precision: NDArray[np.float64], width: int) -> None:
         prior = np.diag(1 / self._camera_prior(width).diagonal())
@@ -190,17 +189,15 @@ class PoseErrors(SavedState):
             return
         shows = np.isfinite(noise)
         unexplained = (_medians(across_residual, shows) / MEDIAN_SQUARE - _medians(noise, shows)).clip(_LEAST**2)
-        for share, newest, count in zip(shares, unexplained, shows.sum(0), strict=True):
-            if count >= _ENOUGH:
-                self._unexplained[share] = self._faded(self._unexplained[share], newest)
-        self._disagreement = self._faded(self._disagreement, median(residual) / MEDIAN_SQUARE)
+        enough = shows.sum(0) >= _ENOUGH
+        seen = shares[enough]
+        self._unexplained[seen] = self._memory * self._unexplained[seen] + (1 - self._memory) * unexplained[enough]
+        newest = median(residual) / MEDIAN_SQUARE
+        self._disagreement = self._memory * self._disagreement + (1 - self._memory) * newest
 
     def _camera_prior(self, width: int) -> NDArray[np.float64]:
         """[4, 4] prior covariance of the camera's errors."""
         return np.diag(np.square(np.array(_CAMERA) * [1, width, width, 1]))
-
-    def _faded(self, running: float, newest: float) -> float:
-        return self._memory * running + (1 - self._memory) * float(newest)
 
 
 @functools.lru_cache(maxsize=8)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
 
@@ -65,7 +65,7 @@ def off_lines(
 
 
 def on_lines(
-    distance: NDArray[np.float64], pixel: NDArray[np.float64], size: tuple[float, float], least: float
+    distance: NDArray[np.float64], pixel: NDArray[np.float64], size: ArrayLike, least: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """The largest group of matches that lie on their epipolar lines: those nearer than six standard deviations of the
     nearest 30 %, by area.
@@ -73,13 +73,13 @@ def on_lines(
     Args:
         distance: [N] from the lines, over the standard deviation of tracking or in pixels.
         pixel: [N, 2] (u, v).
-        size: width and height of the image [px].
+        size: [2] width and height of the image [px].
         least: of the standard deviation, in the unit of ``distance``.
 
     Returns:
         [N] True in the group; [N] weights by area, as a moving object may have most of the corners.
     """
-    cell = (pixel * _CELLS / size).astype(np.int64).clip(0, _CELLS - 1) @ [1, _CELLS]
+    cell = (pixel * _CELLS / np.asarray(size)).astype(np.int64).clip(0, _CELLS - 1) @ [1, _CELLS]
     weight: NDArray[np.float64] = 1 / np.bincount(cell)[cell]
     sigma = max(weighted_quantile(distance, weight, _MOST) / _MOST_QUANTILE, least)
     return distance <= _FARTHEST * sigma, weight

@@ -12,25 +12,37 @@ from torch import Tensor
 
 from ufmstar_torch.frames.frame import LARGEST
 
+POSITIVE = (1e-12, LARGEST)  # range of lengths and variances that divide others
+
 
 def saved_image(state: Mapping[str, Tensor], name: str) -> NDArray[np.uint8]:
     """Read a grey image [H, W] from a saved state; ValueError: another shape or dtype, or no such image."""
-    image = state.get(name, torch.empty(0))
-    if image.dtype != torch.uint8 or image.dim() != 2:
-        raise ValueError(
-            f"state[{name!r}] must have shape (H, W) and dtype uint8, got {tuple(image.shape)} and {image.dtype}"
-        )
-    return image.numpy()
+    image = _array(state, name)
+    if image.dtype != np.uint8 or image.ndim != 2:
+        raise ValueError(f"state[{name!r}] must have shape (H, W) and dtype uint8, got {image.shape} and {image.dtype}")
+    return image
+
+
+def _array(state: Mapping[str, Tensor], name: str) -> NDArray[Any]:
+    """A tensor of a saved state as an array; ValueError: there is none on the CPU."""
+    value: object = state.get(name)
+    if not isinstance(value, Tensor) or not value.is_cpu or value.requires_grad:
+        kind = f"a tensor on {value.device}" if isinstance(value, Tensor) else type(value).__name__
+        raise ValueError(f"state[{name!r}] must be a tensor on the CPU without a gradient, got {kind}")
+    return value.numpy()
 
 
 class SavedState:
     """Attributes that :meth:`state` copies and :meth:`load_state` restores to the last bit.
 
     Attributes:
-        HELD: name in the state by attribute. Each attribute is an array of fixed shape, or a number.
+        HELD: name in the state by attribute. Each attribute is an array of fixed shape, or a number; ``_K`` are
+            intrinsics.
+        RANGES: least and largest value by attribute; within +-``LARGEST`` where none is stated.
     """
 
     HELD: ClassVar[Mapping[str, str]]
+    RANGES: ClassVar[Mapping[str, tuple[float, float]]] = {}
 
     def state(self) -> dict[str, Tensor]:
         """Copy the state, for :meth:`load_state`."""
@@ -44,13 +56,16 @@ class SavedState:
         """
         values: dict[str, Any] = {}
         for attribute, name in self.HELD.items():
-            value, current = np.array(state[name].numpy()), np.asarray(getattr(self, attribute))
+            value, current = np.array(_array(state, name)), np.asarray(getattr(self, attribute))
             if value.shape != current.shape or value.dtype != current.dtype:
                 text = f"must have shape {current.shape} and dtype {current.dtype}, got {value.shape} and {value.dtype}"
                 raise ValueError(f"state[{name!r}] {text}")
-            if not (np.abs(value, dtype=np.float64) <= LARGEST).all():  # NaN is not
-                text = f"finite and within {LARGEST:g}: the state is damaged, start with reset()"
+            low, high = self.RANGES.get(attribute, (-LARGEST, LARGEST))
+            if not ((value >= low) & (value <= high)).all():  # NaN is not
+                text = f"finite and within {low:g} and {high:g}: the state is damaged, start with reset()"
                 raise ValueError(f"state[{name!r}] must be {text}")
+            if attribute == "_K" and not min(value[0, 0], value[1, 1]) > 0:
+                raise ValueError(f"state[{name!r}] must be intrinsics with fx, fy > 0: start with reset()")
             values[attribute] = value if value.ndim else value.item()
         for attribute, value in values.items():
             setattr(self, attribute, value)

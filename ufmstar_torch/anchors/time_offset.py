@@ -30,6 +30,7 @@ _PRIOR, _WINDOW = 1.0, 0.5
 # and tours without an offset it stays 0, also with noise of 1 and 2 degrees.
 _SIGNIFICANT = 2.0
 _LARGEST = 3.0  # [images]
+_MOST = 1.001 / _WINDOW**2 / (1 - _MEMORY)  # of the information, with rounding
 
 
 class TimeOffset(SavedState):
@@ -40,6 +41,10 @@ class TimeOffset(SavedState):
     """
 
     HELD: ClassVar = {"_sum": "lag_sum", "_information": "lag_information", "lag": "lag"}
+    # An information is at most 1 / _WINDOW^2; the sums are geometric.
+    RANGES: ClassVar = {
+        "_sum": (-_LARGEST * _MOST, _LARGEST * _MOST), "_information": (0.0, _MOST), "lag": (-_LARGEST, _LARGEST)
+    }  # fmt: skip
 
     def __init__(self) -> None:
         self.reset()
@@ -69,9 +74,11 @@ class TimeOffset(SavedState):
             error: [6 W] e, beyond :meth:`shift`.
             covariance: [6 W, 6 W] C.
         """
-        steps = _motion(T_world_cam[:-1], T_world_cam[1:])
-        central = _motion(T_world_cam[:-2], T_world_cam[2:]) / 2
-        motion = np.concatenate([steps[1:2], central, steps[-2:-1]]).ravel()
+        views = len(T_world_cam)  # before and after each view; neighbours of the first and the last view
+        before, after = [1, *range(views - 2), views - 3], [2, *range(2, views), views - 2]
+        motion = _motion(T_world_cam[before], T_world_cam[after])
+        motion[1:-1] /= 2
+        motion = motion.ravel()
         weighted = precision * motion
         # Windows overlap: each pose is in W windows.
         window_information = float(weighted @ (motion - covariance @ weighted)) / len(T_world_cam)

@@ -19,7 +19,7 @@ from ufmstar_torch.anchors.bundle import PoseRefinement
 from ufmstar_torch.anchors.corners import find, follow
 from ufmstar_torch.anchors.epipolar import FAR, NEAR, NEAREST, median, off_lines, on_lines, weighted_quantile
 from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, OtherCameraError, checked
-from ufmstar_torch.anchors.saved_state import SavedState, saved_image
+from ufmstar_torch.anchors.saved_state import POSITIVE, SavedState, saved_image
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
 from ufmstar_torch.runtime.checked import Checked, number
 
@@ -129,6 +129,7 @@ class LandmarkTracker(SavedState):
         "_depth": "depth",
         "_depth_count": "depths_judged",
     }
+    RANGES: ClassVar = {"_depth": POSITIVE}
 
     def __init__(self, config: TrackerConfig | None = None) -> None:
         self.config = config if config is not None else TrackerConfig()

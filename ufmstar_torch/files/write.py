@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from filelock import BaseFileLock
 
 _TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.tmp")  # as write_atomic names them
-_POLL_SECONDS = 0.02
 # Error codes of a file system without locks.
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
@@ -61,14 +60,14 @@ def remove_temporaries(paths: Iterable[Path]) -> None:
             path.unlink(missing_ok=True)
 
 
-def hold(path: Path, *, wait: float = 0.0) -> BaseFileLock | None:
+def hold(path: Path) -> BaseFileLock | None:
     """Lock a file until the lock is released or the process ends in any way. None if another process, or an earlier
-    call, holds it for more than ``wait`` [s]. Raises OSError: the file cannot be opened or locked."""
+    call, holds it. Raises OSError: the file cannot be opened or locked."""
     from filelock import FileLock, Timeout
 
     lock = FileLock(path, thread_local=False, fallback_to_soft=False)
     try:
-        lock.acquire(timeout=wait, poll_interval=_POLL_SECONDS)
+        lock.acquire(blocking=False)
     except Timeout:
         return None
     except (NotImplementedError, OSError) as error:

@@ -102,10 +102,10 @@ def require_size(name: str, value: object) -> tuple[int, int]:
     return height, width
 
 
-def as_device(name: str, value: Any, default: str = "cpu") -> torch.device:
-    """The argument ``name`` as a device, ``default`` for None. Raises TypeError, ValueError: no device."""
+def as_device(name: str, value: Any) -> torch.device:
+    """The argument ``name`` as a device, the CPU for None. Raises TypeError, ValueError: no device."""
     if value is None:
-        return torch.device(default)
+        return torch.device("cpu")
     require_kind(name, value, (torch.device, str), "a torch.device, its name or None")
     try:
         return torch.device(value)

@@ -1,4 +1,4 @@
-"""What an image shows besides the networks' prediction: anchors, wrong poses, and whether it shows anything at all."""
+"""Evidence from an image besides the networks' prediction: anchors, wrong poses, and whether it shows anything."""
 
 from __future__ import annotations
 

@@ -144,7 +144,7 @@ def _has_triton(device_type: str) -> bool:
 
 
 def _segment_on_host(
-    depth: Tensor, intrinsics: Tensor, limits: SPGFConfig, features: Tensor | None = None
+    depth: Tensor, intrinsics: Tensor, limits: SPGFConfig, features: Tensor | None
 ) -> tuple[GaussianMixture, Tensor]:
     """The segmentation of tensors of any device, on the CPU; synchronises."""
     from ufmstar_torch.kernels.cpu.segment import segment

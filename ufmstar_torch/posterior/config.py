@@ -36,14 +36,15 @@ class PosteriorConfig(Checked):
     jump: ClassVar[float] = 1.67
     # kappa [1]: precision of f at a node
     precision: ClassVar[float] = 0.5
-    # sigma_t [1]: standard deviation of b's slopes in log d, u and v without anchors
+    # sigma_d, sigma_t [1]: standard deviations of b's slopes in log d, and in u and v, without anchors
+    slope_sigma: ClassVar[float] = 0.12
     tilt_sigma: ClassVar[float] = 0.2
     # rho [1/frame]: share of b's slopes that a frame forgets
     reversion: ClassVar[float] = 0.2
     # n_1 [frames]: weight of slopes of 0 in the mean slopes
     slope_weight: ClassVar[float] = 3.0
     # l_1 [width]: distance from the evidence at which the slopes are half the frame's and half the mean
-    slope_reach: ClassVar[float] = 0.3
+    slope_reach: ClassVar[float] = 0.5
     # p_1 [1]: probability that b's constant lies beyond its prior before the first anchor
     misscaled: ClassVar[float] = 0.1
     # nu [1]: of the Student-t distributions of an anchor's residual and of f's difference across a link
@@ -93,7 +94,7 @@ class PosteriorConfig(Checked):
     @property
     def prior_variance(self) -> tuple[float, float, float, float]:
         """The variances of the coefficients b before the first anchor."""
-        return (self.prior_sigma**2, *(self.tilt_sigma**2,) * 3)
+        return (self.prior_sigma**2, self.slope_sigma**2, self.tilt_sigma**2, self.tilt_sigma**2)
 
 
 if TYPE_CHECKING:

@@ -13,7 +13,12 @@ all levels adapt at the same rate; the constant rate forgets old frames. A frame
 
 Anchors lie on textured surfaces, and a held-out one is farther from the others than most pixels are. Each score
 therefore has as weight the share of the image at its distance from evidence, relative to the share of the scores there.
-What this leaves out is ``TRANSFER``, the factor from t_L at anchors to t_L at pixels.
+At pixels the quantile is
+
+    ``TRANSFER`` normal value (t_L/normal value)^``TRUST``.
+
+Over tours, the quantile at a clip's pixels varies less than that at its held-out anchors and does not follow it. So
+half of the change of log t_L counts: a large error at the anchors widens the intervals, noise changes them little.
 """
 
 from __future__ import annotations
@@ -32,8 +37,10 @@ LEVELS: Final = (0.5, 0.9, 0.99)
 # |z| of the normal distribution at the levels, and twice |z| times its density there: d level / d log |z|.
 NORMAL: Final = (0.6744897501960817, 1.6448536269514722, 2.5758293035489004)
 _SLOPE: Final = np.array([2 * z * math.exp(-z * z / 2) / math.sqrt(2 * math.pi) for z in NORMAL])
-# Factor from the scores' quantiles to the pixels', fitted on tours (docs/measure_thresholds.py --fit).
-TRANSFER: Final = (1.13, 1.19, 1.05)
+# Factors from the scores' quantiles to the pixels', fitted on tours (docs/measure_thresholds.py --fit), and exponent of
+# the scores' quantiles over the normal ones.
+TRANSFER: Final = (0.91, 1.11, 1.0)
+TRUST: Final = 0.5
 RATE: Final = 0.1  # step of the adaptation in frames with many scores
 PRIOR: Final = 3.0  # number of frames that the start counts for
 FEW: Final = 20.0  # number of scores of a frame at which its step is halved
@@ -113,7 +120,7 @@ def quantiles(state: Tensor) -> Tensor:
     if state.device.type == "meta":
         return state.new_empty(len(state), len(LEVELS))
     values = state.cpu().numpy()
-    at_pixels = np.maximum.accumulate(np.exp(values[:, 1:]) * _AT_PIXELS, axis=1)
+    at_pixels = np.maximum.accumulate(np.exp(TRUST * values[:, 1:]) * _AT_PIXELS, axis=1)
     return torch.from_numpy(np.where(values[:, :1] >= LEAST_FRAMES, at_pixels, np.nan)).to(state.device)
 
 

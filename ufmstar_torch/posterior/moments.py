@@ -16,7 +16,7 @@ _FARTHEST = 8.3
 # Quantile of the variance of inliers over the image that limits it.
 _TYPICAL = 0.7
 # Least ratio of the variances of another surface and of the evidence's.
-_APART = 4.0
+_APART = 16.0
 
 
 @leaf

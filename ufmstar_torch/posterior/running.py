@@ -177,8 +177,8 @@ class Running(NamedTuple):
         """Predict coefficients [4] and covariance [4, 4] for a frame whose m_0 is ``mean``.
 
         The constant follows a random walk from the last frame, which stops adding variance at the prior's. The slopes
-        revert to 0 and the variance before the first anchor: what anchors showed of one surface is no evidence of the
-        network's shape on another.
+        revert to the variance before the first anchor, that in log d to 0: what anchors showed of one surface is no
+        evidence of the network's shape on another. Those in u and v revert to their mean over the stream.
         """
         if not self.frames:
             return self.coefficients, self.covariance
@@ -188,4 +188,5 @@ class Running(NamedTuple):
         transformed = T @ self.covariance @ T.T
         grown = config.drift**2 * min(max(1 - transformed[0, 0] / constant, 0), 1)
         added = (1 - (1 - config.reversion) ** 2) * np.array(slopes)
-        return T @ self.coefficients, transformed + np.diag([grown, *added])
+        mean_slopes = config.reversion * self.slopes * [0, 1, 1]
+        return T @ self.coefficients + [0, *mean_slopes], transformed + np.diag([grown, *added])

@@ -4,10 +4,11 @@ At an anchor of depth g the network's error is y = log(g/d). Its model over the 
 
     y = b . (1, log d - m_0, u, v) + f.
 
-b's constant follows a random walk from frame to frame; its slopes revert to 0, so that without evidence the depth fades
-to the network's shape at the stream's scale. At the distance a from evidence the slopes are those of the frame and the
-mean slopes of the stream (``running``), with the shares l^2/(a^2 + l^2) and a^2/(a^2 + l^2), l = ``slope_reach``: in a
-turn, anchors at one side of the image are no evidence of the network's shape at the other.
+b's constant follows a random walk from frame to frame. The slope in log d reverts to 0, those in u and v to their means
+over the stream, so that without evidence the depth fades to the network's shape at the stream's scale. At the distance
+a from evidence the slopes are those of the frame and the mean slopes of the stream (``running``), with the shares
+l^2/(a^2 + l^2) and a^2/(a^2 + l^2), l = ``slope_reach``: in a turn, anchors at one side of the image are no evidence of
+the network's shape at the other.
 
 f is a Gaussian field on a grid whose links are weaker across edges of the predicted depth (``scene``, ``field``). An
 anchor of standard deviation s observes y with the variance

@@ -213,6 +213,8 @@ def _fitting(name: str, saved: object, buffer: Tensor) -> Tensor:
     both_floats = isinstance(saved, Tensor) and saved.is_floating_point() and buffer.is_floating_point()
     if not isinstance(saved, Tensor) or not (both_floats or saved.dtype == buffer.dtype):
         raise ValueError(f"{name} must be a tensor that fits {buffer.dtype}, got {kind}")
+    if saved.is_meta and not buffer.is_meta:
+        raise ValueError(f"{name} must hold values, got a tensor on the device meta")
     return saved.detach().to(buffer.dtype)
 
 
@@ -224,11 +226,11 @@ def _bytes_of(config: Checked) -> Tensor:
 
 def _config_of(state: object) -> dict[str, Any]:
     """The config in a saved ``_extra_state``. Raises ValueError: no tensor of bytes with a JSON object."""
-    if not isinstance(state, Tensor) or state.dtype != torch.uint8 or state.dim() != 1:
+    if not isinstance(state, Tensor) or state.is_meta or state.dtype != torch.uint8 or state.dim() != 1:
         raise ValueError("_extra_state must be a tensor of bytes [n], the config as JSON")
     try:
         config = json.loads(bytes(state.tolist()).decode())
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"_extra_state is not the config as JSON: {error}") from error
     if not isinstance(config, dict):
         raise ValueError(f"_extra_state must hold a JSON object, got {type(config).__name__}")

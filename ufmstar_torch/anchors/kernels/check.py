@@ -64,10 +64,10 @@ def confirmed(pixel: NDArray[np.float64], measured: Measured, cell: int) -> NDAr
         measured: N pixels.
         cell: side of a cell [px]; in a cell with two, only the second is a neighbour of others.
     """
-    candidates = np.flatnonzero((measured.agreed > 0) & (measured.contradicted == 0))
-    reliable = (measured.agreed > 1) & (measured.contradicted == 0)
+    reliable = np.zeros(len(pixel), np.bool_)
     in_cell = np.full((pixel.max(0, initial=0) // cell + 1).astype(np.int64)[::-1], -1)
-    _confirm(pixel, measured.rho, measured.variance, candidates, cell, in_cell, reliable)
+    views = measured.agreed, measured.contradicted
+    _confirm(pixel, measured.rho, measured.variance, *views, cell, in_cell, reliable)
     return reliable
 
 
@@ -89,11 +89,13 @@ def _farther(pixel, occupied, square, far):
 
 
 @reordered
-def _confirm(pixel, rho, variance, candidates, cell, in_cell, reliable):
-    for n in candidates:
-        in_cell[int(pixel[n, 1]) // cell, int(pixel[n, 0]) // cell] = n
-    for n in candidates:
-        if reliable[n]:
+def _confirm(pixel, rho, variance, agreed, contradicted, cell, in_cell, reliable):
+    for n in range(len(pixel)):
+        if agreed[n] > 0 and contradicted[n] == 0:
+            in_cell[int(pixel[n, 1]) // cell, int(pixel[n, 0]) // cell] = n
+    for n in range(len(pixel)):
+        reliable[n] = agreed[n] > 1 and contradicted[n] == 0
+        if agreed[n] != 1 or contradicted[n] > 0:
             continue
         row, column = int(pixel[n, 1]) // cell, int(pixel[n, 0]) // cell
         agreeing = count = 0

@@ -3,9 +3,7 @@
 On the CPU (numba). A pixel x of the image and an inverse depth rho [1/m] project into a keyframe at
 p(rho) = (H x + rho b)/(.)_z, with H = K R K^-1 and b = K t of the relative pose. The patch around x, warped by dp/dx,
 is compared with windows of the keyframe along the line, a pixel apart. Gauss-Newton steps along the line refine the
-position of the best window. Windows have an even side: their centres lie between pixels, and a row of eight pixels is
-copied at once. Loops run over all pixels of a window, so that they are vectorised.
-``tests/oracle_dense.py`` is the same in NumPy.
+position of the best window (``windows``). ``tests/oracle_dense.py`` is the same in NumPy.
 """
 
 from __future__ import annotations
@@ -16,28 +14,24 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.anchors.kernels.windows import (
+    COUNT,
+    FIRST,
+    LARGEST_SCALE,
+    MARGIN,
+    SIDE,
+    WIDE,
+    copy_rows,
+    eights,
+    normalised,
+    refined,
+    sampled,
+    zncc,
+)
 from ufmstar_torch.kernels.compile_cpu import empty, reordered, reordered_leaf
 
-# [px] Side of the compared windows, and offset of their first pixel from the centre.
-SIDE, FIRST = 8, -3.5
-COUNT = SIDE * SIDE
-# A template is a pixel wider than the window on each side; offsets of its pixels from the centre.
-WIDE = SIDE + 2
-_RIGHT = np.tile(np.arange(WIDE, dtype=np.float32) + np.float32(FIRST - 1), WIDE)
-_DOWN = np.repeat(np.arange(WIDE, dtype=np.float32) + np.float32(FIRST - 1), WIDE)
-# The same for the pixels of the window.
-_INSIDE_RIGHT = np.tile(np.arange(SIDE, dtype=np.float32) + np.float32(FIRST), SIDE)
-_INSIDE_DOWN = np.repeat(np.arange(SIDE, dtype=np.float32) + np.float32(FIRST), SIDE)
-# [gray levels] Least standard deviation of a compared window: below it there is only noise.
-LEAST_CONTRAST = 2.0
-# [px] Pixels nearer to the border are not measured.
-MARGIN = 6
-# Most steps of a search, most steps of the refinement, and length of a step at which it has converged [px].
-LONGEST, STEPS, CONVERGED = 192, 5, 0.01
-# [px] Largest distance of the refined position from the best window; a rival is more than APART steps away.
-FARTHEST, APART = 1.5, 2
-# Largest change of scale between the patch and its image in the keyframe.
-LARGEST_SCALE = 2.0
+# Most steps of a search; a rival is more than APART steps away.
+LONGEST, APART = 192, 2
 # The first searched view shows the line from infinity to this multiple of the starting inverse depth: a better match
 # could lie outside of the image.
 WHOLE = 2.0
@@ -143,12 +137,6 @@ def measure(image: NDArray[np.uint8], pixel: NDArray[np.float64], views: Views, 
     return Measured(rho, variance, agreed, contradicted, shown, *columns)
 
 
-def eights(images: NDArray[np.uint8]) -> NDArray[np.uint64]:
-    """View images [V, H, W] as [V, H W - 7] numbers: each holds eight consecutive pixels."""
-    views, size = len(images), images[0].size
-    return np.ndarray((views, max(size - SIDE + 1, 0)), np.uint64, images, strides=(size, 1))
-
-
 @reordered
 def best_pixels(image, cell, pixel, strength):
     """In every cell [C, R] the pixel (u, v) [C, R, 2] of the largest squared gradient, and that gradient [C, R], 0
@@ -205,7 +193,7 @@ def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, con
             if best[2] < least_score or (first and 1 - best[3] < least_rival * (1 - best[2])):
                 continue
             eu, ev, speed = _speed(x, y, z, b[k], _inverse_depth(x, y, z, b[k], best[0], best[1]))
-            if not _refined(patch, along_u, along_v, key, width, height, best[0], best[1], eu, ev, rows, out):
+            if not refined(patch, along_u, along_v, key, width, height, best[0], best[1], eu, ev, rows, out):
                 continue
             if out[5] < least_score:
                 continue
@@ -279,70 +267,6 @@ def _warped(flat, width, height, u, v, H, b, rho, corner, share, template, warp)
 
 
 @reordered_leaf
-def sampled(flat, width, height, u, v, a, b, c, d, corner, share, template):
-    """The pixels of an image at (u, v) + ((a, b), (c, d)) x, for the pixels x of a template, bilinear. ``corner`` and
-    ``share`` are buffers. False where one lies outside."""
-    far_u, far_v = (abs(a) + abs(b)) * (1 - FIRST), (abs(c) + abs(d)) * (1 - FIRST)
-    if not (far_u <= u < width - 1.01 - far_u and far_v <= v < height - 1.01 - far_v):  # .01: for rounding
-        return False
-    u, v, a, b, c, d = np.float32(u), np.float32(v), np.float32(a), np.float32(b), np.float32(c), np.float32(d)
-    for k in range(WIDE * WIDE):
-        su, sv = u + a * _RIGHT[k] + b * _DOWN[k], v + c * _RIGHT[k] + d * _DOWN[k]
-        iu, iv = np.int32(su), np.int32(sv)
-        share[0, k], share[1, k] = su - np.float32(iu), sv - np.float32(iv)
-        corner[k] = np.uint32(iv * np.int32(width) + iu)
-    for k in range(WIDE * WIDE):  # the four pixels around, as the bytes of a number, which vector code unpacks
-        at = np.uint64(corner[k])
-        below = at + np.uint64(width)
-        upper, lower = (flat[at + np.uint64(1)] << 8) | flat[at], (flat[below + np.uint64(1)] << 8) | flat[below]
-        corner[k] = np.uint32((lower << 16) | upper)
-    for k in range(WIDE * WIDE):
-        upper, lower = np.float32(np.int32(corner[k] & 255)), np.float32(np.int32(corner[k] >> 16 & 255))
-        upper += share[0, k] * (np.float32(np.int32(corner[k] >> 8 & 255)) - upper)
-        lower += share[0, k] * (np.float32(np.int32(corner[k] >> 24)) - lower)
-        template[k] = upper + share[1, k] * (lower - upper)
-    return True
-
-
-@reordered_leaf
-def normalised(template, patch, along_u, along_v):
-    """Write the window of a template with mean 0 and norm 1, and its gradients of mean 0 [1/px]. False without
-    contrast."""
-    mean = mean_u = mean_v = squares = np.float32(0)
-    half = np.float32(0.5)
-    for j in range(SIDE):
-        for i in range(SIDE):
-            k, at = j * SIDE + i, (j + 1) * WIDE + i + 1
-            patch[k] = template[at]
-            along_u[k] = half * (template[at + 1] - template[at - 1])
-            along_v[k] = half * (template[at + WIDE] - template[at - WIDE])
-    for k in range(COUNT):
-        mean += patch[k]
-        mean_u += along_u[k]
-        mean_v += along_v[k]
-    mean, mean_u, mean_v = mean / np.float32(COUNT), mean_u / np.float32(COUNT), mean_v / np.float32(COUNT)
-    for k in range(COUNT):
-        patch[k] -= mean
-        squares += patch[k] * patch[k]
-    if squares <= COUNT * LEAST_CONTRAST * LEAST_CONTRAST:
-        return False
-    over = np.float32(1 / np.sqrt(squares))
-    for k in range(COUNT):
-        patch[k] *= over
-        along_u[k] = (along_u[k] - mean_u) * over
-        along_v[k] = (along_v[k] - mean_v) * over
-    return True
-
-
-@reordered_leaf
-def _copied(key, at, width, count, rows):
-    """Copy ``count`` rows of SIDE pixels of an image (:func:`eights`), the first one at index ``at``, to ``rows``."""
-    for j in range(count):
-        rows[j] = key[np.uint64(at)]
-        at += width
-
-
-@reordered_leaf
 def _search(patch, key, width, height, x, y, z, b, low, high, windows, scores, found):
     """Write the best window between two inverse depths to ``found``: its centre on the line (u, v), its ZNCC, and the
     ZNCC of its rival, the best window more than APART steps away. False where no window is inside the image."""
@@ -361,7 +285,7 @@ def _search(patch, key, width, height, x, y, z, b, low, high, windows, scores, f
         left, top = int(np.floor(u_low + s * du + FIRST + 0.5)), int(np.floor(v_low + s * dv + FIRST + 0.5))
         scores[s] = -2
         if left >= 0 and top >= 0 and left + SIDE <= width and top + SIDE <= height:
-            _copied(key, top * width + left, width, SIDE, windows[s])
+            copy_rows(key, top * width + left, width, SIDE, windows[s])
             scores[s] = 0
     # A separate loop: reading a vector of 16 bytes waits until the two numbers just written there are in the cache.
     for s in range(steps + 1):
@@ -376,79 +300,4 @@ def _search(patch, key, width, height, x, y, z, b, low, high, windows, scores, f
         if abs(s - at) > APART and scores[s] > rival:
             rival = scores[s]
     found[0], found[1], found[2], found[3] = u_low + at * du, v_low + at * dv, best, rival
-    return True
-
-
-@reordered_leaf
-def zncc(patch, window):
-    """The correlation of a normalised patch and a window; -1 where the window has no contrast."""
-    total = squares = cross = np.float32(0)
-    for k in range(COUNT):
-        value = np.float32(window[k])
-        total += value
-        squares += value * value
-        cross += patch[k] * value
-    deviation = squares - total * total / np.float32(COUNT)
-    if deviation <= COUNT * LEAST_CONTRAST * LEAST_CONTRAST:
-        return np.float32(-1)
-    return cross / np.sqrt(deviation)
-
-
-@reordered_leaf
-def _refined(patch, along_u, along_v, key, width, height, u, v, eu, ev, rows, out):
-    """Gauss-Newton steps along (eu, ev) from the centre (u, v). ``out``: the displacement [px]; G along, between and
-    across the line [1/px^2]; gradient across times residual [1/px]; ZNCC; mean position (u, v) of the squared gradient
-    along the line, from the centre [px]. False where the window leaves the image or
-    the match."""
-    cu, cv = np.float32(eu), np.float32(ev)
-    g_ee = g_ep = g_pp = patch_e = patch_p = mean_u = mean_v = np.float32(0)
-    for k in range(COUNT):
-        e, p = cu * along_u[k] + cv * along_v[k], cu * along_v[k] - cv * along_u[k]
-        g_ee += e * e
-        mean_u += e * e * _INSIDE_RIGHT[k]
-        mean_v += e * e * _INSIDE_DOWN[k]
-        g_ep += e * p
-        g_pp += p * p
-        patch_e += e * patch[k]
-        patch_p += p * patch[k]
-    if g_ee <= 1e-9:
-        return False
-    displacement, one, copied = 0.0, np.float32(1), -1
-    pixels, next_pixels = rows[0].view(np.uint8), rows[1].view(np.uint8)
-    for step in range(STEPS + 1):
-        left, top = u + displacement * eu + FIRST, v + displacement * ev + FIRST
-        iu, iv = int(np.floor(left)), int(np.floor(top))
-        if iu < 0 or iv < 0 or iu + SIDE >= width or iv + SIDE >= height:
-            return False
-        if iv * width + iu != copied:
-            copied = iv * width + iu
-            _copied(key, copied, width, SIDE + 1, rows[0])
-            _copied(key, copied + 1, width, SIDE + 1, rows[1])
-        fu, fv = np.float32(left - iu), np.float32(top - iv)
-        w00, w01, w10, w11 = (one - fv) * (one - fu), (one - fv) * fu, fv * (one - fu), fv * fu
-        total = squares = cross = down_u = down_v = np.float32(0)
-        for k in range(COUNT):
-            upper = w00 * np.float32(pixels[k]) + w01 * np.float32(next_pixels[k])
-            lower = w10 * np.float32(pixels[k + SIDE]) + w11 * np.float32(next_pixels[k + SIDE])
-            value = upper + lower
-            total += value
-            squares += value * value
-            cross += patch[k] * value
-            down_u += along_u[k] * value
-            down_v += along_v[k] * value
-        deviation = squares - total * total / np.float32(COUNT)
-        if deviation <= COUNT * LEAST_CONTRAST * LEAST_CONTRAST:
-            return False
-        # The gradients have mean 0, so that the values' mean drops out. The part of the patch is not residual.
-        over = one / np.sqrt(deviation)
-        score = cross * over
-        change = -((cu * down_u + cv * down_v) * over - score * patch_e) / g_ee
-        if step == STEPS or abs(change) < CONVERGED:
-            break
-        displacement += change
-        if abs(displacement) > FARTHEST:
-            return False
-    right_p = (cu * down_v - cv * down_u) * over - score * patch_p
-    out[0], out[1], out[2], out[3], out[4], out[5] = displacement, g_ee, g_ep, g_pp, right_p, score
-    out[6], out[7] = mean_u / g_ee, mean_v / g_ee
     return True

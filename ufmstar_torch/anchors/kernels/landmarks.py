@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.anchors.kernels.dense import (
+from ufmstar_torch.anchors.kernels.windows import (
     COUNT,
     FARTHEST,
     LARGEST_SCALE,

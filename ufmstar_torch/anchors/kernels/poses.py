@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.anchors.kernels.cholesky import factored, inverted, reduced
+from ufmstar_torch.anchors.kernels.cholesky import factored, inverted
 from ufmstar_torch.anchors.kernels.dense import Measured, Views
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
 from ufmstar_torch.kernels.compile_cpu import empty, leaf, reordered, reordered_leaf
@@ -37,8 +37,8 @@ class Corrected(NamedTuple):
         rho: [N] inverse depth [1/m].
         match: [N] least variance of an inverse depth in a view by its match [1/m^2]; infinite without a match.
         common: [N] variance of ``rho`` from the remaining errors [1/m^2].
-        residual: [N, V] squared residual of the inverse depth in each view, over its variance; 0 without a match.
-        across_residual: [N, V] squared distance from the line [px^2]; 0 where the match does not show it.
+        residual: [V, N] squared residual of the inverse depth in each view, over its variance; 0 without a match.
+        across_residual: [V, N] squared distance from the line [px^2]; 0 where the match does not show it.
         off_line: [N] largest ``across_residual`` over its variance; NaN where no view shows it.
     """
 
@@ -74,7 +74,7 @@ def corrected(
         measured.rho[found],
         np.zeros((2, n)),
     )
-    residual, across_residual, off_line = np.zeros((n, v)), np.zeros((n, v)), np.full(n, np.nan)
+    residual, across_residual, off_line = np.zeros((v, n)), np.zeros((v, n)), np.full(n, np.nan)
     columns = measured.value, measured.noise, measured.along, measured.speed, measured.slope
     across = measured.across, measured.across_noise
     cameras = views.H, views.b, K, inverse_intrinsics(K)
@@ -89,40 +89,39 @@ def _correct(
     unexplained, precision, right_side, error, covariance, rho, match, common, residual, across_residual, off_line,
 ):  # fmt: skip
     count, views, size = len(found), len(H), len(error)
-    change, across_change = empty((count, views, EACH), np.float64), empty((count, views, EACH), np.float64)
-    offset, weight = empty((count, views), np.float64), empty((count, views), np.float64)
-    shift, across_weight = empty((count, views), np.float64), empty((count, views), np.float64)
-    R, t, moved, delta = (
-        empty((3, 3), np.float64), empty(3, np.float64), empty((2, EACH), np.float64), empty(count, np.float64),
+    change, across_change = empty((views, EACH, count), np.float64), empty((views, EACH, count), np.float64)
+    offset, weight = empty((views, count), np.float64), empty((views, count), np.float64)
+    shift, across_weight = empty((views, count), np.float64), empty((views, count), np.float64)
+    R, t, moved, one = (
+        empty((3, 3), np.float64), empty(3, np.float64), empty((2, EACH), np.float64), empty((2, EACH), np.float64),
     )  # fmt: skip
-    mean, total, view_error = empty(count, np.float64), empty(count, np.float64), empty(EACH, np.float64)
-    A, r, by_view = empty((size, size), np.float64), empty(size, np.float64), empty((EACH, EACH), np.float64)
-    weighted, mean_change = empty((count, size), np.float64), empty((count, size), np.float64)
+    by, rows, delta = empty((2, EACH, count), np.float64), empty((4, count), np.float64), empty(count, np.float64)
+    A, r, weighted = empty((size, size), np.float64), empty(size, np.float64), empty((size, count), np.float64)
+    mean_change = empty((size, count), np.float64)
     for i in range(count):
         n, delta[i] = found[i], 0.0
         for k in range(views):
             used, shows = np.isfinite(value[n, k]), np.isfinite(value[n, k]) and np.isfinite(across[n, k])
-            offset[i, k], shift[i, k] = value[n, k] - rho[i] if used else 0.0, across[n, k] if shows else 0.0
+            offset[k, i], shift[k, i] = value[n, k] - rho[i] if used else 0.0, across[n, k] if shows else 0.0
             scale = (1 + slope[n, k] * slope[n, k]) / (speed[n, k] * speed[n, k])
-            weight[i, k] = 1 / (noise[n, k] / (speed[n, k] * speed[n, k]) + unexplained[k] * scale) if used else 0.0
-            across_weight[i, k] = 1 / (across_noise[n, k] + unexplained[k]) if shows else 0.0
+            weight[k, i] = 1 / (noise[n, k] / (speed[n, k] * speed[n, k]) + unexplained[k] * scale) if used else 0.0
+            across_weight[k, i] = 1 / (across_noise[n, k] + unexplained[k]) if shows else 0.0
             for c in range(EACH):
-                change[i, k, c] = across_change[i, k, c] = 0.0
+                change[k, c, i] = across_change[k, c, i] = 0.0
     for _ in range(_LINEARISATIONS):
         for k in range(views):
             rotated(H[k], b[k], K, K_inverse, R, t)
             for i in range(count):
                 n = found[i]
-                if weight[i, k] > 0:
-                    linearised(
-                        pixel[n], rho[i] + delta[i], along[n, k], slope[n, k], R, t, K, moved,
-                        change[i, k], across_change[i, k],
-                    )  # fmt: skip
+                if weight[k, i] > 0:
+                    geometry = pixel[n], rho[i] + delta[i], along[n, k], slope[n, k]
+                    linearised(*geometry, R, t, K, moved, one[0], one[1])
+                    over = 1 / speed[n, k]
                     for c in range(EACH):
-                        change[i, k, c] /= speed[n, k]
+                        change[k, c, i], across_change[k, c, i] = one[0, c] * over, one[1, c]
         if not solve(
             change, offset, weight, across_change, shift, across_weight, precision, right_side, error, covariance,
-            mean_change, delta, residual, across_residual, mean, total, view_error, A, r, by_view, weighted,
+            mean_change, delta, residual, across_residual, by, rows, A, r, weighted,
         ):  # fmt: skip
             covariance[0, 0] = np.nan
             return
@@ -130,16 +129,19 @@ def _correct(
         rho[i] += delta[i]
         most = 0.0
         for k in range(views):
-            most = max(most, weight[i, k])
-            if across_weight[i, k] > 0:
-                ratio = across_residual[i, k] * across_weight[i, k]
+            most = max(most, weight[k, i])
+            if across_weight[k, i] > 0:
+                ratio = across_residual[k, i] * across_weight[k, i]
                 off_line[i] = ratio if np.isnan(off_line[i]) else max(off_line[i], ratio)
         match[i] = 1 / most
-        for p in range(size):
-            row = 0.0
-            for q in range(size):
-                row += covariance[p, q] * mean_change[i, q]
-            common[i] += row * mean_change[i, p]
+    row = rows[0]
+    for p in range(size):
+        row[:] = 0.0
+        for q in range(size):
+            for i in range(count):
+                row[i] += covariance[p, q] * mean_change[q, i]
+        for i in range(count):
+            common[i] += row[i] * mean_change[p, i]
 
 
 @reordered_leaf
@@ -197,24 +199,25 @@ def rotated(H, b, K, K_inverse, R, t):
 @reordered_leaf
 def solve(
     change, value, weight, across_change, across, across_weight, precision, right_side, error, covariance,
-    mean_change, rho, residual, across_residual, mean, total, view_error, A, r, by_view, weighted,
+    mean_change, rho, residual, across_residual, by, rows, A, r, weighted,
 ):  # fmt: skip
-    """The most likely errors of N pixels in V views, and the depths; False if the equations are singular.
+    """The most likely errors of N pixels in V views, S = 6 V + 4, and the depths; False if the equations are singular.
 
     Args:
-        change: [N, V, 10] derivative of ``value`` by the errors.
-        value: [N, V] inverse depth, from an arbitrary origin for each pixel [1/m].
-        weight: [N, V] inverse of the variance of ``value`` [m^2]; 0 where a view measures nothing.
+        change: [V, 10, N] derivative of ``value`` by the errors.
+        value: [V, N] inverse depth, from an arbitrary origin for each pixel [1/m].
+        weight: [V, N] inverse of the variance of ``value`` [m^2]; 0 where a view measures nothing.
         across_change, across, across_weight: the same of the position across the line [px].
-        precision, right_side: [6 V + 4, 6 V + 4] of the prior, and its product with the prior's mean.
-        error, covariance: overwritten, [6 V + 4] and [6 V + 4, 6 V + 4].
-        mean_change: overwritten, [N, 6 V + 4] derivative of a pixel's weighted mean by the errors.
+        precision, right_side: [S, S] of the prior, and its product with the prior's mean.
+        error, covariance: overwritten, [S] and [S, S].
+        mean_change: overwritten, [S, N] derivative of a pixel's weighted mean by the errors.
         rho: overwritten, [N] inverse depth from its origin; 0 where no view measures it.
-        residual: overwritten, [N, V] squared residual of ``value``, over its variance.
-        across_residual: overwritten, [N, V] squared residual of ``across``.
-        mean, total, view_error, A, r, by_view, weighted: buffers.
+        residual: overwritten, [V, N] squared residual of ``value``, over its variance.
+        across_residual: overwritten, [V, N] squared residual of ``across``.
+        by, rows, A, r, weighted: buffers, [2, 10, N], [4, N], [S, S], [S], [S, N].
     """
-    count, views, size = change.shape[0], change.shape[1], len(error)
+    views, count, size = len(value), len(rho), len(error)
+    mean = rows[0]
     for iteration in range(ROUNDS):
         for i in range(size):
             r[i] = right_side[i]
@@ -223,7 +226,7 @@ def solve(
         student = 0.0 if iteration == 0 else STUDENT
         _equations(
             *(change, value, weight, residual, across_change, across, across_weight, across_residual, student),
-            *(A, r, mean_change, mean, total, by_view, weighted),
+            *(A, r, mean_change, by, rows, weighted),
         )
         if not factored(A):
             return False
@@ -233,63 +236,82 @@ def solve(
             for j in range(size):
                 error[i] += covariance[i, j] * r[j]
         for n in range(count):
-            change_of_mean = 0.0
-            for i in range(size):
-                change_of_mean += mean_change[n, i] * error[i]
-            rho[n] = mean[n] - change_of_mean
-        for k in range(views):
-            for c in range(EACH):
-                view_error[c] = error[POSE * (k if c < POSE else views - 1) + c]
+            rho[n] = mean[n]
+        for i in range(size):
             for n in range(count):
-                e, e_across = value[n, k] - rho[n], across[n, k]
-                for c in range(EACH):
-                    e -= change[n, k, c] * view_error[c]
-                    e_across -= across_change[n, k, c] * view_error[c]
-                residual[n, k], across_residual[n, k] = e * e * weight[n, k], e_across * e_across
+                rho[n] -= mean_change[i, n] * error[i]
+        for k in range(views):
+            off, off_across = residual[k], across_residual[k]
+            for n in range(count):
+                off[n] = value[k, n] - rho[n]
+                off_across[n] = across[k, n]
+            for c in range(EACH):
+                e = error[POSE * (k if c < POSE else views - 1) + c]
+                for n in range(count):
+                    off[n] -= change[k, c, n] * e
+                for n in range(count):
+                    off_across[n] -= across_change[k, c, n] * e
+            for n in range(count):
+                off[n] = off[n] * off[n] * weight[k, n]
+                off_across[n] *= off_across[n]
     return True
 
 
+# Loops over all pixels, each with one result, so that they are vectorised.
 @reordered_leaf
 def _equations(
     change, value, weight, residual, across_change, across, across_weight, across_residual, student,
-    A, r, mean_change, mean, total, by_view, weighted,
+    A, r, mean_change, by, rows, weighted,
 ):  # fmt: skip
-    """Add the pixels to the normal equations A d = r, and write the precision-weighted means over the views.
-    ``student`` = 0: weights without Student's t. ``total``, ``by_view`` and ``weighted`` are buffers."""
-    count, views, size = change.shape[0], change.shape[1], len(r)
+    """Add the pixels to the normal equations A d = r (lower triangle), and write the precision-weighted means over the
+    views: ``mean_change`` and ``rows[0]``. ``student`` = 0: weights without Student's t."""
+    views, count, size = len(value), len(rows[0]), len(r)
+    mean, total, w, a = rows[0], rows[1], rows[2], rows[3]
     for n in range(count):
         mean[n] = total[n] = 0.0
-        for i in range(size):
-            mean_change[n, i] = 0.0
+    for i in range(size):
+        for n in range(count):
+            mean_change[i, n] = 0.0
     for k in range(views):
         first, camera = POSE * k, POSE * (views - 1)  # added to c: its index among the errors
-        for c in range(EACH):
-            for d in range(EACH):
-                by_view[c, d] = 0.0
         for n in range(count):
-            w, a = weight[n, k], across_weight[n, k]
-            if w == 0 and a == 0:
-                continue
+            w[n], a[n] = weight[k, n], across_weight[k, n]
             if student > 0:
-                w *= (student + 1) / (student + residual[n, k])
-                a *= (student + 1) / (student + across_residual[n, k] * a)
-            total[n] += w
-            mean[n] += w * value[n, k]
-            for c in range(EACH):
-                index = c + (first if c < POSE else camera)
-                by, by_across = w * change[n, k, c], a * across_change[n, k, c]
-                mean_change[n, index] += by
-                r[index] += by * value[n, k] + by_across * across[n, k]
-                for d in range(c + 1):  # a lower triangle, which :func:`factored` reads
-                    by_view[c, d] += by * change[n, k, d] + by_across * across_change[n, k, d]
+                w[n] *= (student + 1) / (student + residual[k, n])
+                a[n] *= (student + 1) / (student + across_residual[k, n] * a[n])
+            total[n] += w[n]
+            mean[n] += w[n] * value[k, n]
         for c in range(EACH):
-            for d in range(c + 1):
-                A[c + (first if c < POSE else camera), d + (first if d < POSE else camera)] += by_view[c, d]
+            at, along, over = c + (first if c < POSE else camera), by[0, c], by[1, c]
+            for n in range(count):
+                along[n] = w[n] * change[k, c, n]
+            for n in range(count):
+                over[n] = a[n] * across_change[k, c, n]
+            for n in range(count):
+                mean_change[at, n] += along[n]
+            right = 0.0
+            for n in range(count):
+                right += along[n] * value[k, n] + over[n] * across[k, n]
+            r[at] += right
+            for d in range(c + 1):  # a lower triangle, which :func:`factored` reads
+                product = 0.0
+                for n in range(count):
+                    product += along[n] * change[k, d, n] + over[n] * across_change[k, d, n]
+                A[at, d + (first if d < POSE else camera)] += product
     for n in range(count):
-        over = 1 / total[n] if total[n] > 0 else 0.0
-        mean[n] *= over
-        for i in range(size):
-            weighted[n, i] = mean_change[n, i]
-            mean_change[n, i] *= over
-            r[i] -= weighted[n, i] * mean[n]
-    reduced(A, weighted, mean_change)
+        total[n] = 1 / total[n] if total[n] > 0 else 0.0
+        mean[n] *= total[n]
+    for i in range(size):
+        right = 0.0
+        for n in range(count):
+            weighted[i, n] = mean_change[i, n]
+        for n in range(count):
+            mean_change[i, n] *= total[n]
+        for n in range(count):
+            right += weighted[i, n] * mean[n]
+        r[i] -= right
+        for j in range(i + 1):
+            product = 0.0
+            for n in range(count):
+                product += weighted[i, n] * mean_change[j, n]
+            A[i, j] -= product

@@ -201,8 +201,8 @@ def _most_overlapping(u_left, u_right, h_left, h_right, open, single: tl.constex
 
 @triton.jit
 def _coplanar(mean, line, offset, merged, segment, along, slope, noise_floor: tl.constexpr, angle2: tl.constexpr):
-    """Whether a segment, with its mean and the sum ``along`` its line, is parallel to the lines of the Gaussians and
-    close to their planes, or to the point of a Gaussian of one row."""
+    """[lanes] True where a segment with the line ``along`` is parallel to a Gaussian's line, and its mean is close to
+    the Gaussian's plane, or to the mean of a Gaussian of one row."""
     mx, my, mz = mean
     lx, ly, lz = line
     px, py, pz = offset
@@ -241,7 +241,7 @@ def _joint(join, n, hn, mean, scatter, segment, segment_scatter):
 
 @triton.jit
 def _large_enough(gone, n, merged, min_pixels: tl.constexpr, min_rows: tl.constexpr, prune: tl.constexpr):
-    """Those of the Gaussians ``gone`` that are not pruned."""
+    """The Gaussians ``gone`` that are not pruned."""
     large, tall = n >= min_pixels, merged >= min_rows
     if prune == 0:
         keep = gone
