@@ -39,7 +39,7 @@ NORMAL: Final = (0.6744897501960817, 1.6448536269514722, 2.5758293035489004)
 _SLOPE: Final = np.array([2 * z * math.exp(-z * z / 2) / math.sqrt(2 * math.pi) for z in NORMAL])
 # Factors from the scores' quantiles to the pixels', fitted on tours (docs/measure_thresholds.py --fit), and exponent of
 # the scores' quantiles over the normal ones.
-TRANSFER: Final = (0.91, 1.11, 1.0)
+TRANSFER: Final = (0.91, 1.11, 1.05)
 TRUST: Final = 0.5
 RATE: Final = 0.1  # step of the adaptation in frames with many scores
 PRIOR: Final = 3.0  # number of frames that the start counts for
