@@ -241,7 +241,7 @@ def test_every_kernel_has_a_stamp_of_its_own():
     modules = [importlib.import_module(m.name) for m in pkgutil.walk_packages(ufmstar_torch.__path__, "ufmstar_torch.")
                if m.name.split(".")[1] in ("kernels", "anchors", "posterior") and "triton" not in m.name]  # fmt: skip
     kernels = {one.py_func for m in modules for one in vars(m).values() if isinstance(one, Dispatcher)}
-    assert len(kernels) > 40
+    assert len(kernels) > 30
     assert len({compile_cpu.code_stamp(one) for one in kernels}) == len(kernels)
 
 
