@@ -103,7 +103,7 @@ def test_a_frame_of_eval(tour):
     passed, source = Passed(), {"aleatoric": networks(Brightness(1.0, spread=0.02))}
     with passed.watching():
         evaluate(tour, [row("UfM*-Aleatoric")], source, progress=passed.at)
-    assert_within(passed, (16, 29), (21, 21))
+    assert_within(passed, (16, 29), (21, 20))
 
 
 def test_a_call_of_the_default(tour):
