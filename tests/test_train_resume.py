@@ -117,6 +117,20 @@ def test_a_finished_member_is_not_trained_again(frames, tmp_path, monkeypatch):
     assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in before} == before
 
 
+def test_a_full_disk_does_not_hide_an_interruption(frames, tmp_path, monkeypatch, caplog):
+    def stopped(*_, **__):
+        raise KeyboardInterrupt
+
+    def full(*_, **__):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr("ufmstar_torch.train.fit.train_member", stopped)
+    monkeypatch.setattr("ufmstar_torch.train.fit.write_json_atomic", full)
+    with pytest.raises(KeyboardInterrupt):
+        fit(tiny_job(frames, tmp_path / "out", RECIPE))
+    assert "the weights so far cannot be written: No space left" in caplog.text
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_signals_end_the_command_and_leave_the_last_epoch(ufmstar, frames, tmp_path, number, monkeypatch):
     """Lightning would end the program with exit code 0 after SIGTERM, without weights."""

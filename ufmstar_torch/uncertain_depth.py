@@ -336,7 +336,12 @@ class UncertainDepth(NetworksInTurn):
                 if not isinstance(frame, tuple | list) or len(frame) != 3:
                     raise TypeError(f"frames must yield (image, pose, intrinsics), got {type(frame).__name__}")
                 if waiting is None or not self._networks_on_cpu():
-                    ahead = self._predicted(*frame, ahead=waiting is not None)
+                    try:
+                        ahead = self._predicted(*frame, ahead=waiting is not None)
+                    except Exception:  # raised again after the result of the image before
+                        if waiting is not None:
+                            yield self._fused(waiting)
+                        raise
                     if waiting is not None:
                         yield self._fused(waiting)
                     waiting = ahead
