@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import signal
 from dataclasses import replace
 from functools import partial
@@ -352,11 +353,19 @@ def test_overwriting_removes_what_the_run_wrote_and_nothing_else(path, tmp_path,
     assert outputs(out) == uninterrupted
 
 
+@pytest.fixture(scope="module")
+def two_frames(path, tmp_path_factory):
+    """The folder of a run of two frames. Tests must not change it."""
+    out = tmp_path_factory.mktemp("two") / "out"
+    run(network_job(path, frames=slice(0, 2)), out)
+    return out
+
+
 @pytest.mark.parametrize("options", [{"overwrite": True}, {}])
 @pytest.mark.parametrize("link", ["depth", "frames", "run.json", "frames/7.npz", "summary.json", "preview.mp4"])
-def test_nothing_is_written_through_a_link(path, tmp_path, link, options):
+def test_nothing_is_written_through_a_link(path, tmp_path, two_frames, link, options):
     out, victim = tmp_path / "out", tmp_path / "victim"
-    run(network_job(path, frames=slice(0, 2)), out)
+    shutil.copytree(two_frames, out)
     if link == "preview.mp4":
         (out / link).symlink_to(tmp_path / "nothing")
     else:
@@ -366,9 +375,13 @@ def test_nothing_is_written_through_a_link(path, tmp_path, link, options):
     with pytest.raises(FolderError, match=rf"{link} is a symbolic link, through which nothing is written"):
         run(network_job(path, frames=slice(0, 2)), out, **options)
     assert (outputs(victim) if victim.is_dir() else None) == before
+
+
+def test_a_link_that_the_user_names_is_followed(path, tmp_path, two_frames):
     (tmp_path / "elsewhere").symlink_to(tmp_path / "new")
     (tmp_path / "new").mkdir()
-    run(network_job(path, frames=slice(0, 2)), tmp_path / "elsewhere")  # a folder that the user named
+    run(network_job(path, frames=slice(0, 2)), tmp_path / "elsewhere")
+    assert outputs(tmp_path / "new").keys() == outputs(two_frames).keys()
 
 
 @pytest.mark.parametrize("options", [{}, {"overwrite": True}])
@@ -395,9 +408,9 @@ def test_two_runs_do_not_share_a_folder(path, tmp_path):
 
 
 @pytest.mark.parametrize("content", ["", "{}", '{"program": "ufmstar run", "format": 7}'])
-def test_a_damaged_manifest_is_named(path, tmp_path, content):
+def test_a_damaged_manifest_is_named(path, tmp_path, two_frames, content):
     out = tmp_path / "out"
-    run(network_job(path, frames=slice(0, 2)), out)
+    shutil.copytree(two_frames, out)
     (out / "run.json").write_text(content)
     with pytest.raises(FolderError, match=r"run.json is .*--overwrite starts again"):
         run(network_job(path, frames=slice(0, 2)), out)
