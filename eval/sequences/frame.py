@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 
 from ufmstar_torch.files.limits import require_pixels
-from ufmstar_torch.frames.frame import FARTHEST, FOCAL_RANGE
 
 Loader = Callable[[], np.ndarray]
 Size = tuple[int, int]
@@ -175,6 +174,8 @@ def make_sequence(
     """Divide frames into usable and skipped ones, and check that the intrinsics fit the sizes (H, W). ``posed`` and
     ``metric``: see :class:`FrameSequence`. Raises ValueError: no frame is usable (the message counts the reasons); two
     frames share a name; the intrinsics are malformed or belong to another image size."""
+    from ufmstar_torch.frames.frame import FARTHEST  # here, since that file imports torch
+
     names, entries, skipped = list[str](), list[Entry](), list[Skipped]()
     for frame in frames:
         names.append(frame.name)
@@ -232,6 +233,8 @@ def parse_slice(text: str | None) -> slice:
 
 def check_intrinsics(argument: str, K: np.ndarray, size: Size | None) -> None:
     """Raises ValueError unless K [3, 3] is a pinhole matrix whose centre is well inside ``size`` (H, W)."""
+    from ufmstar_torch.frames.frame import FOCAL_RANGE
+
     if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
         raise ValueError(f"{argument} must be a finite 3x3 matrix with positive focal lengths, got {K.tolist()}")
     if np.abs(K).max() > FOCAL_RANGE[1]:
