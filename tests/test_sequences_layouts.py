@@ -324,6 +324,7 @@ def test_no_frames_at_all(tmp_path, layout):
         ({"intrinsics": (500, 500, 320, 240)}, r"do not fit images of 64x48: were they given for another"),
         ({"intrinsics": (500, 500, 320)}, "expected a 3x3 matrix or fx fy cx cy"),
         ({"intrinsics": np.diag([1.0, -1, 1])}, "positive focal lengths"),
+        ({"intrinsics": np.diag([1e300, 1e300, 1])}, "values within 1e\\+07 px"),
         ({"intrinsics": np.array([[50.0, 0, 32], [0, 50, 24], [0, 1, 1]])}, "must have rows"),
     ],
 )
@@ -331,6 +332,15 @@ def test_options_out_of_range(tmp_path, options, message):
     path, _ = layouts.write_tum(tmp_path)
     with pytest.raises(ValueError, match=message):
         open_sequence(path, **options)
+
+
+def test_a_pose_farther_than_a_million_kilometres_is_skipped_and_named(tmp_path):
+    path = layouts.write_scannet(tmp_path, frames=3)[0]
+    far = np.eye(4)
+    far[0, 3] = 1e300
+    np.savetxt(path / "pose" / "1.txt", far)
+    skipped = open_sequence(path).skipped
+    assert [(frame.name, frame.reason) for frame in skipped] == [("1", "pose farther than 1e+09 m from the origin")]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

@@ -233,8 +233,12 @@ def parse_slice(text: str | None) -> slice:
 
 def check_intrinsics(argument: str, K: np.ndarray, size: Size | None) -> None:
     """Raises ValueError unless K [3, 3] is a pinhole matrix whose centre is well inside ``size`` (H, W)."""
+    from ufmstar_torch.frames.frame import FOCAL_RANGE
+
     if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
         raise ValueError(f"{argument} must be a finite 3x3 matrix with positive focal lengths, got {K.tolist()}")
+    if np.abs(K).max() > FOCAL_RANGE[1]:
+        raise ValueError(f"{argument} must have values within {FOCAL_RANGE[1]:g} px, got {K.tolist()}")
     if np.abs(K[2] - [0, 0, 1]).max() > 1e-9 or abs(K[1, 0]) > 1e-9:
         raise ValueError(f"{argument} must have rows (fx s cx), (0 fy cy), (0 0 1), got {K.tolist()}")
     if size is not None and not fits(K, size):
