@@ -12,8 +12,8 @@ _AHEAD = 0.98
 
 @reordered
 def from_lines(position, before, T, T_before, K, K_inverse, nearest, farthest, least, distance, rho, baseline):
-    """Write the results of ``anchors.epipolar.off_lines``, for inverse depths ``nearest`` and ``farthest``,
-    and depths of at least ``least``."""
+    """Write the results of ``anchors.epipolar.off_lines``. ``nearest`` and ``farthest`` are inverse depths, and the
+    depth of a projected point is at least ``least``."""
     for n in range(len(position)):
         u, v, P = before[n, 0], before[n, 1], T_before[n]
         x = K_inverse[0, 0] * position[n, 0] + K_inverse[0, 1] * position[n, 1] + K_inverse[0, 2]
