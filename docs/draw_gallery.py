@@ -7,7 +7,7 @@ PYTHONPATH=examples python docs/draw_gallery.py OUT DIR/data/hololens_office doc
 
 from __future__ import annotations
 
-import sys
+import argparse
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
@@ -136,4 +136,8 @@ def save(picture: Picture, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path, help="the folder of `ufmstar run`, with its export of a cloud")
+    parser.add_argument("recording", help="of the run")
+    parser.add_argument("folder", type=Path, help="for the pictures")
+    main(**vars(parser.parse_args()))

@@ -25,6 +25,9 @@ from numpy.typing import NDArray
 
 from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import landmark_source
+from ufmstar_torch.eval.report import style
+from ufmstar_torch.eval.report.figures_calibration import OUTLIER, draw_shares
+from ufmstar_torch.eval.report.style import LineStyle
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
 from ufmstar_torch.eval.sequences.images import image_tensor
@@ -100,16 +103,36 @@ def row(name: str, pixels: list[Array]) -> str:
     return f"| {name} | {len(d)} | " + " | ".join(figures) + " |"
 
 
-def outliers(pixels: Array) -> Iterator[str]:
-    """Rows by ``posterior_outlier``, of [P, 5] values: bounds, share of the pixels, mean probability, share beyond
-    three standard deviations of the inliers; and the mean probability beyond and within."""
-    d, _, v1, p, g = pixels.T
-    beyond = (g - d) ** 2 > 9 * v1
-    for low, high in pairwise(PROBABILITIES):
-        used = (p >= low) & (p < high)
-        figures = f"{used.mean():.2f} | {p[used].mean():.3f} | {beyond[used].mean():.3f}"
-        yield f"| {low:g} to {min(high, 1):g} | {figures} |"
-    yield f"mean probability {p[beyond].mean():.3f} beyond, {p[~beyond].mean():.3f} within"
+def outliers(pixels: Array) -> Array:
+    """[bins, 3] by ``posterior_outlier``, of [P, 5] values: share of the pixels, mean probability, and share beyond
+    three standard deviations of the inliers."""
+    p, beyond = pixels[:, 3], beyond_inliers(pixels)
+    used = [(p >= low) & (p < high) for low, high in pairwise(PROBABILITIES)]
+    return np.array([(k.mean(), p[k].mean(), beyond[k].mean()) for k in used])
+
+
+def beyond_inliers(pixels: Array) -> NDArray[np.bool_]:
+    """[P] whether the error of [P, 5] values is beyond three standard deviations of the inliers."""
+    d, _, v1, _, g = pixels.T
+    return (g - d) ** 2 > 9 * v1
+
+
+def print_outliers(every: Array, still: Array, figure: Path | None) -> None:
+    """Print, and draw, outliers stated against found over ``every`` pixel, and the ratio of mean probabilities also for
+    the ``still`` ones."""
+    table = outliers(every)
+    print("\n| posterior_outlier | share | mean | beyond 3 sigma of the inliers |\n|---|---|---|---|")
+    for (low, high), (share, mean, found) in zip(pairwise(PROBABILITIES), table, strict=True):
+        print(f"| {low:g} to {min(high, 1):g} | {share:.2f} | {mean:.3f} | {found:.3f} |")
+    for name, pixels in (("all", every), ("in the tours without", still)):
+        beyond = beyond_inliers(pixels)
+        means = pixels[beyond, 3].mean(), pixels[~beyond, 3].mean()
+        print(f"{name}: mean probability {means[0]:.3f} beyond, {means[1]:.3f} within, ratio {means[0] / means[1]:.2f}")
+    if figure is not None:
+        canvas, curves = style.new_figure(4.2, 4.2, ""), dict(zip(("pixels", "stated", "found"), table.T, strict=True))
+        kind = OUTLIER._replace(stated="stated", found="found", pixels="pixels")
+        draw_shares(canvas.subplots(), kind, {LineStyle("posterior", "#D55E00", "o"): curves}, "")
+        style.save_figure(canvas, figure)
 
 
 def main() -> None:
@@ -119,12 +142,13 @@ def main() -> None:
     source.add_argument("--exact", action="store_true", help="the true depth times 1.35 instead of a network")
     parser.add_argument("--frames", type=int, default=60, help="of a tour")
     parser.add_argument("--tours", type=int, default=len(TOURS), help="number of tours")
+    parser.add_argument("--figure", type=Path, help="PNG or SVG of outliers")
     arguments = parser.parse_args()
     network = None if arguments.exact else load_network("fastdepth", arguments.weights).eval()
     found: dict[str, list[Array]] = defaultdict(list)
-    for seed, style in TOURS[: arguments.tours]:
-        options = {"frames": arguments.frames, "size": SIZE, "style": style}
-        movers, ids = things(seed, style, arguments.frames)
+    for seed, rooms in TOURS[: arguments.tours]:
+        options = {"frames": arguments.frames, "size": SIZE, "style": rooms}
+        movers, ids = things(seed, rooms, arguments.frames)
         for count in (MOVERS, 0):
             frames = list(tour_sequence(seed, movers=count, **options))
             for i, (values, K_map) in enumerate(posterior(frames, network)):
@@ -137,7 +161,7 @@ def main() -> None:
                 for k, mover in enumerate(movers, 1):
                     if count and (shown == k).any():
                         found[mover.motion].append(values[usable & (shown == k)])
-        print(f"tour {seed}, {style}: {len(movers)} things", flush=True)
+        print(f"tour {seed}, {rooms}: {len(movers)} things", flush=True)
     still = [found.pop(name) for name in ("still", "still, in the tours without")]
     print("| | pixels | ratio | rms z | beyond 4 sigma | confident and wrong | delta1 | NLL | mixture: NLL |")
     print("|---" * 9 + "|")
@@ -149,9 +173,7 @@ def main() -> None:
     print(row("still", still[0]))
     print(row("still, in the tours without", still[1]))
     every = np.concatenate([pixels for rows in (*found.values(), *still) for pixels in rows])
-    print("\n| posterior_outlier | share | mean | beyond 3 sigma of the inliers |\n|---|---|---|---|")
-    print("\n".join(outliers(every)))
-    print("in the tours without:", *list(outliers(np.concatenate(still[1])))[-1:])
+    print_outliers(every, np.concatenate(still[1]), arguments.figure)
 
 
 if __name__ == "__main__":

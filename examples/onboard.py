@@ -33,6 +33,7 @@ from ufmstar_torch.eval.engine.realtime import RealTime
 from ufmstar_torch.eval.report.style import save_figure
 from ufmstar_torch.eval.report.text import number, realtime_table
 from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range
+from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
 from ufmstar_torch.eval.run.machine import hardware, load_average, share_threads, versions
 from ufmstar_torch.eval.run.panels import DECADES, Bar, GridRow, Panel, draw_grid
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence, in_memory
@@ -47,6 +48,7 @@ from ufmstar_torch.uncertain_depth import UncertainDepth
 
 FPS = 30.0
 GRAPH, PICTURE, COSTS = "onboard_int8.onnx", "onboard.png", "onboard_costs.png"
+FOLDER = FolderKind("examples/onboard.py", "demonstration", "summary.json", (GRAPH, PICTURE, COSTS))
 _PATH, _WALKED = 900, 300  # frames of the whole path at walking pace, and of the part that is walked back and forth
 _CALIBRATION = 24  # images of another tour, for the ranges of the activations
 _SIZES = {(160, 224): (160, 224)}  # size of the images by that of the network's input; default: half of VGA
@@ -281,6 +283,7 @@ def main(words: Sequence[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--out", type=Path, default=Path("ufmstar_onboard"), help="folder for the results")
     packaged = Path(models.__file__).parent / "weights" / "demo.safetensors"
     weights_help = "of `ufmstar train`, whose first network is quantised; or a FastDepth (.onnx)"
+    parser.add_argument("--overwrite", action="store_true", help="replace an earlier demonstration in that folder")
     parser.add_argument("--weights", type=Path, default=packaged, help=weights_help)
     parser.add_argument("--seconds", type=float, default=120.0, help="duration of the walk [s]")
     parser.add_argument("--seed", type=int, default=100_003, help="of the rooms")
@@ -289,15 +292,19 @@ def main(words: Sequence[str] | None = None) -> dict[str, Any]:
     chosen = parser.parse_args(words)
     if not 1 <= chosen.seconds < math.inf:
         parser.error(f"--seconds must be at least 1, got {chosen.seconds}")
-    chosen.out.mkdir(parents=True, exist_ok=True)
     share_threads()
-    with Bars() as bars:
-        measured = run_onboard(chosen.out, chosen.weights, chosen.seconds, chosen.seed, bars.show, chosen.power)
-    if measured["costs"]:
-        save_figure(draw_cumulative(measured["costs"]), chosen.out / COSTS)
     about = {"out": str(chosen.out), "settings": {name: str(value) for name, value in vars(chosen).items()}}
-    summary: dict[str, Any] = to_json(about | measured | {"hardware": hardware(), "versions": versions()})
-    write_json_atomic(chosen.out / "summary.json", summary)
+    try:
+        folder = output_folder(chosen.out, FOLDER, about, overwrite=chosen.overwrite)
+        with folder, Bars() as bars:
+            measured = run_onboard(chosen.out, chosen.weights, chosen.seconds, chosen.seed, bars.show, chosen.power)
+            if measured["costs"]:
+                save_figure(draw_cumulative(measured["costs"]), chosen.out / COSTS)
+            facts = {"program": FOLDER.program} | about | measured | {"hardware": hardware(), "versions": versions()}
+            summary: dict[str, Any] = to_json(facts)
+            write_json_atomic(chosen.out / FOLDER.manifest, summary)
+    except FolderError as error:
+        parser.error(str(error))
     print(onboard_table(summary))
     return summary
 

@@ -180,8 +180,8 @@ class Preprocess(Checked):
         return depth[..., rows.to(depth.device)[:, None], columns.to(depth.device)]
 
     def resampled(self, image: Tensor) -> Tensor:
-        """[B, 3, h, w] in [0, 1], resized, cropped and resized. Bytes on the CPU stay bytes until the last step, and are
-        rounded as by Pillow and by transformers' processors; other devices and types compute in floats."""
+        """[B, 3, h, w] in [0, 1], resized, cropped and resized. Bytes on the CPU stay bytes until the last step, and
+        are rounded as by Pillow and by transformers' processors; other devices and types compute in floats."""
         _check(image)
         if image.dtype in (torch.float16, torch.bfloat16):  # not supported by torch on the CPU
             return self.resampled(image.float()).to(image.dtype)

@@ -5,9 +5,6 @@ from __future__ import annotations
 import importlib
 import multiprocessing
 import os
-import sys
-
-from ufmstar_torch import cli
 
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(
@@ -23,10 +20,6 @@ def _call(begun, environment, module, name, arguments):
     getattr(importlib.import_module(module), name)(*arguments)
 
 
-def _program(words):
-    sys.exit(cli.main(words))
-
-
 def start(function, *arguments, **environment):
     """Start a process in a new process group that calls a function of a test file; return once it runs."""
     begun, module = CONTEXT.Event(), function.__module__.rpartition(".")[2]  # pytest imports the file as tests.MODULE
@@ -34,8 +27,3 @@ def start(function, *arguments, **environment):
     process.start()
     begun.wait()
     return process
-
-
-def start_program(words):
-    """Start the command ``ufmstar`` in a new process."""
-    return start(_program, [str(word) for word in words])

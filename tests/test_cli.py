@@ -390,14 +390,13 @@ def test_an_error_inside_a_network(ufmstar, path, tmp_path, brightness):
 
 
 @pytest.mark.slow
-def test_fastdepth_on_a_real_sequence(tmp_path):
+def test_fastdepth_on_a_real_sequence(ufmstar, tmp_path):
     sequence = require_shared("data/rgbd_dataset_freiburg1_xyz")
     weights = require_shared("weights/fastdepth_nyu.onnx")
-    command = [sys.executable, "-m", "ufmstar_torch.cli", "run", sequence, "--model", "fastdepth", "--weights", weights]
-    command += ["--plain", "--frames", "0:3", "--distortion", "none", "--threads", "1", "--out", tmp_path / "out"]
-    done = subprocess.run([str(word) for word in command], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "Warning" not in done.stderr
+    words = ("--plain", "--frames", "0:3", "--distortion", "none", "--threads", "1", "--out", tmp_path / "out")
+    code, _, err = ufmstar("run", sequence, "--model", "fastdepth", "--weights", weights, *words)
+    assert code == 0, err
+    assert "Warning" not in err
     summary = read_summary(tmp_path / "out")
     assert summary["frames"]["done"] == summary["frames"]["with_ground_truth"] == 3
     assert summary["prediction"]["size"] == [224, 224]

@@ -151,6 +151,29 @@ def test_another_recording_is_named(finished, capfd):
     assert "--fps goes with --sequence" in capfd.readouterr().err
 
 
+SUMMARIES = {
+    "no settings.sequence": (lambda summary: summary.update(settings={"device": "cpu"}), "(its settings.sequence)"),
+    "a list of settings": (lambda summary: summary.update(settings=[1]), "(its settings.sequence)"),
+    "another program": (lambda summary: summary.update(program="x"), "(its program)"),
+    "a posterior of text": (lambda summary: summary.update(posterior="x"), "(its posterior)"),
+    "a calibration of NaN": (lambda summary: summary.update(posterior={"calibration": float("nan")}), "calibration)"),
+}
+
+
+@pytest.mark.parametrize("damage", SUMMARIES)
+def test_a_damaged_summary_is_named_by_field(finished, tmp_path, damage, capfd):
+    change, said = SUMMARIES[damage]
+    shutil.copytree(finished[0], tmp_path / "out")
+    file = tmp_path / "out" / "summary.json"
+    summary = json.loads(file.read_text())
+    change(summary)
+    file.write_text(json.dumps(summary))
+    assert cli.main(["export", str(tmp_path / "out"), "--to", "cloud"]) == 2
+    errors = capfd.readouterr().err
+    assert f"{file} is not that of a run" in errors
+    assert said in errors
+
+
 DAMAGE = {
     "name": ({"name": 5}, "(its name)"),
     "name that is a path": ({"name": "../../x"}, "(its name)"),

@@ -2,10 +2,11 @@
 
 ``pytest -m slow tests/test_hostile.py`` runs 500 frames, ``UFMSTAR_HOSTILE_FRAMES=10000`` that many. Every session of
 20 frames has its number as seed, so that a failure can be repeated. Damaged files: 150 of each layout, also with a seed
-each."""
+each; of the output folder of a run, 400."""
 
 from __future__ import annotations
 
+import json
 import os
 
 import layouts
@@ -16,7 +17,7 @@ import torch
 from modules import same
 
 import scenes
-from ufmstar_torch import AnchorConfig, MergeConfig, SPGFConfig, UfMStar, UfMStarConfig
+from ufmstar_torch import AnchorConfig, MergeConfig, SPGFConfig, UfMStar, UfMStarConfig, cli
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.eval.sequences import open_sequence
 
@@ -280,6 +281,74 @@ def test_a_few_damaged_recordings(layout, tmp_path):
 @pytest.mark.parametrize("layout", WRITERS)
 def test_hundreds_of_damaged_recordings(layout, tmp_path):
     assert read_damaged(layout, tmp_path, range(100, 250)) > 30
+
+
+# ---- damaged output folders ----
+
+HOSTILE_VALUES = (None, True, -1, 2**63, 10**30, 1e308, float("nan"), "", "x" * 9999, "../../x", [], [[1e308] * 4], {})
+
+
+def mutated(rng, content):
+    """JSON with a value removed, replaced, repeated or negated; or damaged bytes."""
+    values = json.loads(content)
+    node, keys = values, list(values)
+    while True:
+        key = keys[rng.integers(len(keys))]
+        keys = list(node[key]) if isinstance(node[key], dict) else list(range(np.size(node[key]))[:4])
+        if not isinstance(node[key], dict | list) or not keys or rng.random() < 0.4:
+            break
+        node = node[key]
+    kind = rng.integers(5)
+    if kind == 0:
+        return damage(rng, content)
+    if kind == 1:
+        node.pop(key)
+    elif kind == 2 and isinstance(node[key], int | float):
+        node[key] *= -1e9
+    else:
+        node[key] = HOSTILE_VALUES[rng.integers(len(HOSTILE_VALUES))]
+    return json.dumps(values).encode()
+
+
+def damaged_folders(folder, seeds):
+    """Run the commands that read the folder of a run with one of its files mutated. Each ends with an exit code: the
+    number of those that are refused."""
+    path, out = layouts.write_generic(folder / "walk", frames=3)[0], folder / "out"
+    run = ["run", str(path), "--depth", "self", "--plain", "--threads", "1"]
+    assert cli.main([*run, "--out", str(out), "--no-video", "--no-sheet"]) == 0
+    commands = {
+        "frames.jsonl": [["export", "--to", "cloud"], ["export", "--to", "tum"], ["report"]],
+        "summary.json": [["export", "--to", "depth", "--max-sigma", "1"], ["export", "--to", "cloud"]],
+        "run.json": [["run", str(path), *run[2:], "--no-video", "--no-sheet", "--out"]],
+    }
+    refused = 0
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        name = sorted(commands)[rng.integers(len(commands))]
+        file = out / name
+        content = file.read_bytes()
+        lines = content.splitlines(keepends=True) if name == "frames.jsonl" else [content]
+        lines[-1] = mutated(rng, lines[-1])
+        file.write_bytes(b"".join(lines))
+        words = commands[name][rng.integers(len(commands[name]))]
+        before = {each: each.read_bytes() for each in (out / other for other in commands) if each != file}
+        code = cli.main([*words, str(out)] if words[-1] == "--out" else [words[0], str(out), *words[1:]])
+        assert code in (0, 1, 2), (seed, words)
+        refused += code > 0
+        for each, was in (before | {file: content}).items():
+            each.write_bytes(was)
+    return refused
+
+
+def test_a_few_damaged_output_folders(tmp_path, capfd):
+    assert damaged_folders(tmp_path, range(30)) > 5
+    assert "Traceback" not in capfd.readouterr().err
+
+
+@pytest.mark.slow
+def test_hundreds_of_damaged_output_folders(tmp_path, capfd):
+    assert damaged_folders(tmp_path, range(100, 500)) > 50
+    assert "Traceback" not in capfd.readouterr().err
 
 
 @pytest.mark.slow

@@ -101,6 +101,7 @@ def test_the_demo_on_board(tmp_path, monkeypatch, capsys):
     assert {file.name for file in (tmp_path / "out").iterdir()} >= files
     assert set(summary["costs"]["seconds"]) == {"camera and network", "UfM*", "rest"}
     assert len(summary["costs"]["times"]) == summary["realtime"]["results"]
-    with pytest.raises(SystemExit):
-        onboard.main([*words, "--seconds", "0"])
-    assert "--seconds must be at least 1" in capsys.readouterr().err
+    for more, error in (("--seconds", "0"), "--seconds must be at least 1"), ((), "--overwrite replaces it"):
+        with pytest.raises(SystemExit):
+            onboard.main([*words, *more])
+        assert error in capsys.readouterr().err

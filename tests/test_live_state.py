@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import pytest
 import torch
@@ -45,6 +46,12 @@ with LiveDepth(UncertainDepth(Network()), print, state={str(file)!r}):
         (tmp_path / "link.pt").symlink_to(file)
         with pytest.raises(ValueError, match="another process is writing"):
             LiveDepth(model, print, K, state=tmp_path / "link.pt")
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="no file system that creates no files")
+def test_a_state_where_no_file_can_be_created_is_named(model):
+    with pytest.raises(FileNotFoundError, match="no file can be created there"):
+        LiveDepth(model, print, K, state=Path("/proc/x.pt"))
 
 
 def test_the_state_goes_on_where_it_ended(model, tmp_path):

@@ -69,9 +69,8 @@ def test_the_distance_on_recordings(name):
     for n in (0, 6):
         frame = sequence[n]
         x, K = network.preprocess(image_tensor(frame), torch.from_numpy(frame.intrinsics)[None])
-        rows = slice(56, 168)  # half of the map: the oracle is slow
-        K[0, 1, 2] -= rows.start
-        depth = network(x).depth[0, rows].double().numpy()
+        K[0, :2, 2] -= 56  # the middle quarter of the map: the oracle is slow
+        depth = network(x).depth[0, 56:168, 56:168].double().numpy()
         frames.append((depth, frame.T_world_cam, K[0].double().numpy()))
     gap, largest, components = distance(frames)
     assert gap < LIMIT

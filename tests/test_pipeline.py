@@ -270,7 +270,8 @@ def test_stream_runs_a_network_on_the_cpu_beside_ufm_star():
     assert len(list(model.stream((image(i), POSES[i], K) for i in range(3)))) == 3
 
 
-def test_an_error_of_the_network_in_a_stream_comes_after_the_result_before_it():
+@pytest.mark.parametrize("beside", [True, False], ids=["in a thread", "in the caller's thread, as on a GPU"])
+def test_an_error_of_the_network_in_a_stream_comes_after_the_result_before_it(beside):
     class Failing(Scaled):
         def forward(self, image):
             if self.calls == 2:
@@ -278,6 +279,7 @@ def test_an_error_of_the_network_in_a_stream_comes_after_the_result_before_it():
             return super().forward(image)
 
     model = UncertainDepth(Failing(1.0), CONFIG, posterior=False)
+    model._networks_on_cpu = lambda: beside
     results = model.stream((image(i), POSES[i], K) for i in range(4))
     assert [next(results).member for _ in range(2)] == [0, 0]
     with pytest.raises(ArithmeticError, match="the third image"):

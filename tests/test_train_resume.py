@@ -1,4 +1,4 @@
-"""A stopped or failed training continues from its last epoch, with all finished results (killed: test_kills.py)."""
+"""A stopped or failed training continues from its last epoch, with all finished results."""
 
 from __future__ import annotations
 
@@ -115,6 +115,20 @@ def test_a_finished_member_is_not_trained_again(frames, tmp_path, monkeypatch):
     more = replace(recipe, members=3)
     assert [m["seed"] for m in fit(tiny_job(frames, out, more), resume=True)["members"]] == [0, 1, 2]
     assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in before} == before
+
+
+def test_a_full_disk_does_not_hide_an_interruption(frames, tmp_path, monkeypatch, caplog):
+    def stopped(*_, **__):
+        raise KeyboardInterrupt
+
+    def full(*_, **__):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr("ufmstar_torch.train.fit.train_member", stopped)
+    monkeypatch.setattr("ufmstar_torch.train.fit.write_json_atomic", full)
+    with pytest.raises(KeyboardInterrupt):
+        fit(tiny_job(frames, tmp_path / "out", RECIPE))
+    assert "the weights so far cannot be written: No space left" in caplog.text
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

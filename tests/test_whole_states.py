@@ -155,3 +155,64 @@ def test_a_warning_about_the_config_that_is_an_error_changes_nothing():
     with pytest.warns(UserWarning, match="eta was"):
         model.load_stream_state(copy.deepcopy(other.stream_state()))
     assert model._next == 2
+
+
+EXTREME = (0.0, -1.0, 3.0, np.nan, np.inf, -np.inf, 1e-45, 1e-300, 1e30, 1e308, -1e308, 2.0**62)
+
+
+def mutated(rng, state):
+    """A copy of a state with one tensor missing, renamed, of another kind, shape or dtype, or with extreme values."""
+    state = {name: value.clone() for name, value in state.items()}
+    name = str(rng.choice(list(state)))
+    value, kind = state.pop(name), rng.integers(8)
+    if kind == 1:
+        state[f"{name}x"] = value
+    elif kind == 2:
+        state[name] = [None, 5, [1.0], "x", {}, value.numpy(), value.to("meta")][rng.integers(7)]
+    elif kind == 3:
+        state[name] = value.to([torch.float16, torch.float64, torch.int8, torch.bool, torch.complex64][rng.integers(5)])
+    elif kind == 4:
+        state[name] = [value[None], value.flatten()[:0], value.flatten().repeat(2)][rng.integers(3)]
+    elif kind > 4 and value.numel():
+        flat = value.flatten()
+        at = torch.tensor(rng.integers(0, len(flat), [1, 1, len(flat)][kind - 5]))
+        with np.errstate(invalid="ignore"):
+            flat[at] = torch.tensor(rng.choice(EXTREME), dtype=torch.float64).to(value.dtype)
+        state[name] = flat.view(value.shape)
+    return state
+
+
+def load_mutated(kind, seeds):
+    """Load mutated states: each is refused by name and changes nothing, or three frames run and can be saved. The
+    number of states refused."""
+    model, refused = model_of(kind, 4), 0
+    saved = model.stream_state()
+    before = snapshot(model)
+    for seed in seeds:
+        refusal = ""
+        try:
+            model.load_stream_state(mutated(np.random.default_rng(seed), saved))
+        except (TypeError, ValueError) as error:
+            refusal = str(error)
+        if refusal:
+            refused += 1
+            assert unchanged(model, before), seed
+            continue
+        for i in range(4, 7):
+            out = model(*frame(i))
+            assert not out.depth[out.valid].isnan().any(), seed
+            assert not out.std[out.valid].isnan().any(), seed
+        model.load_stream_state(model.stream_state())
+        model.load_stream_state(saved)
+    return refused
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_few_mutated_states(kind):
+    assert load_mutated(kind, range(12)) > 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_hundreds_of_mutated_states(kind):
+    assert load_mutated(kind, range(100, 400)) > 100

@@ -15,6 +15,7 @@ import torch
 from ufmstar_torch.eval.engine.files import write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.machine import hardware, versions
+from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.models.trained import save_trained
 from ufmstar_torch.train.folder import SUMMARY, WEIGHTS, open_folder
 from ufmstar_torch.train.member import (
@@ -56,17 +57,18 @@ def fit(job: Job, *, resume: bool = False, overwrite: bool = False, command: Seq
     first = trainer.is_global_zero
     folder = open_folder(job, resume=resume, overwrite=overwrite) if first else nullcontext()
     with folder, torch.random.fork_rng(devices=range(torch.cuda.device_count())):
-        stopped: str | None = "failed"
         try:
             _meet(trainer, job.settings.out)
             stopped = train_members(job, began)
-        except KeyboardInterrupt:
-            stopped = "interrupted"
-            raise
-        finally:
+        except BaseException as error:
             if first:
-                summary = _conclude(job, stopped, time.monotonic() - began, command)
-    return summary if first else {}
+                stopped = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+                try:
+                    _conclude(job, stopped, time.monotonic() - began, command)
+                except (OSError, ValueError) as unwritten:  # the reason of the stop matters more
+                    LOGGER.warning("the weights so far cannot be written: %s", unwritten)
+            raise
+        return _conclude(job, stopped, time.monotonic() - began, command) if first else {}
 
 
 def _meet(trainer: pl.Trainer, out: Path) -> None:

@@ -266,11 +266,11 @@ class UncertainDepth(NetworksInTurn):
         self, predicted: _Predicted, anchors: Anchors | None, *, search: bool = True
     ) -> Iterator[tuple[Anchors | None, DepthPrediction]]:
         """The image's anchors at pixels of the depth map, and the prediction with whether the image shows something.
-        Waits for the prediction's copies. Errors as :meth:`ImageEvidence.of`."""
+        Waits for the prediction's copies. Errors as :meth:`ImageEvidence.next_image`."""
         if predicted.ready is not None:
             predicted.ready.synchronize()
         p, K, skip = predicted.prediction, predicted.intrinsics, self.ufm.config.on_bad_frame == "skip"
-        with self._evidence.of(
+        with self._evidence.next_image(
             predicted.image, predicted.pose, K, anchors, p.depth.device, search=search, skip=skip
         ) as (found, informative):
             if found is not None and self.preprocess not in (None, in_unit_range):
@@ -336,7 +336,12 @@ class UncertainDepth(NetworksInTurn):
                 if not isinstance(frame, tuple | list) or len(frame) != 3:
                     raise TypeError(f"frames must yield (image, pose, intrinsics), got {type(frame).__name__}")
                 if waiting is None or not self._networks_on_cpu():
-                    ahead = self._predicted(*frame, ahead=waiting is not None)
+                    try:
+                        ahead = self._predicted(*frame, ahead=waiting is not None)
+                    except Exception:  # raised again after the result of the image before
+                        if waiting is not None:
+                            yield self._fused(waiting)
+                        raise
                     if waiting is not None:
                         yield self._fused(waiting)
                     waiting = ahead

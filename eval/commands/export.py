@@ -63,15 +63,17 @@ def main(options: ExportOptions) -> int:
     with usage_errors(FileNotFoundError, ValueError):
         counts = GateCount()
         frames = counts.of(gated_frames(out, options.max_sigma, options.max_relative_sigma))
+        summary = read_summary(out)
         if to not in ("depth", "tum") and options.sequence is not None:
             frames = with_images(frames, open_sequence(options.sequence, **options.opening.changed()))
         elif to not in ("depth", "tum"):
-            print("no colours: --sequence SEQUENCE names the recording with the images")
+            was = summary["settings"]["sequence"]  # shown, never opened
+            print(f"no colours: --sequence SEQUENCE names the recording with the images, in the run {was!r:.200}")
         how = {"voxel": options.voxel} if to == "cloud" else {}
         print(_exporter(to)(frames, out, **how))
         if min(options.max_sigma, options.max_relative_sigma) < math.inf and to != "tum":
             print(f"the limits of sigma keep {counts.share:.1%} of the pixels with a depth")
-            if reason := _unsupported(read_summary(out)):
+            if reason := _unsupported(summary):
                 remedy = "`ufmstar run` without --plain makes a sigma that anchors test (docs/thresholds.md)"
                 print(f"warning: nothing supports this sigma, {reason}: the pixels that are left may be bad; {remedy}")
     return 0

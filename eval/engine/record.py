@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from ufmstar_torch.eval.engine.files import write_atomic, write_json_atomic
 from ufmstar_torch.eval.methods.row import Row, row_from
-from ufmstar_torch.files.limits import read_text
+from ufmstar_torch.files.limits import read_json
 from ufmstar_torch.files.read import read_tensors
 
 FORMAT = 1
@@ -93,8 +92,8 @@ class Record:
         """Read a record. Raises ResultsError: the file is not a record of this format, or its row does not exist; the
         message names the file."""
         try:
-            values = json.loads(read_text(path))
-        except (ValueError, RecursionError) as error:
+            values = read_json(path)
+        except ValueError as error:
             raise ResultsError(f"{path} is not a record: {error}") from error
         names = {f.name for f in fields(cls)} - set(_NOT_STORED)
         if not isinstance(values, dict) or values.pop("format", None) != FORMAT or values.keys() != names:

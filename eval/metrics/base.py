@@ -29,8 +29,8 @@ class Selection:
     def __init__(self, maps: Sequence[Tensor], mask: Tensor, *, complete: bool = False) -> None:
         self.mask: Tensor | None = None
         if complete or _compacts(mask.device):
-            index = slice(None) if complete else mask.nonzero()[:, 0]
-            self.maps = tuple(value[index] for value in maps)
+            whole = complete or bool(mask.all())
+            self.maps = tuple(maps) if whole else tuple(value.masked_select(mask) for value in maps)
         else:
             self.maps = tuple(value.masked_fill(~mask, 1.0) for value in maps)
             self.mask = mask
@@ -56,8 +56,9 @@ class Selection:
         """[bins] by an index [P] in [0, bins): number of the selected pixels, or of those with a ``value`` of True, or
         sum of their ``value`` [P]."""
         if self.mask is None:
-            index, value = (index, value) if value is None or value.dtype != torch.bool else (index[value], None)
-            return torch.bincount(index, value, bins)
+            if value is None or value.dtype != torch.bool:
+                return torch.bincount(index, value, bins)
+            return torch.bincount(index, value.double(), bins).long()  # faster than index[value], and exact
         if value is None or value.dtype == torch.bool:
             values = (self.mask if value is None else self.mask & value).long()
         else:

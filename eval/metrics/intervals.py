@@ -97,12 +97,11 @@ class GatedPixels(SumMetric):
     CONSTANTS = MappingProxyType({"gates": torch.from_numpy(_GATES), "error_edges": torch.from_numpy(_ERRORS)})
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        maps = (pixels.depth, pixels.variance, pixels.target, *([pixels.level] if len(pixels.level) else []))
-        chosen = Selection(maps, pixels.with_truth & pixels.predicted)
-        d, v, g, *levels = chosen
+        d, v, g = chosen = pixels.judged
+        levels = Selection((pixels.level,), pixels.with_truth & pixels.predicted) if len(pixels.level) else ()
         error, gates = (d - g).abs() / g, len(_GATES) + 1
-        gate = torch.searchsorted(self.gates, v.sqrt() / d)  # d = 0 is beyond every gate
-        joint = gate * (len(_ERRORS) + 1) + torch.searchsorted(self.error_edges, error)
+        gate = _class_of(v.sqrt() / d, self.gates)  # d = 0 is beyond every gate
+        joint = gate * (len(_ERRORS) + 1) + _class_of(error, self.error_edges)
         sums = {
             "errors": chosen.histogram(joint, gates * (len(_ERRORS) + 1)).reshape(gates, -1),
             "accurate": chosen.histogram(gate, gates, error <= _DELTA),
@@ -124,6 +123,13 @@ class GatedPixels(SumMetric):
             "gate_delta1": share(accurate, pixels),
             "gate_coverage": share(covered, with_level),
         }
+
+
+def _class_of(value: Tensor, edges: Tensor) -> Tensor:
+    """[P] number of edges [E], which rise geometrically, below each value [P] by more than 1e-9 of it; E for NaN.
+    ``searchsorted`` takes three times as long."""
+    position = (value / edges[0]).log() * ((len(edges) - 1) / (edges[-1] / edges[0]).log())
+    return (position - 1e-9).ceil().nan_to_num(len(edges)).clamp(0, len(edges)).long()
 
 
 def _median(counts: Tensor, edges: Tensor) -> Tensor:

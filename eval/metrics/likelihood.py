@@ -53,7 +53,7 @@ class EntropyHistogram(SumMetric):
         every = Selection((pixels.variance,), pixels.predicted)
         chosen = every.where(every.maps[0] > 0)
         entropy = 0.5 * (math.log(2 * math.pi) + 1.0 + chosen.maps[0].log())
-        counts = chosen.histogram(torch.searchsorted(self.edges, entropy, right=True), 66)
+        counts = chosen.histogram(((entropy + 8.0) * 4.0).floor().clamp(-1, 64).long() + 1, 66)  # edges .25 apart
         below = torch.nn.functional.pad((every.number() - chosen.number())[None], (0, 65))
         return {"counts": counts + below.to(counts.device), "total": chosen.total(entropy), "pixels": chosen.number()}
 

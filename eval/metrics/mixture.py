@@ -44,12 +44,12 @@ class Mixture(SumMetric):
         weight, sigma, error = torch.stack([1 - p, p]), parts.sqrt(), g - d
         log_density = -(error.square() / parts + (2 * torch.pi * parts).log()) / 2
         confidence = (weight * torch.erf(_DELTA * d.abs() / (2**0.5 * sigma))).sum(0)
-        below = (weight * torch.special.ndtr(error / sigma)).sum(0)
+        below = (weight * (1 + torch.erf(error / (2**0.5 * sigma)))).sum(0) / 2
         bins, by_outlier = ((x * _BINS).long().clamp_max(_BINS - 1) for x in (confidence, p))
         accurate = error.abs() <= _DELTA * d.abs()
-        first = chosen.histogram(torch.searchsorted(self.levels, below), _BINS + 1)
+        first = chosen.histogram((below * _BINS - 0.5).ceil().long(), _BINS + 1)  # number of levels below
         return {
-            "total": -chosen.total(torch.logsumexp(weight.log() + log_density, 0)),
+            "total": -chosen.total(torch.logaddexp(*(weight.log() + log_density))),
             "confidence": chosen.histogram(bins, _BINS, confidence),
             "pixels": chosen.histogram(bins, _BINS),
             "accurate": chosen.histogram(bins, _BINS, accurate),

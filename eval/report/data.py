@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,7 +12,7 @@ from ufmstar_torch.eval.engine.judge import CONFIDENCE
 from ufmstar_torch.eval.engine.record import FORMAT, METRICS, Record, ResultsError, Sums
 from ufmstar_torch.eval.methods.row import Row, plain_rows, row_from
 from ufmstar_torch.eval.suite.folder import FAILED, EvalFolder
-from ufmstar_torch.files.limits import read_text
+from ufmstar_torch.files.limits import read_json
 
 Curves = Mapping[str, list[float]]
 
@@ -155,8 +154,8 @@ def _about(out: Path) -> dict[str, Any]:
 def _read_json(path: Path) -> Any:
     """The content of a JSON file, None if it does not exist."""
     try:
-        return json.loads(read_text(path)) if path.is_file() else None
-    except (ValueError, RecursionError) as error:
+        return read_json(path) if path.is_file() else None
+    except ValueError as error:
         raise ResultsError(f"{path} is not JSON: {error}") from error
 
 

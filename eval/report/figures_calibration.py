@@ -107,12 +107,12 @@ def _draw_columns(title: str, panels: Sequence[tuple[tuple[str, str], Mapping[Ro
         drawn = {style.row_style(row): curves[row] for row in rows}
         for below, (kind, words) in enumerate(zip(kinds, (*titles, "", ""), strict=False)):
             panel = axes[len(kinds) * (n // columns) + below, n % columns]
-            _draw_shares(panel, kind, drawn, words, named=n % columns == 0)
+            draw_shares(panel, kind, drawn, words, named=n % columns == 0)
     style.legend_below(figure)
     return figure
 
 
-def _draw_shares(axes: Any, kind: Shares, lines: Mapping[LineStyle, Curves], title: str, *, named: bool = True) -> None:
+def draw_shares(axes: Any, kind: Shares, lines: Mapping[LineStyle, Curves], title: str, *, named: bool = True) -> None:
     """Draw found against stated shares of the lines that have them, in the unit square with its diagonal."""
     axes.set_visible(True)
     axes.plot([0, 1], [0, 1], linestyle="--", linewidth=1.0, color=FAINT, label="exactly right")
@@ -139,8 +139,8 @@ def write_curves(path: Path, curves: Mapping[str, Curves], *, title: str = "") -
     lines = {
         LineStyle(name, *line_style): curves[name] for name, line_style in zip(curves, style.BY_ORDER, strict=False)
     }
-    _draw_shares(delta, DELTA, lines, "δ calibration")
-    _draw_shares(quantiles, QUANTILE, lines, "quantile calibration")
+    draw_shares(delta, DELTA, lines, "δ calibration")
+    draw_shares(quantiles, QUANTILE, lines, "quantile calibration")
     for line_style, values in lines.items():
         x = np.arange(len(values["sparsification_rmse"])) / len(values["sparsification_rmse"])
         sparse.plot(x, values["sparsification_rmse"], markevery=10, **line_style.line)

@@ -140,7 +140,7 @@ def _metric_lines(summary: Mapping[str, Any]) -> list[str]:
 
 def supported(summary: Mapping[str, Any]) -> bool:
     """True if the errors at held-out anchors agree with the posterior's sigma within a factor of two."""
-    calibration = summary.get("posterior", {}).get("calibration")
+    calibration = (summary.get("posterior") or {}).get("calibration")
     return calibration is not None and 1 / _CALIBRATED < calibration < _CALIBRATED
 
 

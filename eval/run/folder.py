@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.engine.files import remove_temporaries, to_json, write_json_atomic
-from ufmstar_torch.files.limits import read_text
+from ufmstar_torch.files.limits import read_json
 from ufmstar_torch.files.write import hold as hold
 from ufmstar_torch.runtime.checked import flat
 
@@ -55,11 +55,11 @@ class FolderKind:
         """The manifest of a folder. Raises FolderError: it is damaged, or of another program or format."""
         path = out / self.manifest
         try:
-            manifest = json.loads(read_text(path))
+            manifest = read_json(path)
             if manifest["program"] != self.program or manifest["format"] != self.format:
                 raise ValueError(f"made by {manifest['program']}, format {manifest['format']}")
             return dict(manifest)
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
+        except (ValueError, KeyError, TypeError) as error:
             article = "an" if self.noun[0] in "aeiou" else "a"
             raise FolderError(f"{path} is not {article} {self.noun}'s ({error}); --overwrite starts again") from error
 
@@ -71,8 +71,8 @@ class FolderKind:
         ours, state = (out / self.manifest).is_file(), ""
         if ours and self.format is None:
             try:
-                content = json.loads(read_text(out / self.manifest))
-            except (OSError, ValueError, RecursionError):
+                content = read_json(out / self.manifest)
+            except (OSError, ValueError):
                 content = None
             ours = isinstance(content, dict) and content.get("program") == self.program
             state = content.get("state", "") if ours else ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,7 +21,8 @@ from ufmstar_torch.eval.run.run_folder import RUN, RunFolder, fitted_depth
 from ufmstar_torch.eval.run.writers import frame_file, read_frame
 from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.eval.sequences.intrinsics import pinhole
-from ufmstar_torch.files.limits import read_text
+from ufmstar_torch.eval.sequences.own_output import is_number
+from ufmstar_torch.files.limits import read_json
 from ufmstar_torch.frames.warnings import hardly_compared
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 
@@ -67,7 +67,7 @@ def write_summary(folder: RunFolder, mixture: GaussianMixture, state: str, reaso
         "mixture": _mixture(done, mixture),
         "time": _time(done, folder.seconds),
         "outputs": folder.outputs,
-        "settings": job.settings,
+        "settings": {"sequence": job.sequence.name, **job.settings},
         "versions": versions(),
         "machine": hardware(),
     }
@@ -79,11 +79,24 @@ def write_summary(folder: RunFolder, mixture: GaussianMixture, state: str, reaso
 
 
 def read_summary(out: Path) -> dict[str, Any]:
-    """The summary of a run. Raises ValueError: it cannot be read."""
+    """The summary of a run. Raises ValueError: it cannot be read, or what is read of an earlier run has another form;
+    the message names file and field."""
     try:
-        return dict(json.loads(read_text(out / SUMMARY)))
-    except (OSError, ValueError, TypeError, RecursionError) as error:
+        summary = read_json(out / SUMMARY)
+    except (OSError, ValueError) as error:
         raise ValueError(f"{out}/{SUMMARY} is not that of a run: {error}") from error
+    content = summary if isinstance(summary, dict) else {}
+    settings, posterior = content.get("settings"), content.get("posterior")
+    calibration = posterior.get("calibration") if isinstance(posterior, dict) else None
+    fine = {
+        "program": content.get("program") == RUN.program,
+        "settings.sequence": isinstance(settings, dict) and isinstance(settings.get("sequence"), str),
+        "posterior": posterior is None or isinstance(posterior, dict),
+        "posterior.calibration": calibration is None or is_number(calibration),
+    }
+    if wrong := [field for field, right in fine.items() if not right]:
+        raise ValueError(f"{out}/{SUMMARY} is not that of a run (its {wrong[0]})")
+    return content
 
 
 def _part_of_image(folder: RunFolder, done: Records) -> str:

@@ -9,7 +9,6 @@ does not return from truncated images. https://colmap.github.io/format.html
 
 from __future__ import annotations
 
-import json
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -27,7 +26,7 @@ from ufmstar_torch.eval.sequences.images import depth_loader, listed_file, liste
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.poses import numbered_lines, poses_from_columns
-from ufmstar_torch.files.limits import read_text
+from ufmstar_torch.files.limits import read_json
 from ufmstar_torch.frames.warnings import LOGGER
 
 LOOKED_FOR = "cameras and images (.bin or .txt) in sparse/0/ (or another number), sparse/ or the folder itself"
@@ -152,8 +151,8 @@ def _frame_name(view: _View) -> str:
 
 
 def _metric(root: Path) -> bool:
-    with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
-        return json.loads(read_text(root / SCALE_FILE))["scale_from"] is not None
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        return read_json(root / SCALE_FILE)["scale_from"] is not None
     return False
 
 

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 
 from ufmstar_torch.files.limits import require_pixels
-from ufmstar_torch.frames.frame import FARTHEST
 
 Loader = Callable[[], np.ndarray]
 Size = tuple[int, int]
@@ -175,6 +174,8 @@ def make_sequence(
     """Divide frames into usable and skipped ones, and check that the intrinsics fit the sizes (H, W). ``posed`` and
     ``metric``: see :class:`FrameSequence`. Raises ValueError: no frame is usable (the message counts the reasons); two
     frames share a name; the intrinsics are malformed or belong to another image size."""
+    from ufmstar_torch.frames.frame import FARTHEST  # here, since that file imports torch
+
     names, entries, skipped = list[str](), list[Entry](), list[Skipped]()
     for frame in frames:
         names.append(frame.name)

@@ -67,12 +67,13 @@ def _wrong_field(record: Any) -> str | None:
         "name": isinstance(name, str) and name != "" and not name.startswith(".") and not set(name) & set("/\\\0"),
         "state": state in ("done", "skipped"),
         "index": not done or (type(index) is int and index >= 0),
-        "timestamp": "timestamp" not in record or _is_number(record["timestamp"]),
-        "intrinsics": not done or (isinstance(K, list) and len(K) == 4 and all(map(_is_number, K)) and min(K[:2]) > 0),
+        "timestamp": "timestamp" not in record or is_number(record["timestamp"]),
+        "intrinsics": not done or (isinstance(K, list) and len(K) == 4 and all(map(is_number, K)) and min(K[:2]) > 0),
         "reason": done or isinstance(record.get("reason"), str),
     }
     return next((f"its {field}" for field, right in fine.items() if not right), None)
 
 
-def _is_number(value: object) -> bool:
+def is_number(value: object) -> bool:
+    """True for a finite number of JSON."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf

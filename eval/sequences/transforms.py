@@ -11,7 +11,6 @@ https://docs.nerf.studio/quickstart/data_conventions.html
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -33,7 +32,7 @@ from ufmstar_torch.eval.sequences.images import (
 )
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.files.limits import read_text
+from ufmstar_torch.files.limits import read_json
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.gaussians.conventions import CONVENTIONS
 
@@ -65,9 +64,9 @@ def read(path: Path, options: Options) -> FrameSequence:
     unknown camera model, or no usable frame."""
     file = _file(path)
     try:
-        content = json.loads(read_text(file))
+        content = read_json(file)
         frames = [dict(frame) for frame in content["frames"]]
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{file}: expected JSON with a list 'frames' of objects: {error}") from error
     others = sorted(other.name for other in file.parent.glob("transforms_*.json") if other != file)
     if path.is_dir() and file.name == TRAIN and others:

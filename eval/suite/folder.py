@@ -11,7 +11,6 @@ OUT/records/DATASET/SEQUENCE/failed.json
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from ufmstar_torch.eval.engine.record import FORMAT, Record, ResultsError
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
 from ufmstar_torch.eval.suite.work_items import WorkItem
-from ufmstar_torch.files.limits import read_text
+from ufmstar_torch.files.limits import read_json
 
 FAILED, CACHE, STOP = "failed.json", "cache", "eval.stop"
 # Files of a report; --overwrite removes them.
@@ -109,11 +108,11 @@ class EvalFolder:
         reasons = {}
         for path in sorted(self.path.glob(f"records/*/*/{FAILED}")):
             try:
-                stored = json.loads(read_text(path))
+                stored = read_json(path)
                 dataset, sequence, reason = (stored[name] for name in ("dataset", "sequence", "reason"))
                 if not all(isinstance(text, str) for text in (dataset, sequence, reason)):
                     raise TypeError("a data set, a sequence and a reason are texts")
-            except (ValueError, LookupError, TypeError, RecursionError) as error:
+            except (ValueError, LookupError, TypeError) as error:
                 raise ResultsError(f"{path} is not the record of a failure: {error}") from error
             reasons[dataset, sequence] = reason
         return reasons

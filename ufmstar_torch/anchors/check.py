@@ -5,7 +5,6 @@ Each warning is logged once per stream, to the logger ``ufmstar_torch``.
 
 from __future__ import annotations
 
-import logging
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -20,13 +19,13 @@ from ufmstar_torch.anchors.anchors import Anchors, inside, require_anchors
 from ufmstar_torch.anchors.epipolar import median
 from ufmstar_torch.frames.arguments import require_float, require_mask
 from ufmstar_torch.frames.frame import FrameInput
+from ufmstar_torch.frames.warnings import log_once
 from ufmstar_torch.kernels.cpu.calls import array
 
 # Largest factor between an anchor and the prediction. A single anchor beyond it would dominate the mean of all others,
 # and larger values overflow in the state. More than FEW such anchors, if they outnumber the valid ones, show that the
 # prediction is wrong.
 FARTHEST_OFF, FEW = 100.0, 3
-_LOG = logging.getLogger("ufmstar_torch")
 _FEW = 8  # least anchors of a frame that are judged
 # Largest share of anchors outside the image: a crop to a square leaves out a quarter of a 4:3 image. Least share
 # outside before rows and columns may be exchanged.
@@ -148,10 +147,7 @@ class AnchorDoubts:
         seldom = self._calls > _FIRST and self._calls % _EVERY
         if seldom or not checked.mask.is_cpu or not checked.mask.shape[1]:
             return
-        for b, kind, text in (*self._pixels(anchors, size), *self._depths(checked)):
-            if (b, kind) not in self._logged:
-                self._logged.add((b, kind))
-                _LOG.warning("stream %d: %s (logged once)", b, text)
+        log_once(self._logged, (*self._pixels(anchors, size), *self._depths(checked)))
 
     def _pixels(self, anchors: Anchors, size: tuple[int, int]) -> Iterator[tuple[int, str, str]]:
         height, width = size

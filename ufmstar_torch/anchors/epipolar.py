@@ -14,8 +14,6 @@ NEAREST = 1e-3
 NEAR, FAR = 1 / 50, 10.0
 # Cells of the image per axis; matches of each cell have the same total weight.
 _CELLS = 6
-# Limit of the inverse depth, as a share of that at which a point reaches the earlier camera's focal plane.
-_AHEAD = 0.98
 # The median of the square of a standard normal variable.
 MEDIAN_SQUARE = 0.4549
 # The standard deviation of most matches is that by the quantile _MOST of their distances, _MOST_QUANTILE of a standard
@@ -43,25 +41,12 @@ def off_lines(
     Returns:
         [N] distances [px], [N] inverse depths of the nearest points on the whole lines [1/m], [N] baselines [m].
     """
-    rays = np.concatenate([position, np.ones((len(position), 1))], axis=1) @ inverse_intrinsics(K).T
-    R_before_world = T_before[:, :3, :3].transpose(0, 2, 1)
-    shift = (R_before_world @ (T[:3, 3] - T_before[:, :3, 3])[..., None])[..., 0]
-    x, b = (R_before_world @ (T[:3, :3] @ rays.T).T[..., None])[..., 0] @ K.T, shift @ K.T
+    from ufmstar_torch.anchors.kernels.epipolar import from_lines  # compiles when it is first needed
 
-    # The point must lie in front of the earlier camera, too: 1/z < x_z/-b_z.
-    rho_max = np.where(b[:, 2] < 0, _AHEAD * x[:, 2] / np.maximum(-b[:, 2], 1e-12), np.inf)
-
-    def project(depth: float) -> NDArray[np.float64]:
-        point = x + b * np.minimum(1 / depth, rho_max)[:, None]
-        return np.asarray(point[:, :2] / np.maximum(point[:, 2:], NEAREST))
-
-    start = project(near)
-    segment, from_start = project(far) - start, before - start
-    share = (from_start * segment).sum(1) / np.maximum(np.square(segment).sum(1), 1e-12)
-    offset = from_start - share.clip(0, 1)[:, None] * segment
-    speed = b[:, :2] - before * b[:, 2:]
-    rho = ((before * x[:, 2:] - x[:, :2]) * speed).sum(1) / np.maximum(np.square(speed).sum(1), 1e-12)
-    return np.linalg.norm(offset, axis=1), rho, np.linalg.norm(shift, axis=1)
+    distance, rho, baseline = np.zeros((3, len(position)))
+    cameras = T, T_before, K, inverse_intrinsics(K)
+    from_lines(position, before, *cameras, 1 / near, 1 / far, distance, rho, baseline)
+    return distance, rho, baseline
 
 
 def on_lines(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from math import prod
 from pathlib import Path
+from typing import Any
 
 MOST_BYTES = 2**30  # of one array, of a state, or of a list of frames
 MOST_PIXELS = MOST_BYTES // 12  # of an image, which takes 12 bytes a pixel as float32 RGB
@@ -32,3 +34,11 @@ def read_text(path: str | Path) -> str:
     if path.is_file():
         require_bytes(str(path), path.stat().st_size)
     return path.read_text(encoding="utf-8-sig")
+
+
+def read_json(path: str | Path) -> Any:
+    """The value of a JSON file. Raises OSError, ValueError: as :func:`read_text`; it is no JSON, or nested too deep."""
+    try:
+        return json.loads(read_text(path))
+    except RecursionError as error:
+        raise ValueError("its values are nested too deep") from error

@@ -62,13 +62,15 @@ def remove_temporaries(paths: Iterable[Path]) -> None:
 
 def hold(path: Path) -> BaseFileLock | None:
     """Lock a file until the lock is released or the process ends in any way. None if another process, or an earlier
-    call, holds it. Raises OSError: the file cannot be opened or locked."""
+    call, holds it. Raises OSError: the file cannot be created, opened or locked."""
     from filelock import FileLock, Timeout
 
     lock = FileLock(path, thread_local=False, fallback_to_soft=False)
     try:
         lock.acquire(blocking=False)
     except Timeout:
+        if not path.exists():  # filelock tries again where a file system, such as /proc, creates no files
+            raise FileNotFoundError(errno.ENOENT, "no file can be created there", str(path)) from None
         return None
     except (NotImplementedError, OSError) as error:
         code = error.errno if isinstance(error, OSError) else errno.ENOSYS  # filelock's form of it

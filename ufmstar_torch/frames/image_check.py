@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from ufmstar_torch.frames.warnings import LOGGER
+from ufmstar_torch.frames.warnings import LOGGER, log_once
 
 # Width of the reduced image [px], and the cells over which it is averaged [px].
 _WIDTH, _CELL = 192, 3
@@ -145,14 +145,8 @@ class ImageCheck:
         self._seen = _Seen(grey, T, first, still, empty, repeated)
         self._examined = True
         if image.is_cpu:  # on an accelerator, reading the counts would synchronise
-            self._warn(self._seen)
+            log_once(self._logged, (*_findings(self._seen), *_moving(self._seen)))
         return shows & ~frozen
-
-    def _warn(self, seen: _Seen) -> None:
-        for b, kind, text in (*_findings(seen), *_moving(seen)):
-            if (b, kind) not in self._logged:
-                self._logged.add((b, kind))
-                LOGGER.warning("stream %d: %s (logged once)", b, text)
 
 
 def _mask(streams: Sequence[int], seen: _Seen) -> Tensor:

@@ -46,7 +46,7 @@ class ImageEvidence:
         self.images = ImageCheck()
 
     @contextmanager
-    def of(
+    def next_image(
         self, image: Tensor, pose: Tensor, K: Tensor, anchors: Anchors | None, device: torch.device, *,
         search: bool, skip: bool,
     ) -> Iterator[tuple[Anchors | None, Tensor | None]]:  # fmt: skip

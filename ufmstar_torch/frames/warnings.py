@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import torch
 from torch import Tensor
@@ -56,6 +56,14 @@ _CAUSES = (
     "another convention, a trajectory of other times, depth that is inverse or relative, or intrinsics of an image of "
     "another size"
 )
+
+
+def log_once(logged: set[tuple[int, str]], findings: Iterable[tuple[int, str, str]]) -> None:
+    """Log the texts of findings (stream, kind, text) whose stream and kind are not ``logged``, and add these."""
+    for b, kind, text in findings:
+        if (b, kind) not in logged:
+            logged.add((b, kind))
+            LOGGER.warning("stream %d: %s (logged once)", b, text)
 
 
 @dataclass
@@ -207,15 +215,13 @@ class StreamWarnings:
         self._calls += 1
         if device == "meta" or (device != "cpu" and (self._calls % EVERY or torch.cuda.is_current_stream_capturing())):
             return
-        for b, kind, text in (
-            *_left_out(frame, statistics, frames, config),
-            *(_spreads(frame) if self._calls % EVERY in (0, 1) else ()),
-            *self._tracked(frame, statistics),
-            *self._alone(statistics, frames),
-        ):
-            if (b, kind) not in self._logged:
-                self._logged.add((b, kind))
-                LOGGER.warning("stream %d: %s (logged once)", b, text)
+        findings = (
+            _left_out(frame, statistics, frames, config),
+            _spreads(frame) if self._calls % EVERY in (0, 1) else (),
+            self._tracked(frame, statistics),
+            self._alone(statistics, frames),
+        )
+        log_once(self._logged, chain.from_iterable(findings))
 
     def _tracked(self, frame: FrameInput, statistics: FrameStatistics) -> Iterator[tuple[int, str, str]]:
         rows = frame.depth[:, ::_ROWS]

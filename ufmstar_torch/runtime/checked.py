@@ -7,7 +7,6 @@ names the field.
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from collections.abc import Mapping
@@ -17,7 +16,7 @@ from typing import Any, ClassVar, Self, get_args, get_type_hints
 
 import numpy as np
 
-from ufmstar_torch.files.limits import read_text
+from ufmstar_torch.files.limits import read_json
 
 
 def number(
@@ -95,8 +94,8 @@ class Checked:
         if not isinstance(path, str | Path):
             raise TypeError(f"path must be a file name or path, got {type(path).__name__}")
         try:
-            values = json.loads(read_text(path))
-        except (ValueError, RecursionError) as error:
+            values = read_json(path)
+        except ValueError as error:
             raise ValueError(f"{path} is not JSON: {error}") from error
         if not isinstance(values, dict):
             raise ValueError(f"{path} must hold a JSON object, got {type(values).__name__}")

@@ -35,6 +35,8 @@ LONGEST, APART = 192, 2
 # The first searched view shows the line from infinity to this multiple of the starting inverse depth: a better match
 # could lie outside of the image.
 WHOLE = 2.0
+# [px] Distance from the border within which a view does not show a line.
+_BORDER = 3.0
 # [px^2] Variance of a match without residual, from interpolation.
 LEAST_MATCH = 0.03**2
 # [px] A match measures the poses across the line where its noise there is below this.
@@ -176,9 +178,9 @@ def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, con
             x, y = H[k, 0, 0] * u + H[k, 0, 1] * v + H[k, 0, 2], H[k, 1, 0] * u + H[k, 1, 1] * v + H[k, 1, 2]
             z = H[k, 2, 0] * u + H[k, 2, 1] * v + H[k, 2, 2]
             low, high = first_low, first_high
-            ends = _within(x, y, z, b[k], 0.0, width, height) and _within(x, y, z, b[k], WHOLE * start, width, height)
-            shown[n] += ends
-            if first and not ends:
+            line, size = (x, y, z, b[k]), (width, height)
+            shown[n] += _within(*line, 0.0, *size, _BORDER) and _within(*line, WHOLE * start, *size, _BORDER)
+            if first and not (_within(*line, 0.0, *size, -FIRST) and _within(*line, WHOLE * start, *size, -FIRST)):
                 continue
             if not first:
                 speed = _speed(x, y, z, b[k], at)[2]
@@ -222,13 +224,13 @@ def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, con
 
 
 @reordered_leaf
-def _within(x, y, z, b, rho, width, height):
-    """True if the view shows a window around the point at inverse depth rho."""
+def _within(x, y, z, b, rho, width, height, border):
+    """True if the view shows the point at inverse depth rho, and ``border`` px around it."""
     z += rho * b[2]
     if z <= 1e-6:
         return False
     u, v = (x + rho * b[0]) / z, (y + rho * b[1]) / z
-    return -FIRST <= u <= width - 1 + FIRST and -FIRST <= v <= height - 1 + FIRST
+    return border <= u <= width - 1 - border and border <= v <= height - 1 - border
 
 
 @reordered_leaf
