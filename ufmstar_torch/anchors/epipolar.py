@@ -45,7 +45,7 @@ def off_lines(
 
     distance, rho, baseline = np.zeros((3, len(position)))
     cameras = T, T_before, K, inverse_intrinsics(K)
-    from_lines(position, before, *cameras, 1 / near, 1 / far, distance, rho, baseline)
+    from_lines(position, before, *cameras, 1 / near, 1 / far, NEAREST, distance, rho, baseline)
     return distance, rho, baseline
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from ufmstar_torch.anchors.epipolar import NEAREST
 from ufmstar_torch.kernels.compile_cpu import reordered
 
 # Limit of the inverse depth, as a share of that at which a point reaches the earlier camera's focal plane.
@@ -12,8 +11,9 @@ _AHEAD = 0.98
 
 
 @reordered
-def from_lines(position, before, T, T_before, K, K_inverse, nearest, farthest, distance, rho, baseline):
-    """Write the results of ``anchors.epipolar.off_lines``, with the inverse depths ``nearest`` and ``farthest``."""
+def from_lines(position, before, T, T_before, K, K_inverse, nearest, farthest, least, distance, rho, baseline):
+    """Write the results of ``anchors.epipolar.off_lines``, for inverse depths ``nearest`` and ``farthest``,
+    and depths of at least ``least``."""
     for n in range(len(position)):
         u, v, P = before[n, 0], before[n, 1], T_before[n]
         x = K_inverse[0, 0] * position[n, 0] + K_inverse[0, 1] * position[n, 1] + K_inverse[0, 2]
@@ -31,7 +31,7 @@ def from_lines(position, before, T, T_before, K, K_inverse, nearest, farthest, d
         # The point must lie in front of the earlier camera, too: 1/z < x_z/-b_z.
         most = _AHEAD * xz / max(-bz, 1e-12) if bz < 0 else np.inf
         near, far = min(nearest, most), min(farthest, most)
-        near_z, far_z = max(xz + near * bz, NEAREST), max(xz + far * bz, NEAREST)
+        near_z, far_z = max(xz + near * bz, least), max(xz + far * bz, least)
         start_u, start_v = (xx + near * bx) / near_z, (xy + near * by) / near_z
         du, dv = (xx + far * bx) / far_z - start_u, (xy + far * by) / far_z - start_v
         share = ((u - start_u) * du + (v - start_v) * dv) / max(du * du + dv * dv, 1e-12)
