@@ -75,21 +75,61 @@ def test_anchors_of_another_camera_are_at_the_pixels_of_the_image():
 def test_landmarks_of_the_images_complete_it():
     """Only the landmark in the hole is added: one is on a pixel that the sensor measured, one is next to such a pixel.
 
-    The common error of the images' landmarks stays."""
-    covered = np.ones((240, 320), bool)
-    covered[:, 200:] = False
+    Where landmarks and sensor agree, depths stay. The stated common errors stay."""
+    depth = plane()
+    depth[:, 200:] = 0
     pixel = np.array([[50.0, 50], [201, 60], [250, 70]])
-    others = Landmarks(pixel, np.full(3, 4.0), np.full(3, 0.1), 3, shared=0.01, scale=0.02)
-    sensor = sensor_landmarks(np.where(covered, plane(), np.float32(0)), K, K)
-    found = completed(sensor, others, covered)
+    others = Landmarks(pixel, np.array([2.0, 4, 4]), np.full(3, 0.1), 3, shared=1e-4, scale=1e-5)
+    sensor = sensor_landmarks(depth, K, K)
+    found = completed(sensor, others, depth)
     n = len(sensor.depth)
     np.testing.assert_array_equal(found.pixel[n:], [[250, 70]])
-    assert (found.depth[n:].tolist(), found.variance[n:].tolist()) == ([4.0], [0.1])
-    assert (found.shared, found.scale, found.tracked) == (0.01, 0.02, n + 3)
+    np.testing.assert_allclose(found.depth[n:], 4)
+    assert (found.variance[n:] <= 0.1 * (1 + 1e-9)).all()
+    assert (found.shared, found.scale, found.tracked) == (1e-4, 1e-5, n + 3)
     none = replace(others, pixel=np.zeros((0, 2)), depth=np.zeros(0), variance=np.zeros(0), shared=np.inf)
-    alone = completed(sensor, none, covered)
+    alone = completed(sensor, none, depth)
     np.testing.assert_array_equal(alone.depth, sensor.depth)
     assert (alone.shared, alone.scale, alone.motion) == (0, 0, None), "wrong poses do not concern the sensor"
+
+
+def with_common_error(rng, wrong=0.0):
+    """A plane of 2 m that the sensor measures at the left, a wall of 6 m at the right that it does not, and landmarks
+    of the images whose inverse depths share an error; of those on the plane, the share ``wrong`` has the depth 1 m."""
+    depth = plane()
+    depth[:, 160:] = 0
+    on_plane = np.arange(400) < 200
+    pixel = np.stack([rng.uniform(5, 150, 400) + 160 * ~on_plane, rng.uniform(5, 235, 400)], axis=-1)
+    u, v = 2 * (pixel.T + 0.5) / [[320], [240]] - 1
+    truth = np.where(on_plane, 2.0, 6.0)
+    rho = (1 / truth + 0.02 + 0.005 * u - 0.01 * v + rng.normal(0, 0.005, 400)) / (1 - 0.01)
+    rho[on_plane & (rng.uniform(size=400) < wrong)] = 1
+    variance = (0.005**2 + 0.02**2 + 0.01**2 * rho**2) / rho**4
+    others = Landmarks(pixel, 1 / rho, variance, 400, shared=0.02**2, scale=0.01**2)
+    return depth, others, on_plane
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.2])
+def test_the_sensor_corrects_the_common_errors_of_the_images(wrong):
+    depth, others, on_plane = with_common_error(np.random.default_rng(1), wrong)
+    sensor = sensor_landmarks(depth, K, K)
+    found = completed(sensor, others, depth)
+    before = others.depth[~on_plane]
+    far = slice(len(found.depth) - len(before), None)
+    assert np.median(np.abs(before / 6 - 1)) > 0.08
+    assert np.median(np.abs(found.depth[far] / 6 - 1)) < 0.03
+    z = (found.depth[far] - 6) / np.sqrt(found.variance[far])
+    assert 0.3 < np.sqrt(np.mean(z**2)) < 1.5
+    assert (found.variance[far] < others.variance[~on_plane]).all()
+
+
+def test_poses_without_a_known_error_correct_nothing():
+    depth, others, _ = with_common_error(np.random.default_rng(2))
+    sensor = sensor_landmarks(depth, K, K)
+    for unchanged in (replace(others, shared=np.inf), replace(others, pixel=others.pixel + np.array([160.0, 0]))):
+        found = completed(sensor, unchanged, depth)
+        assert set(found.depth[len(sensor.depth) :]) <= set(others.depth)
+        assert found.shared == unchanged.shared
 
 
 # ---- ufmstar run

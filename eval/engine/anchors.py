@@ -121,16 +121,16 @@ class AnchorSource:
     ) -> tuple[Landmarks, Anchors, float]:
         """As :meth:`of`, from the frame's depth where it has one and from the tracks elsewhere."""
         assert self.sensor is not None
-        started, landmarks, covered = perf_counter(), _NO_DEPTH, None
+        started, landmarks, depth = perf_counter(), _NO_DEPTH, None
         if frame.depth is not None:
             K_depth = depth_camera(frame)
             landmarks = sensor_landmarks(frame.depth, K_depth, frame.intrinsics, self.sensor)
             if frame.image is not None:
                 size = frame.image.shape[0], frame.image.shape[1]
-                covered = resample_nearest(frame.depth > 0, K_depth, frame.intrinsics, size)
+                depth = resample_nearest(frame.depth, K_depth, frame.intrinsics, size)
         tracked = tracks.of(frame, T_world_cam)
         if tracked is not None:
-            landmarks = tracked[0] if covered is None else completed(landmarks, tracked[0], covered)
+            landmarks = tracked[0] if depth is None else completed(landmarks, tracked[0], depth, self.sensor)
         anchors = landmarks.anchors(frame.intrinsics, prediction.K[0]).to(prediction.depth.device)
         return landmarks, anchors, 1000 * (perf_counter() - started)
 

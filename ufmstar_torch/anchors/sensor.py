@@ -1,7 +1,13 @@
 """Anchors of a depth camera: its depth, thinned to what the posterior can use, with the variance of its kind of sensor.
 
 The sensor's depth has holes, ends at a range and is wrong at edges. There, landmarks of the images complete it
-(:func:`completed`).
+(:func:`completed`), less the common errors that the sensor shows where both measure. With rho an inverse depth, u and v
+from -1 to 1, and wrong poses that shift and turn the images' inverse depths,
+
+    rho_image - rho_sensor = b . (1, u, v, rho_image) + e.
+
+b is normal with the variances that the landmarks state for their common errors: ``Landmarks.shared`` for the first
+three, ``Landmarks.scale`` for the last. e is Student-t distributed, with the landmark's own variance and the sensor's.
 """
 
 from __future__ import annotations
@@ -22,6 +28,11 @@ _CANDIDATES = 6
 # Side of the neighbourhood of a candidate [px], in which depths differ at most by this share of the depth and this many
 # standard deviations: at edges, sensors measure the wrong surface or a mean of two.
 _SIDE, _SHARE, _SIGMAS = 5, 0.02, 3.0
+# Degrees of freedom of e, and iterations of the reweighting. Least variance of a coefficient of b, against division by
+# 0: 1e-5/m, which is 1 mm in a depth of 10 m.
+_FREEDOM, _ITERATIONS, _LEAST = 2.0, 8, 1e-10
+# Least share of a landmark's variance that is its own; least inverse depth, as a share of that measured.
+_OWN, _NEAREST_ZERO = 0.1, 0.1
 
 
 # Standard deviation of a depth z, sigma = a + b z + c z^2 [m], by kind of sensor. Stereo and structured light measure a
@@ -70,13 +81,15 @@ def sensor_landmarks(
     return Landmarks(pixel[:, :2], z, np.square(_sigma(z, kind)), len(z), none="no depth of the sensor")
 
 
-def completed(sensor: Landmarks, others: Landmarks, covered: NDArray[np.bool_]) -> Landmarks:
-    """The sensor's landmarks, and those of the images on pixels without the sensor's depth.
+def completed(sensor: Landmarks, others: Landmarks, depth: NDArray[np.float32], kind: str = "stereo") -> Landmarks:
+    """The sensor's landmarks, and those of the images on pixels without the sensor's depth, less the common errors that
+    the sensor shows.
 
     Args:
         sensor: in the pixels of the image.
         others: likewise; their figures of poses are those of the result.
-        covered: [H, W] of the image, True where the sensor measured.
+        depth: [H, W] of the sensor at the image's pixels, 0 = none [m].
+        kind: of the sensor, as for :func:`sensor_landmarks`.
     """
     if not len(others.depth):
         return replace(
@@ -89,19 +102,50 @@ def completed(sensor: Landmarks, others: Landmarks, covered: NDArray[np.bool_]) 
             shared=0.0,
             scale=0.0,
         )
-    height, width = covered.shape
+    height, width = depth.shape
     column, row = (
         np.rint(x).astype(int).clip(0, size - 1) for x, size in zip(others.pixel.T, (width, height), strict=True)
     )
-    apart = ~(_spread(covered.astype(np.float32)) > 0)[row, column]
+    apart = ~(_spread((depth > 0).astype(np.float32)) > 0)[row, column]
+    z = np.where(_away_from_edges(depth, kind), depth, np.float32(0))[row, column].astype(np.float64)
+    corrected = _without_common_errors(others, z, (height, width), kind)
     return replace(
-        others,
-        pixel=np.concatenate([sensor.pixel, others.pixel[apart]]),
-        depth=np.concatenate([sensor.depth, others.depth[apart]]),
-        variance=np.concatenate([sensor.variance, others.variance[apart]]),
+        corrected,
+        pixel=np.concatenate([sensor.pixel, corrected.pixel[apart]]),
+        depth=np.concatenate([sensor.depth, corrected.depth[apart]]),
+        variance=np.concatenate([sensor.variance, corrected.variance[apart]]),
         motion=None,  # the sensor measures what moves, too
         tracked=sensor.tracked + others.tracked,
     )
+
+
+def _without_common_errors(others: Landmarks, z: NDArray[np.float64], size: tuple[int, int], kind: str) -> Landmarks:
+    """The landmarks less b . x, with the variances after that (the module's equation).
+
+    Args:
+        others: of the images.
+        z: [N] the sensor's depth at their pixels, 0 = none [m].
+        size: (H, W) of the image.
+        kind: of the sensor.
+    """
+    seen, rho = z > 0, 1 / others.depth
+    total, shared, scale = others.variance * rho**4, others.shared, others.scale
+    if not seen.any() or not np.isfinite(shared):
+        return others
+    u, v = 2 * (others.pixel.T + 0.5) / np.array([size[1], size[0]])[:, None] - 1
+    x = np.stack([np.ones_like(rho), u, v, rho], axis=-1)
+    own = np.maximum(total - shared - scale * rho**2, _OWN * total)
+    known, z = x[seen], z[seen]
+    noise = own[seen] + np.square(_sigma(z, kind) / z**2)
+    prior, weight = np.diag(1 / np.maximum([shared, shared, shared, scale], _LEAST)), 1 / noise
+    for _ in range(_ITERATIONS):
+        covariance = np.linalg.inv(prior + (known.T * weight) @ known)
+        b = covariance @ known.T @ (weight * (rho[seen] - 1 / z))
+        residual = rho[seen] - 1 / z - known @ b
+        weight = (_FREEDOM + 1) / (_FREEDOM * noise + np.square(residual))
+    depth = 1 / np.maximum(rho - x @ b, _NEAREST_ZERO * rho)
+    variance = np.minimum(own + np.einsum("ni,ij,nj->n", x, covariance, x), total) * depth**4
+    return replace(others, depth=depth, variance=variance)
 
 
 def _sigma(z: NDArray[np.float64], kind: str) -> NDArray[np.float64]:
