@@ -160,6 +160,25 @@ def test_state_continues_and_resets():
     assert whole(image(0), POSES[0], K).member == 0
 
 
+def test_a_state_that_is_refused_leaves_the_last_image_known():
+    """The camera moves, and its image is repeated: that is noticed although a load failed in between."""
+    picture = torch.randint(100, 255, (1, 3, H, W), dtype=torch.uint8)
+
+    class Wall(nn.Module):
+        def forward(self, x):
+            return DepthPrediction(torch.full_like(x[:, 0], 2.0))
+
+    models = [UncertainDepth(Wall(), CONFIG, posterior=False) for _ in range(3)]
+    for model in models:
+        model(picture, POSES[0], K)
+    with pytest.raises(ValueError, match="the state must hold"):
+        models[0].load_stream_state({})
+    models[1].load_stream_state(models[1].stream_state())  # forgets the image
+    refused, loaded, undisturbed = (model(picture, POSES[1], K).variance.nan_to_num() for model in models)
+    assert torch.equal(refused, undisturbed)
+    assert not torch.equal(loaded, undisturbed)
+
+
 def test_a_state_holds_no_weights_and_names_other_networks(caplog):
     first = UncertainDepth([Scaled(1.0), Scaled(1.1)], CONFIG, posterior=False)
     for i in range(3):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -136,6 +137,13 @@ class TestCompare:
             colours = np.asarray(picture.convert("RGB")).astype(int)
         # RdBu_r: red where UfM*'s value is larger; it is nowhere smaller.
         assert ((colours[..., 0] > 80) & (colours[..., 1] < 20) & (colours[..., 2] < 50)).sum() > 500
+
+    def test_long_labels_of_rows_do_not_run_over_the_panels(self, tmp_path: Path) -> None:
+        one = example({"ufm": (full(2.0), full(0.01)), "star": (full(2.0), full(0.02))})
+        long = replace(one, labels={name: f"networks in turn, with {name} (100,000 points)" for name in one.rows})
+        drawn = [draw_comparison(tmp_path, e, ["ufm", "star"], base) for e, base in ((one, "a"), (long, "b"))]
+        assert (tmp_path / drawn[0].file).read_bytes() == (tmp_path / drawn[1].file).read_bytes()
+        assert drawn[1].title.endswith(f"{long.labels['star']} against {long.labels['ufm']}")
 
 
 class TestWritePictures:

@@ -479,6 +479,7 @@ class UncertainDepth(NetworksInTurn):
         except BaseException:
             self._load(before)
             raise
+        self._evidence.images.reset()
 
     def _load(self, state: Mapping[str, Tensor]) -> None:
         parts: dict[str, dict[str, Tensor]] = {_UFM: {}, _LANDMARKS: {}, "": {}}
@@ -500,7 +501,6 @@ class UncertainDepth(NetworksInTurn):
         if int(counts[_MARK]) != weights_mark(self.networks):
             LOGGER.warning("the state was saved with other networks: it holds their disagreement; reset() begins anew")
         self._next = int(counts[_INDEX])
-        self._evidence.images.reset()
 
 
 def _copied(values: dict[str, Tensor], device: torch.device | None) -> tuple[dict[str, Any], torch.cuda.Event | None]:

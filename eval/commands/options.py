@@ -40,6 +40,7 @@ _plain: dict[str, Any] = {"help_behavior_hint": ""}
 Flag = Annotated[bool, arg(**_plain)]
 Text = Annotated[str | None, arg(metavar="TEXT", **_plain)]
 File = Annotated[Path | None, arg(metavar="FILE", **_plain)]
+Folder = Annotated[Path | None, arg(metavar="DIR", **_plain)]
 Count = Annotated[int | None, arg(metavar="N", **_plain)]
 Number = Annotated[float | None, arg(metavar="X", **_plain)]
 Texts = Annotated[tuple[str, ...], arg(metavar="TEXT...", **_plain)]
