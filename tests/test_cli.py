@@ -63,7 +63,7 @@ HEAVY = ("torch", "numba", "scipy", "cv2", "PIL", "pandas", "matplotlib", "onnx"
 
 
 def test_help_imports_no_heavy_package():
-    """Of all commands in one process; train is the last, since its options contain settings from modules that import
+    """All commands run in one process; train is the last, since its options contain settings from modules that import
     torch."""
     commands = [*sorted(cli.COMMANDS, key="train".__eq__), None]
     words = [["eval", "--list"], *([name, "--help"] for name in commands[:-1])]

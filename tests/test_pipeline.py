@@ -139,6 +139,23 @@ def test_the_mean_uncertainty_of_images():
     assert model(image(4), POSES[4], K).member == 0
 
 
+@pytest.mark.parametrize("beside", [True, False])
+def test_a_stream_may_reuse_the_arrays_of_its_frames(beside, monkeypatch):
+    """Networks run ahead in a thread of their own, or, as on an accelerator, in the caller's."""
+    monkeypatch.setattr(UncertainDepth, "_networks_on_cpu", lambda self: beside)
+
+    def video():
+        picture, pose, intrinsics = image(0)[0].clone(), POSES[0].numpy().copy(), K.numpy().copy()
+        for i in range(4):
+            picture[:], pose[:], intrinsics[:] = image(i)[0], POSES[i].numpy(), K.numpy()
+            intrinsics[0, 0] *= 1 + i / 20
+            yield picture, pose, intrinsics
+
+    model, one_by_one = (UncertainDepth(Scaled(1.0), CONFIG, posterior=False) for _ in range(2))
+    for out, frame in zip(model.stream(video()), video(), strict=True):
+        assert torch.equal(out.variance, one_by_one(*frame).variance)
+
+
 def test_networks_stay_in_eval_mode():
     model = UncertainDepth(nn.Sequential(Scaled(1.0)), CONFIG, posterior=False)
     model.train()

@@ -73,6 +73,11 @@ class _Predicted:
     features: Tensor | None
     ready: torch.cuda.Event | None
 
+    def copied(self) -> _Predicted:
+        """With copies of the caller's image, pose and intrinsics, whose memory the next frame may reuse."""
+        copies = {name: getattr(self, name).clone() for name in ("image", "pose", "intrinsics")}
+        return replace(self, **copies, prediction=replace(self.prediction, intrinsics=self.prediction.K.clone()))
+
 
 @one_caller(
     "forward",
@@ -320,7 +325,8 @@ class UncertainDepth(NetworksInTurn):
         """The predictions of a video, in order, with the networks one image ahead of UfM*.
 
         Both run at the same time: networks on a GPU with ``multiview_device="cpu"``, those on the CPU in a thread of
-        their own, except under autocast. Each result is yielded after the next frame has been read.
+        their own, except under autocast. Each result is yielded after the next frame has been read,
+        which may reuse the arrays of the one before.
 
         Args:
             frames: image, pose and intrinsics of each frame, as in :meth:`forward`.
@@ -342,13 +348,13 @@ class UncertainDepth(NetworksInTurn):
                         if waiting is not None:
                             yield self._fused(waiting)
                         raise
-                    if waiting is not None:
-                        yield self._fused(waiting)
-                    waiting = ahead
+                    before, waiting = waiting, ahead.copied()
+                    if before is not None:
+                        yield self._fused(before)
                     continue
                 out, predicting = self._fused_beside(waiting, pool, frame)
                 yield out
-                waiting = predicting.result()
+                waiting = predicting.result().copied()
         if waiting is not None:
             yield self._fused(waiting)
 
