@@ -20,6 +20,7 @@ from ufmstar_torch.eval.commands.options import (
     Texts,
     arg,
     assigned,
+    one_of,
     parse,
 )
 
@@ -66,7 +67,7 @@ class DataOptions:
         no_augmentation: Train on the frames as they are.
     """
 
-    data: Literal["tour", "nyu", "sequences"] | None = None
+    data: Annotated[Literal["tour", "nyu", "sequences"] | None, one_of("tour", "nyu", "sequences")] = None
     root: Texts = ()
     no_augmentation: Flag = False
 
