@@ -48,6 +48,11 @@ Repeated = Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="TEXT", **_pl
 Words = Annotated[UseAppendAction[tuple[tuple[str, ...], ...]], arg(metavar="TEXT...", **_plain)]  # or several
 
 
+def one_of(*names: str) -> Any:
+    """The help of an option that has one of these names, or None by default."""
+    return arg(metavar=f"{{{','.join(names)}}}", **_plain)
+
+
 @dataclass(frozen=True, kw_only=True)
 class MachineOptions:
     """The machine.
