@@ -26,6 +26,7 @@ from ufmstar_torch.eval.report.pictures import (
     pictures_of,
 )
 from ufmstar_torch.eval.run.colours import INVALID_GREY
+from ufmstar_torch.eval.run.panels import break_name
 
 K = np.array([[20.0, 0, 7.5], [0, 20, 5.5], [0, 0, 1]])
 
@@ -153,3 +154,16 @@ class TestWritePictures:
         assert [p.file.partition("-")[0] for p in pictures] == [STRIP, BREAKDOWN, COMPARE]
         assert all((evaluation / "figures" / p.file).is_file() for p in pictures)
         assert all(p.title.startswith(sequence) for p in pictures)
+
+
+@pytest.mark.parametrize(
+    ("name", "lines"),
+    [
+        ("1305031105.043373", ["1305031105.", "043373"]),
+        ("a_long-name.of a room", ["a_long-", "name.of a", "room"]),
+        ("abcdefghijklmnop", ["abcdefghijkl", "mnop"]),
+        ("short", ["short"]),
+    ],
+)
+def test_names_break_at_marks_and_timestamps_at_the_point(name: str, lines: list[str]) -> None:
+    assert break_name(name, 12).split("\n") == lines
