@@ -8,12 +8,14 @@ all moving pixels and for those that stand still: number of pixels; median ratio
 square z; the share of pixels beyond 4 sigma; the share with a stated sigma below a tenth of the depth and an error
 above half of the truth; delta1; NLL; and NLL of the mixture. The last row has the still pixels in the tours without
 things that move. The first frames are left out, because they have no parallax. A second table has the pixels of all
-tours by ``posterior_outlier``.
+tours by ``posterior_outlier``: the share beyond three standard deviations of the inliers, as the mixture states it and
+as found.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 from collections import defaultdict
 from collections.abc import Iterator
 from itertools import pairwise
@@ -92,8 +94,7 @@ def posterior(frames: list[Frame], network: DepthNetwork | None) -> Iterator[tup
 def row(name: str, pixels: list[Array]) -> str:
     """A row of the table from [P, 5] values."""
     d, v, v1, p, g = np.concatenate(pixels).T
-    z2, off = (g - d) ** 2 / v, np.abs(d - g)
-    v2 = np.maximum((v - (1 - p) * v1) / np.maximum(p, 1e-12), v1)
+    z2, off, v2 = (g - d) ** 2 / v, np.abs(d - g), outlier_variance(v, v1, p)
     parts = [np.exp(-((g - d) ** 2) / x / 2) / np.sqrt(2 * np.pi * x) for x in (v1, v2)]
     mixture = -np.log(np.maximum((1 - p) * parts[0] + p * parts[1], 1e-30)).mean()
     nll = (z2 + np.log(2 * np.pi * v)).mean() / 2
@@ -103,12 +104,20 @@ def row(name: str, pixels: list[Array]) -> str:
     return f"| {name} | {len(d)} | " + " | ".join(figures) + " |"
 
 
+def outlier_variance(v: Array, v1: Array, p: Array) -> Array:
+    """V_2 of the mixture with the total variance v, the inliers' variance v1 and the outliers' probability p."""
+    return np.maximum((v - (1 - p) * v1) / np.maximum(p, 1e-12), v1)
+
+
 def outliers(pixels: Array) -> Array:
-    """[bins, 3] by ``posterior_outlier``, of [P, 5] values: share of the pixels, mean probability, and share beyond
-    three standard deviations of the inliers."""
-    p, beyond = pixels[:, 3], beyond_inliers(pixels)
+    """[bins, 4] by ``posterior_outlier``, of [P, 5] values: share of the pixels, mean probability, and the share beyond
+    three standard deviations of the inliers, as the mixture states it and as found."""
+    _, v, v1, p, _ = pixels.T
+    far = 3 * torch.from_numpy(np.sqrt(v1 / outlier_variance(v, v1, p)))  # in standard deviations of the outliers
+    stated = (1 - p) * math.erfc(3 / math.sqrt(2)) + p * torch.erfc(far / math.sqrt(2)).numpy()
     used = [(p >= low) & (p < high) for low, high in pairwise(PROBABILITIES)]
-    return np.array([(k.mean(), p[k].mean(), beyond[k].mean()) for k in used])
+    columns = p, stated, beyond_inliers(pixels)
+    return np.array([(k.mean(), *(column[k].mean() for column in columns)) for k in used])
 
 
 def beyond_inliers(pixels: Array) -> NDArray[np.bool_]:
@@ -121,16 +130,17 @@ def print_outliers(every: Array, still: Array, figure: Path | None) -> None:
     """Print, and draw, outliers stated against found over ``every`` pixel, and the ratio of mean probabilities also for
     the ``still`` ones."""
     table = outliers(every)
-    print("\n| posterior_outlier | share | mean | beyond 3 sigma of the inliers |\n|---|---|---|---|")
-    for (low, high), (share, mean, found) in zip(pairwise(PROBABILITIES), table, strict=True):
-        print(f"| {low:g} to {min(high, 1):g} | {share:.2f} | {mean:.3f} | {found:.3f} |")
+    print("\n| posterior_outlier | share | mean | beyond 3 sigma of inliers: stated | found |\n|---|---|---|---|---|")
+    for (low, high), (share, *figures) in zip(pairwise(PROBABILITIES), table, strict=True):
+        print(f"| {low:g} to {min(high, 1):g} | {share:.2f} | " + " | ".join(f"{x:.3f}" for x in figures) + " |")
     for name, pixels in (("all", every), ("in the tours without", still)):
         beyond = beyond_inliers(pixels)
         means = pixels[beyond, 3].mean(), pixels[~beyond, 3].mean()
         print(f"{name}: mean probability {means[0]:.3f} beyond, {means[1]:.3f} within, ratio {means[0] / means[1]:.2f}")
     if figure is not None:
-        canvas, curves = style.new_figure(4.2, 4.2, ""), dict(zip(("pixels", "stated", "found"), table.T, strict=True))
-        kind = OUTLIER._replace(stated="stated", found="found", pixels="pixels")
+        canvas, names = style.new_figure(4.2, 4.2, ""), ("pixels", "probability", "stated", "found")
+        curves, x = dict(zip(names, table.T, strict=True)), "stated share beyond 3 σ of inliers"
+        kind = OUTLIER._replace(stated="stated", found="found", pixels="pixels", x=x)
         draw_shares(canvas.subplots(), kind, {LineStyle("posterior", "#D55E00", "o"): curves}, "")
         style.save_figure(canvas, figure)
 

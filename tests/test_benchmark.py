@@ -113,7 +113,7 @@ def test_a_network_on_a_rendered_room(tmp_path, weights, capsys):
     assert set(report["machine"]["hardware"]) >= {"cpu", "cores", "platform", "environment"}
     rows = {row["row"].partition("-DepthOnly")[::2]: row for row in report["rows"]}
     plain, corners, posterior = (
-        rows["UfM*", setting] for setting in ("", " (anchors corners)", " (anchors dense, posterior True)")
+        rows["UfM*", setting] for setting in ("", " (anchors corners)", " (anchors dense, posterior)")
     )
     assert len(rows) == 4, "UfM, and three rows of UfM*"
     for row in rows.values():
@@ -129,6 +129,7 @@ def test_a_network_on_a_rendered_room(tmp_path, weights, capsys):
     assert overlapped["latency"]["count"] == overlapped["ratio_to_network"]["count"] == 1, "nothing overlaps the last"
     printed = capsys.readouterr().out
     assert "UfM*-DepthOnly (anchors corners)" in printed
+    assert "\nmedians of ratios within one frame; step: UfM* alone, default: with dense anchors" in printed
     ratios = report["ratios"]
     assert len(ratios) == 6
     for name, ratio in ratios.items():

@@ -63,7 +63,7 @@ HEAVY = ("torch", "numba", "scipy", "cv2", "PIL", "pandas", "matplotlib", "onnx"
 
 
 def test_help_imports_no_heavy_package():
-    """Of all commands in one process; train is the last, since its options contain settings from modules that import
+    """All commands run in one process; train is the last, since its options contain settings from modules that import
     torch."""
     commands = [*sorted(cli.COMMANDS, key="train".__eq__), None]
     words = [["eval", "--list"], *([name, "--help"] for name in commands[:-1])]
@@ -407,3 +407,15 @@ def test_fastdepth_on_a_real_sequence(ufmstar, tmp_path):
     assert 0 < summary["uncertainty"]["mean_sigma"] < 1
     made = ["mixture.ply", "mixture.npz", "contact_sheet.png", "preview.mp4"]
     assert all((tmp_path / "out" / name).stat().st_size > 500 for name in made)
+
+
+def test_the_progress_of_kernels_states_why_they_take_long(capsys):
+    from ufmstar_torch.eval.commands.terminal import Bars
+    from ufmstar_torch.eval.engine.progress import Progress
+
+    with Bars() as bars:
+        for done in (0, 2):
+            bars.show(Progress("kernels", done, 2))
+    first, last = capsys.readouterr().err.splitlines()
+    assert first.startswith("kernels: 0 of 2 (the first run on a computer compiles them")
+    assert last == "kernels: done, 2 of 2"

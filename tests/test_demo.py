@@ -21,7 +21,7 @@ from ufmstar_torch.models import save_trained
 
 FRAMES, SEED = 3, 5
 SHIPPED = Path(str(files("ufmstar_torch.models").joinpath("weights", "demo.safetensors")))
-ROWS = ["Aleatoric", "Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble", "UfM*-Ensemble (anchors dense, posterior True)"]
+ROWS = ["Aleatoric", "Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble", "UfM*-Ensemble (anchors dense, posterior)"]
 README = Path(__file__).parent.parent / "README.md"
 
 

@@ -149,3 +149,18 @@ def test_the_times_of_streams(script: Any, capsys: pytest.CaptureFixture[str], m
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in lines] == ["1 streams at once", "3 streams at once"]
     assert all(float(line.split()[-2]) > 0 for line in lines)
+
+
+def test_stated_outliers_are_found_where_the_mixture_is_right(script: Any) -> None:
+    """Errors drawn from the mixture lie beyond three standard deviations of the inliers as often as stated, which is
+    less often than the probability: outliers may have small errors."""
+    rng, n = np.random.default_rng(0), 200_000
+    p, inlier = rng.uniform(0, 1, n), rng.uniform(0.01, 0.1, n)
+    outlier = inlier * rng.uniform(16, 60, n)
+    error = rng.normal(size=n) * np.sqrt(np.where(rng.random(n) < p, outlier, inlier))
+    d = np.full(n, 5.0)
+    table = script("measure_movers").outliers(np.stack([d, (1 - p) * inlier + p * outlier, inlier, p, d + error], 1))
+    share, mean, stated, found = table.T
+    np.testing.assert_allclose(found, stated, atol=0.01)
+    assert share.sum() == pytest.approx(1)
+    assert (found[2:] < 0.75 * mean[2:]).all()

@@ -81,9 +81,12 @@ def test_a_state_that_does_not_fit_is_refused_and_stays(model, tmp_path):
         content = path.read_bytes()
         with pytest.raises(
             ValueError, match=rf"state .*{path.name} cannot be continued: (.|\n)*{words}(.|\n)*Delete the"
-        ):
+        ) as refused:  # its traceback keeps all objects
             LiveDepth(model, print, K, state=path)
         assert path.read_bytes() == content
+        path.unlink()
+        LiveDepth(model, print, K, state=path).close()
+    assert refused.value.__cause__ is not None
     after = model.stream_state()
     assert all(torch.equal(after[name], value) for name, value in before.items())
 

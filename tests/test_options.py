@@ -256,6 +256,7 @@ def test_help_is_short_and_has_sentences(command, monkeypatch):
         parse(options, ["--help"], f"ufmstar {command}")
     assert ended.value.code == 0
     assert len(shown.getvalue().splitlines()) <= _TWO_SCREENS
+    assert "None" not in shown.getvalue(), "no name to choose, and no default to know"
     assert "options options" not in shown.getvalue().replace("-options", "options")
     for name, text in _texts(options).items():
         assert text, name

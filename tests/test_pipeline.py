@@ -139,6 +139,23 @@ def test_the_mean_uncertainty_of_images():
     assert model(image(4), POSES[4], K).member == 0
 
 
+@pytest.mark.parametrize("beside", [True, False])
+def test_a_stream_may_reuse_the_arrays_of_its_frames(beside, monkeypatch):
+    """Networks run ahead in a thread of their own, or, as on an accelerator, in the caller's."""
+    monkeypatch.setattr(UncertainDepth, "_networks_on_cpu", lambda self: beside)
+
+    def video():
+        picture, pose, intrinsics = image(0)[0].clone(), POSES[0].numpy().copy(), K.numpy().copy()
+        for i in range(4):
+            picture[:], pose[:], intrinsics[:] = image(i)[0], POSES[i].numpy(), K.numpy()
+            intrinsics[0, 0] *= 1 + i / 20
+            yield picture, pose, intrinsics
+
+    model, one_by_one = (UncertainDepth(Scaled(1.0), CONFIG, posterior=False) for _ in range(2))
+    for out, frame in zip(model.stream(video()), video(), strict=True):
+        assert torch.equal(out.variance, one_by_one(*frame).variance)
+
+
 def test_networks_stay_in_eval_mode():
     model = UncertainDepth(nn.Sequential(Scaled(1.0)), CONFIG, posterior=False)
     model.train()
@@ -158,6 +175,25 @@ def test_state_continues_and_resets():
     assert torch.equal(second(image(3), POSES[3], K).variance, expected[3])
     whole.reset()
     assert whole(image(0), POSES[0], K).member == 0
+
+
+def test_a_state_that_is_refused_leaves_the_last_image_known():
+    """The camera moves, and its image is repeated: that is noticed although a load failed in between."""
+    picture = torch.randint(100, 255, (1, 3, H, W), dtype=torch.uint8)
+
+    class Wall(nn.Module):
+        def forward(self, x):
+            return DepthPrediction(torch.full_like(x[:, 0], 2.0))
+
+    models = [UncertainDepth(Wall(), CONFIG, posterior=False) for _ in range(3)]
+    for model in models:
+        model(picture, POSES[0], K)
+    with pytest.raises(ValueError, match="the state must hold"):
+        models[0].load_stream_state({})
+    models[1].load_stream_state(models[1].stream_state())  # forgets the image
+    refused, loaded, undisturbed = (model(picture, POSES[1], K).variance.nan_to_num() for model in models)
+    assert torch.equal(refused, undisturbed)
+    assert not torch.equal(loaded, undisturbed)
 
 
 def test_a_state_holds_no_weights_and_names_other_networks(caplog):

@@ -21,6 +21,7 @@ from ufmstar_torch.eval.report.figures_error import draw_entropy, draw_error, en
 from ufmstar_torch.eval.report.figures_sweep import default_value, draw_sweep, sweep_lines, sweeps
 from ufmstar_torch.eval.report.quantities import NLL, difference, mean_of
 from ufmstar_torch.eval.report.style import (
+    legend_below,
     line_style,
     new_figure,
     save_figure,
@@ -66,7 +67,7 @@ class TestCalibration:
         shown = [axes for axes in figure.axes if axes.get_visible()]
         assert [axes.get_title(loc="left") for axes in shown] == ["Ensemble", "DepthOnly", "", ""]
         delta, quantile = drawn(shown[0]), drawn(shown[2])
-        assert list(delta) == list(quantile) == ["exactly right", "alone", "UfM-100K", "UfM*"]
+        assert list(delta) == list(quantile) == ["exactly right", "network alone", "UfM-100K", "UfM*"]
         for row in (ALONE, UFM, UFM_STAR):
             curves = results.merged["rooms", row]
             np.testing.assert_array_equal(quantile[line_style(row.method).name].get_ydata(), curves["ece_q_observed"])
@@ -77,7 +78,12 @@ class TestCalibration:
             assert line.get_color() == line_style(row.method).colour
         assert list(drawn(shown[1])) == ["exactly right", "UfM*"]  # a depth-only network has no variance
         (legend,) = figure.legends
-        assert {text.get_text() for text in legend.get_texts()} == {"alone", "UfM-100K", "UfM*", "exactly right"}
+        assert {text.get_text() for text in legend.get_texts()} == {
+            "network alone",
+            "UfM-100K",
+            "UfM*",
+            "exactly right",
+        }
 
 
 class TestError:
@@ -94,7 +100,7 @@ class TestError:
                 expected = results.merged["rooms", row][f"nll_by_error:{reference}"]
                 np.testing.assert_array_equal(line.get_ydata(), expected)
                 np.testing.assert_array_equal(line.get_xdata(), np.arange(5, 100, 10))
-        assert named(shown[0]) == {"alone", "UfM-100K", "UfM*"}
+        assert named(shown[0]) == {"network alone", "UfM-100K", "UfM*"}
 
 
 class TestEntropy:
@@ -110,7 +116,7 @@ class TestEntropy:
         for histogram in histograms.values():
             assert (histogram.density * np.diff(histogram.edges)).sum() == pytest.approx(1.0)  # no pixel lies outside
         assert words(axes) == [
-            f"{name}: mean {mean:.2f}" for name, mean in zip(("alone", "UfM-100K", "UfM*"), means, strict=True)
+            f"{name}: mean {mean:.2f}" for name, mean in zip(("network alone", "UfM-100K", "UfM*"), means, strict=True)
         ]
 
     def test_pixels_without_a_variance_are_told(self):
@@ -157,7 +163,7 @@ class TestSweeps:
     def test_lines_bands_and_the_base_alone(self, swept):
         figure = draw_sweep(swept, "ensemble", "rotation_noise")
         above = figure.axes[0]
-        line, dashed = drawn(above)["UfM*"], drawn(above)["alone"]
+        line, dashed = drawn(above)["UfM*"], drawn(above)["network alone"]
         np.testing.assert_allclose(line.get_xdata(), [0, 2, 5])
         np.testing.assert_allclose(line.get_ydata(), [5.0, 5.2, 5.5])
         assert (dashed.get_linestyle(), set(dashed.get_ydata())) == ("--", {7.0})
@@ -206,8 +212,8 @@ def test_the_overlap_figure_shows_the_improvement_in_nll_with_its_zero_line() ->
     lines = drawn(figure.axes[0])
     assert lines["UfM*"].get_xdata().tolist() == list(skips)
     np.testing.assert_allclose(lines["UfM*"].get_ydata(), [3.0, 2.5, 1.0])
-    assert list(lines["alone"].get_ydata()) == [0, 0]
-    assert "alone" in drawn(figure.axes[1])
+    assert list(lines["network alone"].get_ydata()) == [0, 0]
+    assert "network alone" in drawn(figure.axes[1])
 
 
 # ---- sweeps with anchors ----
@@ -277,3 +283,17 @@ def test_the_report_has_them(anchored):
     names = {name for name, _ in figures_of(anchored)}
     assert names >= {f"sweep depth_only {name}" for name in ("anchor_count", "track_noise", "anchors.shrinkage")}
     assert draw_sweep(anchored, "depth_only", "anchor_count").axes[0].get_xscale() == "symlog"
+
+
+def test_a_legend_of_long_names_lies_within_the_figure():
+    figure = new_figure(12.6, 4.6, "")
+    axes = figure.subplots()
+    names = [f"networks in turn, with UfM* and dense anchors, number {i}" for i in range(5)]
+    for i, name in enumerate(names):
+        axes.plot([0, 1], [i, i], label=name)
+    legend_below(figure)
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == names
+    box = legend.get_window_extent()
+    assert 0 <= box.x0 < box.x1 <= figure.bbox.x1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from ufmstar_torch.eval.report.pictures import (
     pictures_of,
 )
 from ufmstar_torch.eval.run.colours import INVALID_GREY
+from ufmstar_torch.eval.run.panels import break_name
 
 K = np.array([[20.0, 0, 7.5], [0, 20, 5.5], [0, 0, 1]])
 
@@ -137,6 +139,13 @@ class TestCompare:
         # RdBu_r: red where UfM*'s value is larger; it is nowhere smaller.
         assert ((colours[..., 0] > 80) & (colours[..., 1] < 20) & (colours[..., 2] < 50)).sum() > 500
 
+    def test_long_labels_of_rows_do_not_run_over_the_panels(self, tmp_path: Path) -> None:
+        one = example({"ufm": (full(2.0), full(0.01)), "star": (full(2.0), full(0.02))})
+        long = replace(one, labels={name: f"networks in turn, with {name} (100,000 points)" for name in one.rows})
+        drawn = [draw_comparison(tmp_path, e, ["ufm", "star"], base) for e, base in ((one, "a"), (long, "b"))]
+        assert (tmp_path / drawn[0].file).read_bytes() == (tmp_path / drawn[1].file).read_bytes()
+        assert drawn[1].title.endswith(f"{long.labels['star']} against {long.labels['ufm']}")
+
 
 class TestWritePictures:
     def test_all_kinds_with_their_words(self, evaluation: Path, tmp_path: Path) -> None:
@@ -145,3 +154,16 @@ class TestWritePictures:
         assert [p.file.partition("-")[0] for p in pictures] == [STRIP, BREAKDOWN, COMPARE]
         assert all((evaluation / "figures" / p.file).is_file() for p in pictures)
         assert all(p.title.startswith(sequence) for p in pictures)
+
+
+@pytest.mark.parametrize(
+    ("name", "lines"),
+    [
+        ("1305031105.043373", ["1305031105.", "043373"]),
+        ("a_long-name.of a room", ["a_long-", "name.of a", "room"]),
+        ("abcdefghijklmnop", ["abcdefghijkl", "mnop"]),
+        ("short", ["short"]),
+    ],
+)
+def test_names_break_at_marks_and_timestamps_at_the_point(name: str, lines: list[str]) -> None:
+    assert break_name(name, 12).split("\n") == lines

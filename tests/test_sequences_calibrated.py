@@ -371,6 +371,12 @@ def test_hostile_arkit_folders(tmp_path):
         (path / "odometry.csv").write_text(text)
         with pytest.raises(ValueError, match=message):
             open_sequence(path)
+    camera = (path / "camera_matrix.csv").read_text()
+    for text in (camera.replace("\n", ", "), camera.replace("1\n", "nan\n")):
+        (path / "camera_matrix.csv").write_text(text)
+        with pytest.raises(ValueError, match=r"camera_matrix\.csv"):
+            open_sequence(path)
+    (path / "camera_matrix.csv").write_text(camera)
     (path / "odometry.csv").write_text(good.replace("000005", "000077"))
     layouts.truncate(path / "depth" / "000001.png")
     layouts.write_image(path / "confidence" / "000002.png", np.ones((3, 3), np.uint8))

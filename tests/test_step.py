@@ -223,7 +223,8 @@ def test_a_stream_gives_the_same_bits_alone_and_on_any_number_of_threads(backend
             for s, ufm in enumerate(alone):
                 one = {key: value[s : s + 1] for key, value in more.items() if key != "anchors"}
                 if "anchors" in more:
-                    one["anchors"] = Anchors(*(v[s : s + 1] for v in vars(more["anchors"]).values() if v is not None))
+                    fields = {key: v[s : s + 1] for key, v in vars(more["anchors"]).items() if v is not None}
+                    one["anchors"] = Anchors(**fields)
                 depth, pose, camera = arguments
                 assert_same(ufm(depth[s : s + 1], pose[s : s + 1], camera, **one), outs[0], slice(s, s + 1))
     finally:

@@ -237,7 +237,7 @@ def test_a_in_h_is_a_row_of_its_own():
     one = row("UfM*-Aleatoric", overrides={"variances_in_h": True})
     config = ufm_star_config(one)
     assert (config.variances_in_h, config.features, config.entries) == (True, 0, 3)
-    assert one.label == "UfM*-Aleatoric (variances_in_h True)"
+    assert one.label == "UfM*-Aleatoric (variances_in_h)"
 
 
 # ---- how images come to the networks ----

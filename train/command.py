@@ -9,7 +9,20 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from ufmstar_torch.eval.commands.errors import UsageError
-from ufmstar_torch.eval.commands.options import Count, File, Flag, Number, Repeated, Text, Texts, arg, assigned, parse
+from ufmstar_torch.eval.commands.options import (
+    Count,
+    File,
+    Flag,
+    Folder,
+    Number,
+    Repeated,
+    Text,
+    Texts,
+    arg,
+    assigned,
+    one_of,
+    parse,
+)
 
 if TYPE_CHECKING:
     from ufmstar_torch.train.presets import Recipe
@@ -37,7 +50,7 @@ class BackboneOptions:
         spec: This JSON file declares the network's kind, scale, size and alignment.
     """
 
-    backbone: File = None
+    backbone: Folder = None
     head: Literal["depth-only", "aleatoric", "evidential", "mc-dropout", "ensemble", "batch-ensemble"] = "aleatoric"
     fine_tune: Flag = False
     features: Text = None
@@ -46,7 +59,7 @@ class BackboneOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class DataOptions:
-    """Data.
+    """Images with true depth.
 
     Attributes:
         data: Train on NYU Depth V2, on sequences, or on rendered tours.
@@ -54,24 +67,24 @@ class DataOptions:
         no_augmentation: Train on the frames as they are.
     """
 
-    data: Literal["tour", "nyu", "sequences"] | None = None
+    data: Annotated[Literal["tour", "nyu", "sequences"] | None, one_of("tour", "nyu", "sequences")] = None
     root: Texts = ()
     no_augmentation: Flag = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class SessionOptions:
-    """Session.
+    """Start, hardware and length of the training.
 
     Attributes:
         seed: Draw initial weights, order and augmentation with this seed.
         init: Start from these weights: a trained .safetensors, FastDepth's .onnx, a ResNet's .pth, Monodepth2's folder,
             or the word imagenet.
-        accelerator: Train on cpu or gpu (default: a GPU if there is one).
+        accelerator: Train on cpu or gpu; auto takes a GPU if there is one.
         devices: Use this many processes or GPUs.
         nodes: Use this many computers.
         trainable: Train only parameters whose names begin with one of these.
-        max_minutes: Stop after this time, with a validation and the weights; --resume continues.
+        max_minutes: Stop after this time (0: no limit), with a validation and the weights; --resume continues.
         no_progress: Show no progress bar.
         no_tensorboard: Write no logs for TensorBoard.
     """
@@ -117,7 +130,7 @@ class TrainOptions:
     list: Flag = False
     preset: Text = None
     members: Count = None
-    out: File = None
+    out: Folder = None
     resume: Flag = False
     overwrite: Flag = False
     threads: Count = None

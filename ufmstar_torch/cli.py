@@ -32,7 +32,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "export": ("eval.commands.export", "a run's result as depth maps, a cloud, a trajectory or transforms.json"),
     "poses": ("eval.commands.poses", "poses and landmarks of a video that has none, by structure from motion"),
     "recalibrate": ("eval.commands.recalibrate", "fit a map of the variance to sequences with ground truth"),
-    "data": ("eval.commands.data", "check: do a sequence's poses, depth and images fit together?"),
+    "data": ("eval.commands.data", "data check SEQUENCE: test if its poses, depth and images fit together"),
 }
 _HELP = """usage: ufmstar COMMAND ...
 

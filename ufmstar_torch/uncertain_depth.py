@@ -73,6 +73,11 @@ class _Predicted:
     features: Tensor | None
     ready: torch.cuda.Event | None
 
+    def copied(self) -> _Predicted:
+        """With copies of the caller's image, pose and intrinsics, whose memory the next frame may reuse."""
+        copies = {name: getattr(self, name).clone() for name in ("image", "pose", "intrinsics")}
+        return replace(self, **copies, prediction=replace(self.prediction, intrinsics=self.prediction.K.clone()))
+
 
 @one_caller(
     "forward",
@@ -320,7 +325,8 @@ class UncertainDepth(NetworksInTurn):
         """The predictions of a video, in order, with the networks one image ahead of UfM*.
 
         Both run at the same time: networks on a GPU with ``multiview_device="cpu"``, those on the CPU in a thread of
-        their own, except under autocast. Each result is yielded after the next frame has been read.
+        their own, except under autocast. Each result is yielded after the next frame has been read,
+        which may reuse the arrays of the one before.
 
         Args:
             frames: image, pose and intrinsics of each frame, as in :meth:`forward`.
@@ -342,13 +348,13 @@ class UncertainDepth(NetworksInTurn):
                         if waiting is not None:
                             yield self._fused(waiting)
                         raise
-                    if waiting is not None:
-                        yield self._fused(waiting)
-                    waiting = ahead
+                    before, waiting = waiting, ahead.copied()
+                    if before is not None:
+                        yield self._fused(before)
                     continue
                 out, predicting = self._fused_beside(waiting, pool, frame)
                 yield out
-                waiting = predicting.result()
+                waiting = predicting.result().copied()
         if waiting is not None:
             yield self._fused(waiting)
 
@@ -479,6 +485,7 @@ class UncertainDepth(NetworksInTurn):
         except BaseException:
             self._load(before)
             raise
+        self._evidence.images.reset()
 
     def _load(self, state: Mapping[str, Tensor]) -> None:
         parts: dict[str, dict[str, Tensor]] = {_UFM: {}, _LANDMARKS: {}, "": {}}
@@ -500,7 +507,6 @@ class UncertainDepth(NetworksInTurn):
         if int(counts[_MARK]) != weights_mark(self.networks):
             LOGGER.warning("the state was saved with other networks: it holds their disagreement; reset() begins anew")
         self._next = int(counts[_INDEX])
-        self._evidence.images.reset()
 
 
 def _copied(values: dict[str, Tensor], device: torch.device | None) -> tuple[dict[str, Any], torch.cuda.Event | None]:

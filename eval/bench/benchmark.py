@@ -70,5 +70,6 @@ def format_report(result: Mapping[str, Any]) -> str:
         if row["stages"] is not None:
             stages = row["stages"]["stages"].items()
             lines.append(f"stages of {row['row']}: " + ", ".join(f"{n} {t['median_ms']:.2f}" for n, t in stages))
+    lines.append("medians of ratios within one frame; step: UfM* alone, default: with dense anchors and the posterior")
     lines += [f"{name}: {ratio:.3f}" for name, ratio in result["ratios"].items()]
     return "\n".join(lines + [f"no energy of the {unit}: {why}" for unit, why in result["power"]["missing"].items()])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from ufmstar_torch.config import SPGFConfig, UfMStarConfig
 from ufmstar_torch.eval.commands.options import (
@@ -16,6 +16,7 @@ from ufmstar_torch.eval.commands.options import (
     Text,
     Texts,
     assigned,
+    one_of,
     require_least,
 )
 from ufmstar_torch.eval.methods.setting import started
@@ -172,11 +173,14 @@ class UfMOptions:
         recalibration: Use this file of `ufmstar recalibrate`, or none (default: WEIGHTS.recalibration.json).
     """
 
-    preset: Literal["tum", "tartanair_indoor", "tartanair_outdoor"] | None = None
+    preset: Annotated[
+        Literal["tum", "tartanair_indoor", "tartanair_outdoor"] | None,
+        one_of("tum", "tartanair_indoor", "tartanair_outdoor"),
+    ] = None
     ufm_preset: Literal["paper", "default"] = "default"
     set: Repeated = ()
     anchors: Text = None
-    scale_from: Literal["network"] | None = None
+    scale_from: Annotated[Literal["network"] | None, one_of("network")] = None
     recalibration: Text = None
 
     def __post_init__(self) -> None:

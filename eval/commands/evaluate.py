@@ -20,6 +20,7 @@ from ufmstar_torch.eval.commands.options import (
     arg,
     as_dict,
     joined,
+    one_of,
     reader,
     require_least,
 )
@@ -60,7 +61,7 @@ class SuiteOptions:
 
     suite: Text = None
     base: Text = None
-    ufm_preset: Literal["paper", "default"] | None = None
+    ufm_preset: Annotated[Literal["paper", "default"] | None, one_of("paper", "default")] = None
     network: Words = ()
     recalibration: Words = ()
     list: Flag = False

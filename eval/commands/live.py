@@ -16,6 +16,7 @@ from ufmstar_torch.eval.commands.opening import Recording
 from ufmstar_torch.eval.commands.options import (
     File,
     Flag,
+    Folder,
     MachineOptions,
     Positional,
     arg,
@@ -78,7 +79,7 @@ class LiveOptions(MachineOptions):
     max_wait: float = 0.2
     state: File = None
     save_every: float = 10.0
-    out: File = None
+    out: Folder = None
     overwrite: Flag = False
     view: Flag = False
     json: Flag = False

@@ -12,7 +12,7 @@ from ufmstar_torch.eval.sequences.options import Options
 
 @dataclass(frozen=True, kw_only=True)
 class OpeningOptions:
-    """Opening of recordings.
+    """How the recording is read.
 
     Attributes:
         layout: Read this layout (docs/data.md) instead of the detected one.

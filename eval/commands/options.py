@@ -40,11 +40,17 @@ _plain: dict[str, Any] = {"help_behavior_hint": ""}
 Flag = Annotated[bool, arg(**_plain)]
 Text = Annotated[str | None, arg(metavar="TEXT", **_plain)]
 File = Annotated[Path | None, arg(metavar="FILE", **_plain)]
+Folder = Annotated[Path | None, arg(metavar="DIR", **_plain)]
 Count = Annotated[int | None, arg(metavar="N", **_plain)]
 Number = Annotated[float | None, arg(metavar="X", **_plain)]
 Texts = Annotated[tuple[str, ...], arg(metavar="TEXT...", **_plain)]
 Repeated = Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="TEXT", **_plain)]  # one text each time
 Words = Annotated[UseAppendAction[tuple[tuple[str, ...], ...]], arg(metavar="TEXT...", **_plain)]  # or several
+
+
+def one_of(*names: str) -> Any:
+    """The help of an option that has one of these names, or None by default."""
+    return arg(metavar=f"{{{','.join(names)}}}", **_plain)
 
 
 @dataclass(frozen=True, kw_only=True)

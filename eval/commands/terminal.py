@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ufmstar_torch.eval.engine.progress import Progress
 
+_FIRST_RUN = "the first run on a computer compiles them, which takes about a minute"
+
 
 class Bars:
     """A progress bar of the current stage of a run, or of the current sequence of an evaluation.
@@ -35,9 +37,10 @@ class Bars:
             how = {"unit": unit, "dynamic_ncols": True, "leave": False, "disable": None}
             self._stage, self._bar = stage, tqdm(total=progress.total, initial=first, desc=stage, **how)
             if self._bar.disable:
-                self.say(f"{stage}: {progress.done} of {progress.total}")
-            if stage == "kernels":
-                self._bar.set_postfix_str("compiled on the first run")
+                note = f" ({_FIRST_RUN})" if stage == "kernels" else ""
+                self.say(f"{stage}: {progress.done} of {progress.total}{note}")
+            elif stage == "kernels":
+                self._bar.set_postfix_str(_FIRST_RUN)
         bar = self._bar
         bar.total = progress.total
         if progress.components is not None:

@@ -53,7 +53,7 @@ class Row:
 
     @property
     def label(self) -> str:
-        """The displayed name: "UfM*-Ensemble", "UfM*-Ensemble (ema_alpha 1.0)"."""
+        """The displayed name: "UfM*-Ensemble", "UfM*-Ensemble (ema_alpha 1.0, posterior)"."""
         return self.label_without()
 
     def label_without(self, *settings: str) -> str:
@@ -61,7 +61,7 @@ class Row:
         values = {name: value for name, value in self.setting.to_dict().items() if name not in settings}
         if self.setting.recalibration:  # without the folder
             values["recalibration"] = Path(self.setting.recalibration).name
-        changed = ", ".join(f"{name} {value}" for name, value in values.items())
+        changed = ", ".join(name if value is True else f"{name} {value}" for name, value in values.items())
         return f"{self.method.name} ({changed})" if changed else self.method.name
 
     def to_dict(self) -> dict[str, Any]:

@@ -188,12 +188,12 @@ def draw_comparison(folder: Path, example: Example, pair: Sequence[str], base: s
     signed = ColourScale(-limit, limit, DIFFERENCE_MAP)
     panels = [
         Panel(example.image, "image"),
-        Panel(length.rgb(new.error), f"|error| of {name_new}"),
-        Panel(_sigma(old, length), f"σ, {name_old}"),
-        Panel(_sigma(new, length), f"σ, {name_new}"),
+        Panel(length.rgb(new.error), "|error| of UfM*"),
+        Panel(_sigma(old, length), "σ of UfM"),
+        Panel(_sigma(new, length), "σ of UfM*"),
         Panel(signed.rgb(new.sigma - old.sigma), "difference of σ"),
     ]
-    lines = [f"frame {example.frame}", f"{name_old}:", *figures_of(old), f"{name_new}:", *figures_of(new)]
+    lines = [f"frame {example.frame}", "UfM:", *figures_of(old), "UfM*:", *figures_of(new)]
     bars = [Bar("|error| and σ [m]", length, 1, span=3), Bar("UfM* minus UfM [m]", signed, 4)]
     name = file_name(COMPARE, example.dataset, example.sequence, example.frame, base)
     draw_grid(folder / name, [GridRow(example.sequence, lines, panels)], bars, aspect=example.aspect)

@@ -33,9 +33,9 @@ class LineStyle(NamedTuple):
 
 
 def line_style(method: Method) -> LineStyle:
-    """The style of a method, equal in every figure and for every network: "alone", "UfM-100K", "UfM*", "UfM*-Full"."""
+    """The style of a method, equal in every figure and for every network, such as "network alone", "UfM*-Full"."""
     if method.fusion == ALONE:
-        return LineStyle("alone", "#6b6b6b", "^")
+        return LineStyle("network alone", "#6b6b6b", "^")
     full = "-Full" if method.full else ""
     if method.fusion == UFM:
         cap = "" if method.max_points is None else f"-{method.max_points // 1000}K"
@@ -98,7 +98,8 @@ def name_lines(axes: Any) -> None:
 def legend_below(figure: Any) -> None:
     """Add the names of all lines below the panels."""
     named = {label: h for axes in figure.axes for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    columns = max(2, int(figure.get_figwidth() / 1.3))  # a name takes some 1.3 inches
+    longest = 0.5 + 0.06 * max(map(len, named), default=0)  # inches: the line, and a letter in this size
+    columns = max(1, int(figure.get_figwidth() / longest))
     how: dict[str, Any] = {"ncols": min(len(named), columns), "frameon": False, "fontsize": TICK}
     figure.legend(list(named.values()), list(named), loc="outside lower center", **how)
 

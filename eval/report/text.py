@@ -177,7 +177,9 @@ def realtime_table(summary: Mapping[str, Any]) -> str:
     rows += [["  network, with its input", *ms("network_ms")], ["  UfM*", *ms("ours_ms")]]
     rows += [["processor time of the thread", *ms("processor_ms")]]
     counts = [f"{summary['results']} of {summary['images']} images in {summary['seconds']:.1f} s"]
-    counts += [f"{count} {reason}" for reason, count in (summary["dropped"] | summary["skipped"]).items()]
+    counts += [
+        f"{count} without a result ({reason})" for reason, count in (summary["dropped"] | summary["skipped"]).items()
+    ]
     counts += [f"{summary['restarts']} restarts of the anchors' evidence"] if summary["restarts"] else []
     lost, ours = (None if summary[name] is None else 100 * summary[name] for name in ("lost_share", "ours_share"))
     memory = ("memory", summary["memory_bytes"]), ("growth", summary["memory_growth_bytes"])

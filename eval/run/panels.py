@@ -115,10 +115,12 @@ def axes_at(figure: Any, left: float, bottom: float, width: float, height: float
 
 
 def break_name(name: str, letters: int) -> str:
-    """The name on lines of at most ``letters``, broken after hyphens, underscores and blanks if possible."""
+    """The name on lines of at most ``letters``, broken after hyphens, underscores and blanks if possible, else after a
+    point."""
     lines, rest = [], name
     while len(rest) > letters:
         end = max(rest.rfind(mark, 1, letters) for mark in "-_ ")
+        end = rest.rfind(".", 1, letters) if end < 1 else end
         end = letters - 1 if end < 1 else end
         lines.append(rest[: end + 1].rstrip())
         rest = rest[end + 1 :]

@@ -18,7 +18,7 @@ from ufmstar_torch.eval.sequences.images import read_color, read_depth
 from ufmstar_torch.eval.sequences.intrinsics import pinhole_values
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import csv_rows, number, numbers, poses_from_columns, read_matrix
+from ufmstar_torch.eval.sequences.poses import csv_rows, number, poses_from_columns, read_matrix
 from ufmstar_torch.eval.sequences.video import Video
 
 _VIDEO, _ODOMETRY, _CAMERA = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
@@ -40,8 +40,9 @@ def read(path: Path, options: Options) -> FrameSequence:
     if missing := [name for name in _COLUMNS if name not in names]:
         found = ", ".join(names)[:99]
         raise ValueError(f"{path / _ODOMETRY}: the first line must name the column {missing[0]!r}, got {found!r}")
-    video, expected = Video(path / _VIDEO), f"{path / _CAMERA}: expected 3 lines of 3 numbers"
-    K = numbers(read_matrix(path / _CAMERA, commas=True), (3, 3), expected)
+    video, K, expected = Video(path / _VIDEO), read_matrix(path / _CAMERA, commas=True), "expected 3 lines of 3 numbers"
+    if K.shape != (3, 3) or not np.isfinite(K).all():
+        raise ValueError(f"{path / _CAMERA}: {expected}")
     frames: list[Entry | Skipped] = []
     lenses = {}
     for words, where in rows:

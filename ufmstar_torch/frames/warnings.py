@@ -7,13 +7,18 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, pairwise
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.frame import FrameInput
 from ufmstar_torch.frames.output import FrameStatistics
+
+Depth = NDArray[np.floating[Any]]
 
 # Least frames and components before a warning about views, and the largest share of components seen in only one view.
 # On rendered tours, also at 1/10 of their frames, correct input stays below .7; poses in millimetres reach .99.
@@ -86,12 +91,12 @@ class _Track:
     still: int = 0  # successive frames with an unchanged pose
     farthest: float = 0.0  # largest depth of the last frame
     saturated: int = 0  # successive changes of the pose with the same largest depth
-    depth: Tensor | None = None  # depth map at the first of the ``still`` frames
+    depth: Depth | None = None  # depth map at the first of the ``still`` frames
     member: float = 0.0  # index of the network that predicted it
     waiting: bool = False  # whether its next prediction is to be compared
 
     def follow(
-        self, T: list[list[float]], focal: tuple[float, float], depth: Tensor, total: float, mean: float, member: float
+        self, T: list[list[float]], focal: tuple[float, float], depth: Depth, total: float, mean: float, member: float
     ) -> Iterator[tuple[str, str]]:
         """Update the statistics with a frame of a ``mean`` depth [m]; yields kinds and texts of warnings."""
         step = math.dist(_position(T), _position(self.T))
@@ -126,27 +131,27 @@ class _Track:
             text = "the poses go back and forth between two places: every camera is a stream of its own (a batch)"
             yield "alternating", text
 
-    def _saturate(self, depth: Tensor) -> Iterator[tuple[str, str]]:
+    def _saturate(self, depth: Depth) -> Iterator[tuple[str, str]]:
         largest = float(depth.max())
         self.saturated = self.saturated + 1 if largest == self.farthest > 0 else 0
         self.farthest = largest
         if self.saturated == _FRAMES:
-            share = float((depth == largest).sum() / (depth > 0).sum())
+            share = np.count_nonzero(depth == largest) / np.count_nonzero(depth)
             if share > _SATURATED:
                 text = f"the depth of {share:.0%} of the pixels is {largest:g} m in every frame: if the network cannot "
                 yield "saturated", text + "predict more, as in the sky, set valid to False there"
 
-    def _stay(self, depth: Tensor, member: float) -> Iterator[tuple[str, str]]:
+    def _stay(self, depth: Depth, member: float) -> Iterator[tuple[str, str]]:
         self.still += 1
         if self.still == 1 or self.depth is None or self.depth.shape != depth.shape:
-            self.depth, self.member = depth.clone(), member
+            self.depth, self.member = depth.copy(), member
         elif self.still % _FRAMES == 0 or self.waiting:
             self.waiting = member != self.member  # of networks in turn, the same one is compared
             if self.waiting:
                 return
             both = (depth > 0) & (self.depth > 0)
-            change = (depth[both] / self.depth[both] - 1).abs()
-            if change.numel() and (median := float(change.median())) > _CHANGE:
+            change = abs(depth[both] / self.depth[both] - 1)
+            if change.size and (median := float(np.median(change))) > _CHANGE:
                 text = f"the pose was the same in {self.still + 1} frames, in which the depth changed by {median:.0%}"
                 yield "pose", text + " in the median: is it updated?"
 
@@ -164,9 +169,9 @@ class _Track:
         )
 
 
-def _mean(depth: Tensor, total: float) -> float:
+def _mean(depth: Depth, total: float) -> float:
     """Mean depth [m] of the pixels with a depth, whose sum is ``total``; infinite if there are none."""
-    return total / count if (count := int((depth > 0).sum())) else math.inf
+    return total / count if (count := np.count_nonzero(depth)) else math.inf
 
 
 def _position(T: list[list[float]]) -> list[float]:
@@ -224,7 +229,7 @@ class StreamWarnings:
         log_once(self._logged, chain.from_iterable(findings))
 
     def _tracked(self, frame: FrameInput, statistics: FrameStatistics) -> Iterator[tuple[int, str, str]]:
-        rows = frame.depth[:, ::_ROWS]
+        rows = frame.depth[:, ::_ROWS].numpy(force=True)
         sums, pixels = rows.sum((1, 2)).tolist(), statistics.valid_pixels.tolist()
         poses, cameras = frame.T_world_cam.tolist(), frame.intrinsics.tolist()
         used = None if statistics.anchors_used is None else statistics.anchors_used.tolist()

@@ -26,6 +26,9 @@ class GaussianMixture:
         reference: [B, K, 5] the reference view (``steps.fuse``): the camera's centre in the first camera's frame [m],
             the index of the network, and the largest change q of the view since.
         features: [B, K, F] further entries of H, running averages in the caller's units.
+
+    Raises:
+        ValueError: a tensor has another shape.
     """
 
     mean: Tensor
@@ -117,3 +120,15 @@ class GaussianMixture:
             return torch.cat([value, value.new_zeros(value.shape[0], missing, *value.shape[2:])], dim=1)
 
         return GaussianMixture(**{name: pad(value) for name, value in self.tensors().items()})
+
+    def __post_init__(self) -> None:
+        if self.weight.dim() != 2:
+            raise ValueError(f"weight must have shape (B, K), got {tuple(self.weight.shape)}")
+        slots = b, k = self.weight.shape
+        expected = {
+            "mean": (b, k, 3), "covariance": (b, k, 3, 3), "disagreement": slots, "compared": slots,
+            "views": slots, "reference": (b, k, 5), "features": (b, k, *self.features.shape[-1:]),
+        }  # fmt: skip
+        for name, shape in expected.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name} must have shape {tuple(shape)}, got {tuple(getattr(self, name).shape)}")

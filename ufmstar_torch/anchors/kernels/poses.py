@@ -38,7 +38,7 @@ class Corrected(NamedTuple):
         match: [N] least variance of an inverse depth in a view by its match [1/m^2]; infinite without a match.
         common: [N] variance of ``rho`` from the remaining errors [1/m^2].
         residual: [V, N] squared residual of the inverse depth in each view, over its variance; 0 without a match.
-        across_residual: [V, N] squared distance from the line [px^2]; 0 where the match does not show it.
+        across_residual: [V, N] squared distance from the line [px^2]; meaningless where the match does not show it.
         off_line: [N] largest ``across_residual`` over its variance; NaN where no view shows it.
     """
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.config import SPGFConfig
@@ -21,6 +22,7 @@ from ufmstar_torch.kernels.cpu.calls import array, each, shares_of_stream
 from ufmstar_torch.kernels.cpu.segment_image import join_rows, write_gaussians, write_labels
 from ufmstar_torch.kernels.cpu.segment_rows import SEGMENT, SEGMENT_INT, scan_rows
 
+Maps = NDArray[np.floating[Any]]
 _LIGHTER = 4  # a pixel takes a fraction of its regression's time: fewer threads pay off
 _PRUNE = {"none": 0, "both": 1, "either": 2}
 
@@ -49,15 +51,14 @@ def segment(
     depth: Tensor, intrinsics: Tensor, limits: SPGFConfig, features: Tensor | None = None
 ) -> tuple[GaussianMixture, Tensor]:
     """As :func:`ufmstar_torch.steps.segment.segment`, for CPU tensors, float64 inside."""
-    mixture, labels = gaussians(depth, intrinsics, limits, features)
-    return mixture, labels()
+    fields, labels = gaussians(array(depth), array(intrinsics), limits, None if features is None else array(features))
+    return GaussianMixture(*map(torch.from_numpy, fields)), labels()
 
 
 def gaussians(
-    depth: Tensor, intrinsics: Tensor, config: SPGFConfig, features: Tensor | None = None
-) -> tuple[GaussianMixture, Callable[[], Tensor]]:
-    """The mixture of :func:`segment`, and a function that writes the labels."""
-    z = array(depth)
+    z: Maps, intrinsics: Maps, config: SPGFConfig, features: Maps | None = None
+) -> tuple[tuple[Maps, ...], Callable[[], Tensor]]:
+    """The fields of the mixture of :func:`segment`, and a function that writes the labels."""
     streams, height, width = z.shape
     limits = _limits(config)
     room = height * config.segments_per_row(width)
@@ -66,7 +67,7 @@ def gaussians(
     shares = shares_of_stream(streams, height * width // _LIGHTER)
     rows = [height * i // shares for i in range(shares + 1)]
     scans, joins = [], []
-    for b, K in enumerate(array(intrinsics).tolist()):
+    for b, K in enumerate(intrinsics.tolist()):
         fx, fy, cx, cy = K[0][0], K[1][1], K[0][2], K[1][2]
         slope = config.slope(min(fx, fy))
         bins = _depth_bins(0.5 * min(width / fx, height / fy), limits)
@@ -91,10 +92,9 @@ def gaussians(
         write_gaussians(*fit[:3], mean[b], covariance[b], weight[b])
     means = np.empty((streams, k, 0), dtype)
     if features is not None:
-        means = _feature_means(array(features), labels().numpy(), weight)
+        means = _feature_means(features, labels().numpy(), weight)
     not_compared = *(np.zeros((streams, k), dtype) for _ in range(3)), np.zeros((streams, k, 5), dtype)
-    fields = (mean, covariance, weight, *not_compared, means)
-    return GaussianMixture(*map(torch.from_numpy, fields)), labels
+    return (mean, covariance, weight, *not_compared, means), labels
 
 
 def _feature_means(features: np.ndarray, labels: np.ndarray, weight: np.ndarray) -> np.ndarray:

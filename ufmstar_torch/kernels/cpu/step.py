@@ -128,8 +128,9 @@ def _segment(
 ) -> tuple[NDArray[Any], ...]:
     """Step 2: the fields of C_i in the camera frame, float64, with the covariances lifted to the reference's floor."""
     limits = config.segment.scaled_to(*frame.size)
-    mixture, _ = gaussians(frame.informative_depth, frame.intrinsics, limits, frame.features)
-    segments = tuple(map(array, mixture.to(torch.float64).tensors().values()))
+    features = None if frame.features is None else array(frame.features)
+    mixture, _ = gaussians(array(frame.informative_depth), intrinsics, limits, features)
+    segments = tuple(value.astype(np.float64) for value in mixture)
     epsilon = 8 * torch.finfo(stored).eps
     for K, *written in zip(intrinsics.tolist(), *segments[:3], strict=True):
         lift(*written, config.near_plane, min(K[0][0], K[1][1]), PIXEL_VARIANCE, epsilon)
