@@ -31,8 +31,8 @@ _SIDE, _SHARE, _SIGMAS = 5, 0.02, 3.0
 # Degrees of freedom of e, and iterations of the reweighting. Least variance of a coefficient of b, against division by
 # 0: 1e-5/m, which is 1 mm in a depth of 10 m.
 _FREEDOM, _ITERATIONS, _LEAST = 2.0, 8, 1e-10
-# Least share of a landmark's variance that is its own; least inverse depth, as a share of that measured.
-_OWN, _NEAREST_ZERO = 0.1, 0.1
+# Least share of a landmark's variance that is independent; least inverse depth, as a share of that measured.
+_INDEPENDENT, _NEAREST_ZERO = 0.1, 0.1
 
 
 # Standard deviation of a depth z, sigma = a + b z + c z^2 [m], by kind of sensor. Stereo and structured light measure a
@@ -134,17 +134,17 @@ def _without_common_errors(others: Landmarks, z: NDArray[np.float64], size: tupl
         return others
     u, v = 2 * (others.pixel.T + 0.5) / np.array([size[1], size[0]])[:, None] - 1
     x = np.stack([np.ones_like(rho), u, v, rho], axis=-1)
-    own = np.maximum(total - shared - scale * rho**2, _OWN * total)
-    known, z = x[seen], z[seen]
-    noise = own[seen] + np.square(_sigma(z, kind) / z**2)
+    independent = np.maximum(total - shared - scale * rho**2, _INDEPENDENT * total)
+    x_seen, z = x[seen], z[seen]
+    noise = independent[seen] + np.square(_sigma(z, kind) / z**2)
     prior, weight = np.diag(1 / np.maximum([shared, shared, shared, scale], _LEAST)), 1 / noise
     for _ in range(_ITERATIONS):
-        covariance = np.linalg.inv(prior + (known.T * weight) @ known)
-        b = covariance @ known.T @ (weight * (rho[seen] - 1 / z))
-        residual = rho[seen] - 1 / z - known @ b
+        covariance = np.linalg.inv(prior + (x_seen.T * weight) @ x_seen)
+        b = covariance @ x_seen.T @ (weight * (rho[seen] - 1 / z))
+        residual = rho[seen] - 1 / z - x_seen @ b
         weight = (_FREEDOM + 1) / (_FREEDOM * noise + np.square(residual))
     depth = 1 / np.maximum(rho - x @ b, _NEAREST_ZERO * rho)
-    variance = np.minimum(own + np.einsum("ni,ij,nj->n", x, covariance, x), total) * depth**4
+    variance = np.minimum(independent + np.einsum("ni,ij,nj->n", x, covariance, x), total) * depth**4
     return replace(others, depth=depth, variance=variance)
 
 
