@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from layouts_more import rigid
 from scipy.spatial.transform import Rotation, Slerp
 
-from ufmstar_torch.eval.sequences.poses import associate, read_pose, read_trajectory
+from ufmstar_torch.eval.sequences.poses import associate, numbers, read_pose, read_trajectory
 from ufmstar_torch.gaussians.trajectory import Trajectory, interpolate_pose
 
 QUARTER = np.sqrt(0.5)
@@ -160,3 +160,12 @@ def test_association_equals_brute_force(first, second, limit):
     # integers: no difference lies within rounding of the limit
     a, b = np.array(first, dtype=float), np.array(second, dtype=float)
     assert associate(a, b, limit) == brute_force_association(a, b, limit)
+
+
+@pytest.mark.parametrize(
+    "values", [[1, 2, np.nan], [1, np.inf, 2], ["a", 1, 2], [1, 2], [[1], [2, 3]], [10**400, 1, 1], None]
+)
+def test_numbers_of_another_form_are_refused_with_the_callers_text(values):
+    with pytest.raises(ValueError, match="expected three"):
+        numbers(values, (3,), "expected three")
+    assert numbers([[1, 2, 3]], (3,), "").tolist() == [1.0, 2.0, 3.0]

@@ -77,9 +77,10 @@ def test_a_frame_with_an_unusable_pose_is_skipped_and_takes_no_turn(sequence):
     stretched = entries[1].T_world_cam.copy()
     stretched[:3, :3] *= 1.3
     entries[1] = replace(entries[1], T_world_cam=stretched)
-    source = networks(Brightness(1.0), Brightness(1.1))
-    runner = RowRunner("row", source, Gaussians(UfMStarConfig(), CPU))
+    members = Brightness(1.0), Brightness(1.1)
+    runner = RowRunner("row", networks(*members), Gaussians(UfMStarConfig(), CPU))
     results = results_of(replace(sequence, entries=tuple(entries)), range(4), [runner])
+    assert [member.calls for member in members] == [2, 1]
     assert "not orthonormal" in results[1].skipped["row"]
     assert [result.rows["row"].out.member for result in results if result.rows] == [0, 1, 0]
 

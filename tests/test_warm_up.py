@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 from modules import same
+from numba.core import caching, codegen
 from numba.core.dispatcher import Dispatcher
 
 import ufmstar_torch
@@ -106,6 +107,21 @@ def test_a_part_becomes_machine_code_in_its_kernel_alone(monkeypatch):
     )
     assert compiled_function()(3)[0] == 6.0
     assert optimised == ["both"]
+
+
+@pytest.mark.parametrize(
+    ("owner", "names"),
+    [
+        (codegen.JITCodeLibrary, "_optimize_functions _optimize_final_module _finalize_final_module"),
+        (codegen.JITCodeLibrary, "get_pointer_to_function codegen"),
+        (codegen.JITCPUCodegen, "set_env"),
+        (caching.IndexDataCacheFile, "_load_index _save_index _load_data _save_data"),
+    ],
+)
+def test_numba_has_the_methods_that_are_replaced(owner, names):
+    """A method that numba has renamed would be replaced no longer, without an error."""
+    missing = [name for name in names.split() if not hasattr(owner, name)]
+    assert not missing, f"numba changed: {owner.__name__} has no {missing}; mend ufmstar_torch/kernels/compile_cpu.py"
 
 
 def test_no_garbage_is_collected_while_kernels_are_compiled():

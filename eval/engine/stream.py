@@ -106,12 +106,14 @@ def frame_results(
 
 
 def _require_inputs(frame: Frame, rows: Sequence[RowRunner]) -> None:
-    """Raises FrameError: the frame lacks the image or the depth that a row needs."""
+    """Raises FrameError: the frame lacks the image or the depth that a row needs, or its camera is unusable."""
     tracked = any(row.setting.anchors in (CORNERS, DENSE) for row in rows)
     if frame.image is None and (tracked or any(row.source.needs_image for row in rows)):
         raise FrameError(frame.name, "no image")
     if frame.depth is None and any(row.source.is_truth for row in rows):
         raise FrameError(frame.name, "no depth map")
+    if frame.image is not None:
+        require_camera(frame, frame.intrinsics, (frame.image.shape[0], frame.image.shape[1]))
 
 
 def _predicted(
@@ -130,8 +132,6 @@ def _truths(frame: Frame, predictions: Mapping[str, DepthPrediction]) -> dict[st
     unusable."""
     computed: dict[tuple[object, ...], NDArray[np.float32] | None] = {}
     truths = {}
-    if frame.image is not None:
-        require_camera(frame, frame.intrinsics, (frame.image.shape[0], frame.image.shape[1]))
     for key, prediction in predictions.items():
         K = prediction.K[0].numpy()
         camera = (prediction.size, K.tobytes())

@@ -115,8 +115,8 @@ def read_matrix(path: str | Path, *, commas: bool = False) -> np.ndarray:
 
 
 def numbers(values: Any, shape: tuple[int, ...], error: str) -> np.ndarray:
-    """Nested finite numbers, as of JSON or YAML, as float64 of a shape (-1 = any length). Raises ValueError with the
-    text ``error``: they have another form."""
+    """Nested finite numbers, as of JSON or YAML, as float64 of a shape. Raises ValueError with the text ``error``: they
+    have another form."""
     with suppress(TypeError, ValueError, OverflowError):
         array = np.array(values, dtype=np.float64).reshape(shape)
         if np.isfinite(array).all():
