@@ -152,8 +152,8 @@ def test_another_recording_is_named(finished, capfd):
 
 
 SUMMARIES = {
-    "no settings.sequence": (lambda summary: summary.update(settings={"device": "cpu"}), "(its settings.sequence)"),
-    "a list of settings": (lambda summary: summary.update(settings=[1]), "(its settings.sequence)"),
+    "no sequence.name": (lambda summary: summary.update(sequence={"layout": "generic"}), "(its sequence.name)"),
+    "a list as sequence": (lambda summary: summary.update(sequence=[1]), "(its sequence.name)"),
     "another program": (lambda summary: summary.update(program="x"), "(its program)"),
     "a posterior of text": (lambda summary: summary.update(posterior="x"), "(its posterior)"),
     "a calibration of NaN": (lambda summary: summary.update(posterior={"calibration": float("nan")}), "calibration)"),

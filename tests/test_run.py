@@ -94,7 +94,7 @@ def test_the_summary_says_what_it_came_from(path, tmp_path):
     text = run(network_job(path, frames=slice(0, 4, 2)), tmp_path / "out")
     assert text == read_summary(tmp_path / "out")
     assert (text["state"], text["reason"]) == ("finished", "2 of 2 frames")
-    assert (text["sequence"]["name"], text["settings"]) == ("walk", {"sequence": "walk", "note": "a test"})
+    assert (text["sequence"]["name"], text["settings"]) == ("walk", {"note": "a test"})
     assert {"ufmstar_torch", "torch", "numpy", "numba", "python"} <= text["versions"].keys()
     assert text["network_alone"] is None
     assert "without a variance" in text["network_alone_reason"]

@@ -67,7 +67,7 @@ def main(options: ExportOptions) -> int:
         if to not in ("depth", "tum") and options.sequence is not None:
             frames = with_images(frames, open_sequence(options.sequence, **options.opening.changed()))
         elif to not in ("depth", "tum"):
-            was = summary["settings"]["sequence"]  # shown, never opened
+            was = summary["sequence"]["name"]  # shown, never opened
             print(f"no colours: --sequence SEQUENCE names the recording with the images, in the run {was!r:.200}")
         how = {"voxel": options.voxel} if to == "cloud" else {}
         print(_exporter(to)(frames, out, **how))

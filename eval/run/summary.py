@@ -67,7 +67,7 @@ def write_summary(folder: RunFolder, mixture: GaussianMixture, state: str, reaso
         "mixture": _mixture(done, mixture),
         "time": _time(done, folder.seconds),
         "outputs": folder.outputs,
-        "settings": {"sequence": job.sequence.name, **job.settings},
+        "settings": job.settings,
         "versions": versions(),
         "machine": hardware(),
     }
@@ -86,11 +86,11 @@ def read_summary(out: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise ValueError(f"{out}/{SUMMARY} is not that of a run: {error}") from error
     content = summary if isinstance(summary, dict) else {}
-    settings, posterior = content.get("settings"), content.get("posterior")
+    sequence, posterior = content.get("sequence"), content.get("posterior")
     calibration = posterior.get("calibration") if isinstance(posterior, dict) else None
     fine = {
         "program": content.get("program") == RUN.program,
-        "settings.sequence": isinstance(settings, dict) and isinstance(settings.get("sequence"), str),
+        "sequence.name": isinstance(sequence, dict) and isinstance(sequence.get("name"), str),
         "posterior": posterior is None or isinstance(posterior, dict),
         "posterior.calibration": calibration is None or is_number(calibration),
     }
