@@ -8,6 +8,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
+from ufmstar_torch.anchors.dense_keyframes import Keyframes
 from ufmstar_torch.anchors.kernels import dense as dense_cpu
 from ufmstar_torch.anchors.kernels.dense import Search, Views, best_pixels, measure
 from ufmstar_torch.anchors.kernels.landmarks import Columns, sight, store
@@ -240,3 +241,19 @@ def test_a_search_along_the_last_row_reads_nothing_beyond_the_image():
     assert dense_cpu._search(patch, dense_cpu.eights(key[None])[0], width, height, *line, windows, scores, match)
     assert match[:2].tolist() == [10.5, height - 4.5]
     assert match[2] == pytest.approx(1, abs=1e-5)
+
+
+def test_images_of_half_the_size_are_those_of_the_stored_keyframes():
+    """Also when the ring has replaced an image, when a state is loaded, and when images have another size."""
+    keyframes, states = Keyframes(2), []
+    for i in range(4):
+        T = np.eye(4)
+        T[0, 3] = i
+        keyframes.add(np.full((8, 8), 10 * i, np.uint8), T, 2.0, i)
+        assert keyframes.halves(np.array([i % 2]))[0, 0, 0] == 10 * i
+        states.append(keyframes.state())
+    keyframes.load_state(states[1])
+    assert keyframes.halves(np.arange(2))[:, 0, 0].tolist() == [0, 10]
+    keyframes.reset()
+    keyframes.add(np.full((6, 6), 7, np.uint8), np.eye(4), 2.0, 0)
+    assert keyframes.halves(np.array([0])).tolist() == [[[7] * 3] * 3]
