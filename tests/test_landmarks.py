@@ -238,10 +238,10 @@ def test_a_model_with_a_source_equals_one_that_is_given_its_anchors(tour, file):
     by_hand, corners, both = wrapped(None), wrapped("corners"), wrapped(["corners", mapped])
     for i, (image, T, K) in enumerate(pictures(tour)):
         actual = tracker.update(image.permute(1, 2, 0).numpy(), T.numpy(), K.numpy()).anchors(K.numpy(), K)
-        expected = by_hand(image[None], T, K, anchors=actual)
-        assert torch.equal(corners(image[None], T, K).variance, expected.variance)
-        stacked = image[None].expand(2, -1, -1, -1) if i % 2 else image[None].expand(2, -1, -1, -1).float() / 255
-        out = both(stacked, T.expand(2, 4, 4), K.expand(2, 3, 3))
+        shown = image[None] if i % 2 else image[None].float() / 255  # a source reads the same bytes from both
+        expected = by_hand(shown, T, K, anchors=actual)
+        assert torch.equal(corners(shown, T, K).variance, expected.variance)
+        out = both(shown.expand(2, -1, -1, -1), T.expand(2, 4, 4), K.expand(2, 3, 3))
         assert out.statistics.anchors[1] > 0
     torch.testing.assert_close(out.variance[0], expected.variance[0], rtol=1e-4, atol=1e-6)
     assert expected.statistics.anchors_used > 0
