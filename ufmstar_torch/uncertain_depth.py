@@ -74,7 +74,7 @@ class _Predicted:
     ready: torch.cuda.Event | None
 
     def copied(self) -> _Predicted:
-        """With copies of the caller's image, pose and intrinsics, whose memory the next frame may reuse."""
+        """A copy that shares no memory with the caller's image, pose and intrinsics, which the next frame may reuse."""
         copies = {name: getattr(self, name).clone() for name in ("image", "pose", "intrinsics")}
         return replace(self, **copies, prediction=replace(self.prediction, intrinsics=self.prediction.K.clone()))
 
@@ -344,7 +344,7 @@ class UncertainDepth(NetworksInTurn):
                 if waiting is None or not self._networks_on_cpu():
                     try:
                         ahead = self._predicted(*frame, ahead=waiting is not None)
-                    except Exception:  # raised again after the result of the image before
+                    except Exception:  # of any kind, raised again once the caller has the result of the image before
                         if waiting is not None:
                             yield self._fused(waiting)
                         raise

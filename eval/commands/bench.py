@@ -14,7 +14,7 @@ from ufmstar_torch.eval.commands.options import File, MachineOptions, as_dict, r
 
 @dataclass(frozen=True, kw_only=True)
 class BenchOptions(MachineOptions):
-    """Measure the time of UfM* (plain, anchored, with the posterior) beside a network, on the same frames.
+    """Measure the times of a network and of UfM* (alone, with corners, with the posterior) on the same frames.
 
     Times depend on the machine and on its other load: compare ratios. docs/results/speed.md explains each figure.
 

@@ -12,7 +12,7 @@ from ufmstar_torch.eval.sequences.options import Options
 
 @dataclass(frozen=True, kw_only=True)
 class OpeningOptions:
-    """How the recording is read.
+    """Options for opening a recording.
 
     Attributes:
         layout: Read this layout (docs/data.md) instead of the detected one.

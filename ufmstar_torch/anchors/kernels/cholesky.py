@@ -51,7 +51,7 @@ def inverted(L, inverse):
                 total += L[i, k] * inverse[j, k]
             inverse[j, i] = -total / L[i, i]
     for i in range(size):
-        for j in range(i + 1):  # the diagonal last, as it is read
+        for j in range(i + 1):  # j = i comes last, because the other sums read inverse[i, i]
             total = 0.0
             for k in range(i, size):
                 total += inverse[i, k] * inverse[j, k]
