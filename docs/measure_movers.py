@@ -139,8 +139,8 @@ def print_outliers(every: Array, still: Array, figure: Path | None) -> None:
         print(f"{name}: mean probability {means[0]:.3f} beyond, {means[1]:.3f} within, ratio {means[0] / means[1]:.2f}")
     if figure is not None:
         canvas, names = style.new_figure(4.2, 4.2, ""), ("pixels", "probability", "stated", "found")
-        curves, x = dict(zip(names, table.T, strict=True)), "stated share beyond 3 σ of inliers"
-        kind = OUTLIER._replace(stated="stated", found="found", pixels="pixels", x=x)
+        kind = OUTLIER._replace(stated="stated", found="found", pixels="pixels")
+        curves = dict(zip(names, table.T, strict=True))
         draw_shares(canvas.subplots(), kind, {LineStyle("posterior", "#D55E00", "o"): curves}, "")
         style.save_figure(canvas, figure)
 

@@ -9,7 +9,7 @@ from evaluations import in_memory, rows_of
 
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.metrics.intervals import IntervalCoverage
-from ufmstar_torch.eval.report.figures_calibration import INTERVAL, draw_calibration
+from ufmstar_torch.eval.report.figures_calibration import INTERVAL, OUTLIER, draw_calibration
 from ufmstar_torch.eval.report.figures_error import draw_gates, gates_figure
 
 
@@ -88,10 +88,10 @@ def test_the_report_draws_coverage_and_gates_of_rows_with_intervals():
     lines = [line for line in axes.lines if line.get_label() != "exactly right"]
     assert len(lines) == 1
     np.testing.assert_allclose(lines[0].get_ydata(), metrics.curves()["coverage_found"])
-    of_mixture = {"outlier_predicted": [0.05], "outlier_found": [0.1], "outlier_pixels": [1]}
+    of_mixture = {"outlier_stated": [0.05], "outlier_found": [0.1], "outlier_pixels": [1]}
     with_outliers = replace(results, merged={("rooms", rows[1]): metrics.curves() | of_mixture})
     axes = draw_calibration(with_outliers, "rooms").axes[-1]
-    assert (axes.get_xlabel(), axes.lines[1].get_ydata().tolist()) == ("posterior_outlier", [0.1])
+    assert (axes.get_xlabel(), axes.lines[1].get_ydata().tolist()) == (OUTLIER.x, [0.1])
     error, within, covered = draw_gates(results, "rooms").axes
     assert [len(axes.lines) for axes in (error, within, covered)] == [2, 2, 3]
     assert {text.get_text() for text in error.texts} == {"0.05", "0.1", "0.2"}

@@ -43,9 +43,11 @@ def test_outliers_are_counted_by_their_stated_probability() -> None:
     metrics.update(depth[:100], variance[:100], truth[:100], mixture=(inlier[:100], 1 - outlier[:100]))
     curves = metrics.curves()
     assert curves["outlier_pixels"] == [0, len(depth), *[0] * 7, 100]
-    assert curves["outlier_predicted"][1] == pytest.approx(0.1)
-    assert curves["outlier_predicted"][9] == pytest.approx(0.9)
     expected = 0.9 * math.erfc(3 / 2**0.5) + 0.1 * math.erfc(0.6 / 2**0.5)
+    assert curves["outlier_stated"][1] == pytest.approx(expected, abs=1e-5)
+    # With p = .9 and the same variance of .034, v_2 = (.034 - .1 x .01)/.9.
+    expected_of_many = 0.1 * math.erfc(3 / 2**0.5) + 0.9 * math.erfc(0.3 / (2 * 0.033 / 0.9) ** 0.5)
+    assert curves["outlier_stated"][9] == pytest.approx(expected_of_many, abs=1e-5)
     assert curves["outlier_found"][1] == pytest.approx(expected, abs=0.002)
     assert math.isnan(curves["outlier_found"][0])
 

@@ -22,14 +22,15 @@ class Mixture(SumMetric):
     v_2 = (v - (1 - p) v_1)/p, at least v_1. The pixels are those with ground truth, a finite depth, v_1 > 0 and p.
     ``compute()``: ``mixture_nll`` [nats], ``mixture_ece_delta`` and ``mixture_ece_q`` with the bins of ``ECEDelta`` and
     ``ECEQuantile``, ``mixture_coverage``: share of ground truths in the central interval of three sigma's mass, .9973.
-    Curves [10] over bins of p: ``outlier_predicted``, mean p, ``outlier_found``, share of the pixels beyond three sigma
-    of the inliers (NaN in an empty bin), and ``outlier_pixels``. {} without a pixel: only a posterior has a mixture.
+    Curves [10] over bins of p, of the share of pixels beyond three sigma of the inliers (NaN in an empty bin):
+    ``outlier_stated`` by the mixture, ``outlier_found``; and ``outlier_pixels``. {} without a pixel: only a posterior
+    has a mixture.
     """
 
     OF_VARIANCE = "the mixture"
     NEEDS = "inlier"
     STATES = (
-        *(("total", SUM), ("confidence", SUM, _BINS), ("predicted", SUM, _BINS), ("covered", COUNT)),
+        *(("total", SUM), ("confidence", SUM, _BINS), ("stated", SUM, _BINS), ("covered", COUNT)),
         *((name, COUNT, _BINS) for name in ("accurate", "pixels", "at_or_below", "beyond", "with_outlier")),
     )
 
@@ -45,6 +46,7 @@ class Mixture(SumMetric):
         log_density = -(error.square() / parts + (2 * torch.pi * parts).log()) / 2
         confidence = (weight * torch.erf(_DELTA * d.abs() / (2**0.5 * sigma))).sum(0)
         below = (weight * (1 + torch.erf(error / (2**0.5 * sigma)))).sum(0) / 2
+        beyond = (weight * torch.erfc(3 * v1.sqrt() / (2**0.5 * sigma))).sum(0)
         bins, by_outlier = ((x * _BINS).long().clamp_max(_BINS - 1) for x in (confidence, p))
         accurate = error.abs() <= _DELTA * d.abs()
         first = chosen.histogram((below * _BINS - 0.5).ceil().long(), _BINS + 1)  # number of levels below
@@ -54,7 +56,7 @@ class Mixture(SumMetric):
             "pixels": chosen.histogram(bins, _BINS),
             "accurate": chosen.histogram(bins, _BINS, accurate),
             "at_or_below": first.cumsum(0)[:-1],
-            "predicted": chosen.histogram(by_outlier, _BINS, p),
+            "stated": chosen.histogram(by_outlier, _BINS, beyond),
             "beyond": chosen.histogram(by_outlier, _BINS, error.square() > 9 * v1),
             "with_outlier": chosen.histogram(by_outlier, _BINS),
             "covered": chosen.number((below - 0.5).abs() <= _THREE_SIGMA / 2),
@@ -71,7 +73,7 @@ class Mixture(SumMetric):
             "mixture_ece_delta": share(gap, count),
             "mixture_ece_q": (observed - self.levels).abs().mean(),
             "mixture_coverage": share(self.covered, count),
-            "outlier_predicted": share(self.predicted, self.with_outlier),
+            "outlier_stated": share(self.stated, self.with_outlier),
             "outlier_found": share(self.beyond, self.with_outlier),
             "outlier_pixels": self.with_outlier.double(),
         }

@@ -38,7 +38,7 @@ DELTA = Shares(
 QUANTILE = Shares("ece_q_levels", "ece_q_observed", "predicted quantile", "share of truth below")
 INTERVAL = Shares("coverage_levels", "coverage_found", "stated probability of the interval", "share of truth in it")
 OUTLIER = Shares(
-    "outlier_predicted", "outlier_found", "posterior_outlier", "share beyond 3 σ of inliers", "outlier_pixels"
+    "outlier_stated", "outlier_found", "stated share beyond 3 σ of inliers", "true share", "outlier_pixels"
 )
 KINDS = DELTA, QUANTILE, INTERVAL, OUTLIER
 
