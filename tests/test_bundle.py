@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import oracle_bundle
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from landmark_runs import true_depth, walk
@@ -206,6 +207,18 @@ def test_a_pose_that_jumps_once_starts_a_new_trajectory_and_teaches_nothing():
             np.testing.assert_array_equal(poses, off)
             assert refinement.state()["given_pose_variance"].equal(before["given_pose_variance"])
     assert jumps == [i == 12 for i in range(20)]
+
+
+@pytest.mark.parametrize(("recent", "jumped"), [(60.0, True), (1e6, False)])
+def test_only_an_error_far_above_the_recent_ones_is_a_jump(recent, jumped):
+    refinement = PoseRefinement()
+    refinement.load_state(refinement.state() | {"surprise_lately": torch.tensor(recent, dtype=torch.float64)})
+    truth, pixel = scene(np.random.default_rng(0), noise=0.2)
+    truth[-1, :3, 3] += [0.1, 0, 0]
+    refinement.refine(pixel, np.ones(pixel.shape[:2], bool), truth, K, 2.0)
+    assert refinement.jumped == jumped
+    kept = refinement.state()["surprise_lately"].item()
+    assert kept > 5 * recent if jumped else kept == pytest.approx(0.8 * recent)
 
 
 @pytest.mark.parametrize("kind", [LandmarkTracker, DenseEvidence])
