@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from time import monotonic
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from ufmstar_torch.eval.commands.depth import NetworkOptions, PosteriorOptions
+from ufmstar_torch.eval.commands.depth import NetworkOptions, UfMOptions
 from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import Recording
 from ufmstar_torch.eval.commands.options import (
@@ -85,7 +85,7 @@ class LiveOptions(MachineOptions):
     json: Flag = False
     opening: Recording
     network: NetworkOptions
-    uncertainty: PosteriorOptions
+    uncertainty: UfMOptions
 
     def __post_init__(self) -> None:
         require_least(self, max_wait=0, save_every=0)
@@ -134,7 +134,7 @@ def main(options: LiveOptions) -> int:
     with ExitStack() as stack:
         with usage_errors(ImportError, OSError, ValueError):
             if options.out is not None:
-                kind.earlier(options.out, resume=False, overwrite=options.overwrite)
+                kind.earlier(options.out, overwrite=options.overwrite)
             K = None if (intrinsics := options.opening.of_reader.intrinsics) is None else read_intrinsics(intrinsics)
             events = _events(options, K)
             model = _model(options)
@@ -241,7 +241,7 @@ def _model(options: LiveOptions) -> UncertainDepth:
         source.networks,
         config,
         mode="full" if chosen.mode == "full" else "alternate",
-        posterior=options.uncertainty.posterior,
+        posterior=not options.uncertainty.plain,
         samples=source.passes if len(source.networks) == 1 and chosen.mode == "full" else None,
         anchors=None if anchors is None else landmarks_of(anchors, None),
         recalibration=options.uncertainty.load_recalibration(config, chosen.weights, source),
