@@ -1,6 +1,7 @@
 """The loop over frames: read, predict, update every row.
 
-``ufmstar run`` writes the results of one row, ``ufmstar eval`` judges those of a suite's rows.
+``ufmstar run`` writes the results of one row, ``ufmstar eval`` judges those of a suite's rows, ``ufmstar rank`` scores
+those of one row on many sequences.
 """
 
 from __future__ import annotations

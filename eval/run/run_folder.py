@@ -58,10 +58,6 @@ RUN = FolderKind(
 )
 
 
-# The network's depth map [h, w], its valid pixels, and the intrinsics of map and image.
-_FirstMap = tuple[NDArray[Any], NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]
-
-
 class RunFolder:
     """Writes the frames of a job into its output folder.
 
@@ -70,6 +66,7 @@ class RunFolder:
         metrics: of these frames.
         seconds: time from the beginning to the last of these frames.
         outputs: by file that is made from all frames None, or why it was not made.
+        first_maps: of ``keep_first_map``.
     """
 
     def __init__(self, job: RunJob, path: Path) -> None:
@@ -77,7 +74,7 @@ class RunFolder:
         self.records: list[dict[str, Any]] = []
         self.outputs: dict[str, str | None] = {}
         self.metrics = RunMetrics(load_plugins(job.settings.get("plugin", ())).metrics)
-        self._first_maps: dict[int, _FirstMap] = {}
+        self.first_maps: FirstMaps = {}
         RUN.clear(path)  # of an earlier run with the same values
         (path / FRAMES).mkdir(exist_ok=True)
         write_bytes_atomic(path / RECORDS, b"")
@@ -89,7 +86,7 @@ class RunFolder:
             self.metrics.add(row)
             judged = perf_counter() - started
             write_frame(frame_file(self.path, result.name), frame_arrays(result.frame, row))
-            self._keep_first_map(result, row)
+        keep_first_map(self.job, result, self.first_maps)
         ms = {"metrics": 1000 * judged, "write": 1000 * (perf_counter() - started - judged)}
         record: dict[str, Any] = to_json(frame_record(result, UFM, ms))
         with (self.path / RECORDS).open("ab") as file:
@@ -97,23 +94,29 @@ class RunFolder:
         self.records.append(record)
         self.seconds += result.ms["cycle"] / 1000
 
-    def _keep_first_map(self, result: FrameResult, row: RowResult) -> None:
-        """Keep the map of a frame in which tracked corners begin."""
-        if result.frame is not None and any(result.index == one.first for one in self.job.corners):
-            depth, valid = row.prediction.depth[0].numpy(), row.valid.numpy()
-            self._first_maps[result.index] = depth, valid, row.intrinsics, result.frame.intrinsics
 
-    def fitted_depth(self) -> DepthFit | None:
-        """Compare the kept maps with the depth of the corners that begin in them; None if the motion is too small, or
-        if the poses contradict the images."""
-        job, maps = self.job, self._first_maps
-        if job.image_fit is None or job.image_fit.problem:
-            return None
+# By index of a frame: the network's depth map [h, w], its valid pixels, and the intrinsics of map and image.
+FirstMaps = dict[int, tuple[NDArray[Any], NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]]
 
-        def depth_at(index: int, pixel: NDArray[np.float64]) -> NDArray[Any] | None:
-            return depth_at_pixels(*maps[index], pixel) if index in maps else None
 
-        return depth_fit(job.sequence, job.corners, depth_at)
+def keep_first_map(job: RunJob, result: FrameResult, maps: FirstMaps) -> None:
+    """Add the depth map of a frame in which tracked corners of the job begin."""
+    row = result.rows.get(UFM)
+    if row is not None and result.frame is not None and any(result.index == one.first for one in job.corners):
+        depth, valid = row.prediction.depth[0].numpy(), row.valid.numpy()
+        maps[result.index] = depth, valid, row.intrinsics, result.frame.intrinsics
+
+
+def fitted_depth(job: RunJob, maps: FirstMaps) -> DepthFit | None:
+    """Compare maps with the depth of the corners that begin in them; None if the motion is too small, or if the poses
+    contradict the images."""
+    if job.image_fit is None or job.image_fit.problem:
+        return None
+
+    def depth_at(index: int, pixel: NDArray[np.float64]) -> NDArray[Any] | None:
+        return depth_at_pixels(*maps[index], pixel) if index in maps else None
+
+    return depth_fit(job.sequence, job.corners, depth_at)
 
 
 def frame_arrays(frame: Frame | None, row: RowResult) -> dict[str, NDArray[Any]]:
