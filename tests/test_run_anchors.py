@@ -23,6 +23,7 @@ from ufmstar_torch.eval.run.pictures import FinishedRun
 from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences.frame import in_memory
+from ufmstar_torch.eval.sequences.images import read_depth
 from ufmstar_torch.eval.sequences.open import open_sequence
 
 TOUR = "tour:5?frames=8&size=120x160"
@@ -222,6 +223,15 @@ def test_a_run_with_a_posterior_corrects_the_depth(tour, tmp_path):
     assert "coverage_90" not in before
     assert len(summary["posterior"]["quantiles"]) == 3
     one, name = last, tour.names[-1]
+    for kind, values, unit in (
+        ("depth", one["depth"], 1e-3),
+        ("sigma", np.sqrt(one["variance"]), 1e-4),
+        ("network_depth", one["network_depth"], 1e-3),
+        ("ufm_sigma", np.sqrt(one["ufm_variance"]), 1e-4),
+    ):
+        image = read_depth(whole / kind / f"{name}.png")
+        expected = np.minimum(values, 65535 * unit)[one["valid"]]
+        np.testing.assert_allclose(image[one["valid"]], expected, atol=unit)
     panel = FinishedRun(whole, tour, records(whole), with_error=True).panel(7)
     labels = [column.label for column in map_columns([panel])]
     assert labels == ["depth, network", "depth", "σ", "|error|", "σ, UfM*", "|error|, network"]

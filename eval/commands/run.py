@@ -225,7 +225,10 @@ def _report(summary: Mapping[str, Any], out: str) -> int:
     for name, reason in summary["outputs"].items():
         if reason is not None:
             print(f"no {name}: {reason}")
-    print(f"{out}: {', '.join(['summary.json', 'frames.jsonl', 'frames/', *made])}")
+    maps = ["depth/", "sigma/"]
+    if "ufm" in summary:
+        maps = ["depth/ and sigma/ (of the posterior)", "network_depth/", "ufm_sigma/"]
+    print(f"{out}: {', '.join(['summary.json', 'frames.jsonl', 'frames/', *maps, *made])}")
     state = f"ufmstar run: {summary['state']}: {summary['reason']}"
     if summary["state"] == FINISHED:
         print(state)

@@ -31,10 +31,13 @@ from ufmstar_torch.eval.run.folder import FolderKind
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.writers import (
     FRAMES,
+    PNGS,
     frame_file,
     is_frame,
+    is_length_png,
     output_arrays,
     write_frame,
+    write_pngs,
 )
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.own_output import RECORDS
@@ -51,8 +54,8 @@ RUN = FolderKind(
     manifest="run.json",
     format=7,
     lock="run.lock",
-    files=(f"{FRAMES}/*.npz", "summary.json", RECORDS, *_MADE_AT_END),
-    recognise={f"{FRAMES}/*.npz": is_frame},
+    files=(f"{FRAMES}/*.npz", *(f"{f}/*.png" for f in PNGS), "summary.json", RECORDS, *_MADE_AT_END),
+    recognise={f"{FRAMES}/*.npz": is_frame, **{f"{folder}/*.png": is_length_png for folder in PNGS}},
     allowed=(CACHE,),
     temporary=(".*.tmp", "*/.*.tmp", f"{CACHE}/*/*/.*.tmp"),
 )
@@ -75,6 +78,7 @@ class RunFolder:
         self.outputs: dict[str, str | None] = {}
         self.metrics = RunMetrics(load_plugins(job.settings.get("plugin", ())).metrics)
         self.first_maps: FirstMaps = {}
+        self._unit: float | None = None  # of the depth PNGs [m per count]
         RUN.clear(path)  # of an earlier run with the same values
         (path / FRAMES).mkdir(exist_ok=True)
         write_bytes_atomic(path / RECORDS, b"")
@@ -85,7 +89,9 @@ class RunFolder:
         if (row := result.rows.get(UFM)) is not None:
             self.metrics.add(row)
             judged = perf_counter() - started
-            write_frame(frame_file(self.path, result.name), frame_arrays(result.frame, row))
+            arrays = frame_arrays(result.frame, row)
+            write_frame(frame_file(self.path, result.name), arrays)
+            self._unit = write_pngs(self.path, result.name, arrays, self._unit)
         keep_first_map(self.job, result, self.first_maps)
         ms = {"metrics": 1000 * judged, "write": 1000 * (perf_counter() - started - judged)}
         record: dict[str, Any] = to_json(frame_record(result, UFM, ms))
