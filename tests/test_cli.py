@@ -212,7 +212,7 @@ def test_debug_shows_the_traceback(ufmstar, tmp_path):
 @pytest.mark.parametrize(
     ("words", "unbuffered"),
     [(["--help"], ""), (["--help"], "1"), (["run", "--help"], "1"), (["eval", "--list"], ""),
-     (["data", "check", "{path}"], "")],
+     pytest.param(["data", "check", "{path}"], "", marks=pytest.mark.slow)],
 )  # fmt: skip
 def test_a_reader_that_closes_the_output_ends_the_command_quietly(words, unbuffered, path):
     """As ``ufmstar eval --list | head -1`` does."""
