@@ -128,7 +128,7 @@ def job_from(options: RunOptions) -> RunJob:
         indices=indices,
         source=source,
         config=config.within(source.max_depth, source.states_confidence),
-        recalibration=ufm.load_recalibration(config, options.network.weights, source),
+        recalibration=ufm.load_recalibration(config, source),
         device=torch.device(options.device),
         settings=options.settings(),
         every=options.network.mode == "full",
