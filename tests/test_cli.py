@@ -86,7 +86,7 @@ NETWORK = "--model fastdepth --weights {path}/K.txt"
 EVAL = "ufmstar eval --suite depth-only --network depth_only=ground-truth:24x32 --root d={path} --out {out}"
 # Options of ``ufmstar run SEQUENCE --out OUT``, or a whole command line; and part of the message.
 MISTAKES = {
-    "unknown command": ("ufmstar walk", "no command 'walk', there are demo, run, eval,"),
+    "unknown command": ("ufmstar walk", "no command 'walk', there are demo, run, rank, eval,"),
     "no sequence": ("ufmstar run", "sequence"),
     "no out": ("ufmstar run {path} --depth self", "out"),
     "no such sequence": ("ufmstar run /nowhere --depth self --out {out}", "no such file or folder: /nowhere"),
@@ -162,6 +162,11 @@ MISTAKES = {
         "ufmstar data check {path} --reader depth_intrinsics=1,2",
         "--reader depth_intrinsics must be a file",
     ),
+    "rank: part": ("ufmstar rank {tour} --depth self --by epistemic --out {out}", "comes with no epistemic variance"),
+    "rank: anchors": ("ufmstar rank {tour} --depth self --by anchored --out {out}", "--by anchored needs --anchors"),
+    "rank: count": ("ufmstar rank {tour} --depth self --count 0 --out {out}", "--count must be at least 1"),
+    "rank: measured": ("ufmstar rank {tour} --depth self --measured 2 --out {out}", "--measured must be a share"),
+    "rank: depth": ("ufmstar rank {tour} {path} --depth a --out {out}", "--depth DIR goes with one sequence"),
     "eval: nothing": ("ufmstar eval", "--suite is missing"),
     "eval: no network": ("ufmstar eval --suite depth-only --root x --out o", "--network is missing"),
     "eval: no file": (f"{EVAL} --suite /nowhere/mine.toml", "/nowhere/mine.toml"),
@@ -265,9 +270,9 @@ def test_settings_come_from_a_file_and_options(ufmstar, path, tmp_path):
 
 def test_the_papers_settings_by_name():
     words = ["walk", "--depth", "self", "--out", "out", "--plain", "--ufm-preset", "paper", "--set", "eta=0.4"]
-    assert read(words).uncertainty.config() == UfMStarConfig.paper().replace(eta=0.4, on_bad_frame="skip")
-    assert read([*words, "--set", "segment.min_rows=8"]).uncertainty.config().segment.min_rows == 8
-    mixed = read([*words, "--preset", "tum"]).uncertainty.config()
+    assert read(words).config == UfMStarConfig.paper().replace(eta=0.4, on_bad_frame="skip")
+    assert read([*words, "--set", "segment.min_rows=8"]).config.segment.min_rows == 8
+    mixed = read([*words, "--preset", "tum"]).config
     assert (mixed.segment, mixed.regression) == (SPGFConfig.preset("tum"), "neighbourhood")
 
 

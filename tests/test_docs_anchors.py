@@ -95,5 +95,5 @@ def test_the_flag_on_the_page_is_one():
     (command,) = [block for block in blocks(PAGE.read_text(), "bash") if block.startswith("ufmstar run")]
     options = read(command.split()[2:])
     assert options.uncertainty.anchors == "corners"
-    assert options.uncertainty.config().posterior is not None
+    assert options.config.posterior is not None
     assert options.network.model == "fastdepth"

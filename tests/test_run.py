@@ -15,6 +15,7 @@ import pytest
 import torch
 from forked import start
 from layouts import truncate, write_depth_png, write_generic
+from PIL import Image
 from runs import CONFIG, Brightness, network_job, outputs, own_depth_job, read_summary, records
 
 from ufmstar_torch import UncertainDepth
@@ -183,8 +184,8 @@ def test_an_ensemble_alternates(path, tmp_path):
 # ---- interruptions ----
 
 
-def after_file(count, error=Crash):
-    """Raise after the ``count``-th frame's file, before the frame is recorded."""
+def between_files(count, error=Crash):
+    """Raise after the ``count``-th of the frames' files (three per frame), before it is recorded."""
 
     def break_(monkeypatch):
         calls = []
@@ -195,12 +196,13 @@ def after_file(count, error=Crash):
             if len(calls) == count:
                 raise error
 
-        monkeypatch.setattr(writers, "write_atomic", partial(broken, writers.write_atomic))
+        for name in ("write_atomic", "write_bytes_atomic"):
+            monkeypatch.setattr(writers, name, partial(broken, getattr(writers, name)))
 
     return break_
 
 
-@pytest.mark.parametrize("break_", [after_file(1), after_file(4)])
+@pytest.mark.parametrize("break_", [between_files(1), between_files(3), between_files(12)])
 def test_a_crash_anywhere_is_made_good(path, tmp_path, uninterrupted, break_):
     with pytest.MonkeyPatch.context() as patch:
         break_(patch)
@@ -254,7 +256,7 @@ def test_an_error_of_the_network_is_in_the_summary(path, tmp_path):
 def test_a_full_disk_leaves_finished_frames(path, tmp_path, uninterrupted):
     out = tmp_path / "out"
     with pytest.MonkeyPatch.context() as patch:
-        after_file(5, OSError(errno.ENOSPC, "No space left on device"))(patch)
+        between_files(13, OSError(errno.ENOSPC, "No space left on device"))(patch)
         summary = run(network_job(path, *pair()), out)
     assert (summary["state"], summary["frames"]["done"]) == ("failed", 4)
     assert "No space left on device" in summary["reason"]
@@ -332,9 +334,15 @@ def test_overwriting_removes_what_the_run_wrote_and_nothing_else(path, tmp_path,
     """Files of a user, in every folder and with every ending of the run's files."""
     out = tmp_path / "out"
     run(network_job(path, frames=slice(0, 6)), out)
-    mine = [out / "frames" / "mine.npz", out / "frames" / "notes.txt", out / "cache" / "a.pt"]
-    np.savez(mine[0], depth=np.ones((3, 3)))
-    for file in mine[1:]:
+    mine = [
+        out / "depth" / "photo.png",
+        out / "frames" / "mine.npz",
+        out / "sigma" / "notes.txt",
+        out / "cache" / "a.pt",
+    ]
+    Image.fromarray(np.full((5, 5, 3), 9, np.uint8)).save(mine[0])
+    np.savez(mine[1], depth=np.ones((3, 3)))
+    for file in mine[2:]:
         file.write_text("mine")
     before = [file.read_bytes() for file in mine]
     (out / "frames" / "orphan.npz").write_bytes((out / "frames" / "7.npz").read_bytes())  # of a killed run
@@ -354,7 +362,7 @@ def two_frames(path, tmp_path_factory):
 
 
 @pytest.mark.parametrize("options", [{"overwrite": True}, {}])
-@pytest.mark.parametrize("link", ["frames", "run.json", "frames/7.npz", "summary.json", "preview.mp4"])
+@pytest.mark.parametrize("link", ["depth", "frames", "run.json", "frames/7.npz", "summary.json", "preview.mp4"])
 def test_nothing_is_written_through_a_link(path, tmp_path, two_frames, link, options):
     out, victim = tmp_path / "out", tmp_path / "victim"
     shutil.copytree(two_frames, out)

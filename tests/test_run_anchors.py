@@ -12,6 +12,7 @@ from runs import job_of, outputs, read_summary, records
 
 from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig, cli
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
+from ufmstar_torch.eval.commands import rank
 from ufmstar_torch.eval.commands.run import job_from, read
 from ufmstar_torch.eval.engine.maps import MapSource, folder_source
 from ufmstar_torch.eval.report.text import run_table
@@ -22,6 +23,7 @@ from ufmstar_torch.eval.run.pictures import FinishedRun
 from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences.frame import in_memory
+from ufmstar_torch.eval.sequences.images import read_depth
 from ufmstar_torch.eval.sequences.open import open_sequence
 
 TOUR = "tour:5?frames=8&size=120x160"
@@ -221,6 +223,15 @@ def test_a_run_with_a_posterior_corrects_the_depth(tour, tmp_path):
     assert "coverage_90" not in before
     assert len(summary["posterior"]["quantiles"]) == 3
     one, name = last, tour.names[-1]
+    for kind, values, unit in (
+        ("depth", one["depth"], 1e-3),
+        ("sigma", np.sqrt(one["variance"]), 1e-4),
+        ("network_depth", one["network_depth"], 1e-3),
+        ("ufm_sigma", np.sqrt(one["ufm_variance"]), 1e-4),
+    ):
+        image = read_depth(whole / kind / f"{name}.png")
+        expected = np.minimum(values, 65535 * unit)[one["valid"]]
+        np.testing.assert_allclose(image[one["valid"]], expected, atol=unit)
     panel = FinishedRun(whole, tour, records(whole), with_error=True).panel(7)
     labels = [column.label for column in map_columns([panel])]
     assert labels == ["depth, network", "depth", "σ", "|error|", "σ, UfM*", "|error|, network"]
@@ -254,35 +265,38 @@ def test_images_are_needed(tour, monkeypatch, tmp_path, caplog):
     blind = with_entries(tour, lambda _, e: dataclasses.replace(e, load_image=None))
     monkeypatch.setattr("ufmstar_torch.eval.sequences.open.open_sequence", lambda *_, **__: blind)
     with pytest.raises(ValueError, match=r"--anchors corners searches images, of which the sequence .* has none"):
-        job_from(read([*words, "--anchors", "corners"]))
+        job_from(read([*words, "--anchors", "corners"]), TOUR)
     assert not caplog.messages
     words[2] = saved_depths(tour, tmp_path / "maps")
-    job = job_from(read(words))
+    job = job_from(read(words), TOUR)
     assert job.config.posterior is job.config.anchors is None
     assert job.settings["plain"] is True
     assert [text for text in caplog.messages if "UfM* alone" in text and "has no images" in text]
     caplog.clear()
-    assert job_from(read([*words, "--plain"])).config == job.config
+    assert job_from(read([*words, "--plain"]), TOUR).config == job.config
     assert not caplog.messages
 
 
 def test_the_default_is_the_posterior_with_dense_evidence_and_plain_is_ufm_star_alone(tour, tmp_path):
     words = [TOUR, "--depth", saved_depths(tour, tmp_path / "maps"), "--out", "out"]
-    jobs = {option: job_from(read([*words, *option.split()])) for option in ("", "--plain", "--anchors corners")}
+    jobs = {option: job_from(read([*words, *option.split()]), TOUR) for option in ("", "--plain", "--anchors corners")}
     assert {option: job.landmarks for option, job in jobs.items() if job.config.posterior} == {
         "": "dense",
         "--anchors corners": "corners",
     }
     assert jobs["--plain"].config == UfMStarConfig(on_bad_frame="skip")
+    ranked = rank.read([TOUR, "--depth", "self", "--out", "out"])
+    assert ranked.config.anchors is ranked.config.posterior is None
+    assert rank.read([TOUR, "--depth", "self", "--out", "out", "--anchors", "dense"]).config.anchors is not None
 
 
 @pytest.mark.parametrize("depth", ["self", "ground-truth"])
 def test_the_recordings_own_depth_is_not_corrected_unless_anchors_are_named(depth, caplog):
     """A correction by depths that are searched in images makes a perfect depth worse."""
     words = [TOUR, "--depth", depth, "--out", "out"]
-    plain = job_from(read(words))
+    plain = job_from(read(words), TOUR)
     assert plain.config == UfMStarConfig(on_bad_frame="skip")
     assert [text for text in caplog.messages if "the recording's own depth is not corrected" in text]
     assert plain.settings["plain"] is True
     for option in (["--anchors", "dense"], ["--set", "posterior.half_life=9"]):
-        assert job_from(read([*words, *option])).config.posterior is not None
+        assert job_from(read([*words, *option]), TOUR).config.posterior is not None

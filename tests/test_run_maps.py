@@ -95,7 +95,7 @@ def test_a_run_reads_back_what_another_left_and_skips_what_it_skipped(path, tmp_
     broken = replace(sequence.entries[2], load_image=lambda: np.zeros((5, 5, 3), np.uint8))
     spoiled = replace(sequence, entries=(*sequence.entries[:2], broken, *sequence.entries[3:]))
     run(job_of(spoiled, networks(Brightness(), preprocess=preprocess), frames=slice(1, 5)), tmp_path / "first")
-    for folder in ("first", "first/frames"):
+    for folder in ("first", "first/depth"):
         source = folder_source(sequence, tmp_path / folder, indices=range(1, 5))
         summary = run(job_of(sequence, source, frames=slice(1, 5)), tmp_path / "second", overwrite=True)
         assert summary["frames"]["done"] == 3

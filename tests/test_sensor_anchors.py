@@ -249,5 +249,5 @@ def test_the_command(tmp_path, capfd):
     assert "--anchors sensor goes with the depth of a network" in capfd.readouterr().err
     assert cli.main([*words, "--overwrite", "--depth", str(maps), "--anchors", "sensor:x"]) == 2
     assert "the kind of sensor must be one of" in capfd.readouterr().err
-    with pytest.raises(ValueError, match="is the depth of a recording, for `ufmstar run`"):
+    with pytest.raises(ValueError, match="is the depth of a recording, for `ufmstar run` and `rank`"):
         landmarks_of("sensor:tof", None)

@@ -87,7 +87,7 @@ def test_a_trajectory_or_another_convention_is_refused(written):
 def test_a_run_that_compares_views_refuses_it(written, tmp_path):
     words = [str(written[0]), "--depth", "ground-truth", "--out", str(tmp_path / "out")]
     with pytest.raises(ValueError, match="single images without poses, which UfM\\* needs"):
-        job_from(read(words))
+        job_from(read(words), words[0])
 
 
 def test_an_evaluation_refuses_rows_that_compare_views(written):

@@ -70,7 +70,10 @@ def choosing():
     print("chosen", choose([1.0, 2.0]))
 def metrics():
     from ufmstar_torch.eval.metrics import mean_and_ci
-for call in (choosing, metrics, own_network, trajectory, hugging_face, train_module, corners, command):
+def ranking():
+    from ufmstar_torch.cli import main
+    main(["rank", "a", "--depth", "self", "--out", "c"])
+for call in (choosing, metrics, ranking, own_network, trajectory, hugging_face, train_module, corners, command):
     try:
         call()
     except ModuleNotFoundError as error:
@@ -101,6 +104,7 @@ def test_what_is_missing_without_extras_is_named():
         ("hugging_face", "transformers", "models"),
         ("train_module ufmstar_torch.train.train_module", "lightning", "train"),
         ("ufmstar run: failed: this command", r"\w+", "eval"),
+        ("ufmstar rank: failed: this command", r"\w+", "eval"),
         ("metrics ufmstar_torch.eval.metrics.mean_and_ci", "torchmetrics", "eval"),
     ):
         (line,) = (line for line in output.splitlines() if line.startswith(who))

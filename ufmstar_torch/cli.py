@@ -23,6 +23,7 @@ CLOSED = 141  # of a program that SIGPIPE ends
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("eval.commands.demo", "the method on rendered rooms, without data or weights"),
     "run": ("eval.commands.run", "depth and variance of a sequence of posed images, onto disk"),
+    "rank": ("eval.commands.rank", "which images of a pool to label, the most uncertain first"),
     "eval": ("eval.commands.evaluate", "the rows of a table or figure of the paper, on your own sequences"),
     "live": ("eval.commands.live", "depth and variance of a camera, or of a recording at its pace"),
     "report": ("eval.commands.report", "tables, figures and a page from the results of eval"),

@@ -1,4 +1,4 @@
-"""The options of depth and of UfM* that ``run`` and ``live`` share, and the loading of what they name."""
+"""The options of depth and of UfM* that ``run``, ``rank`` and ``live`` share, and the loading of what they name."""
 
 from __future__ import annotations
 
@@ -160,16 +160,15 @@ class MapOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class UfMOptions:
-    """UfM*, and the posterior that corrects its depth and variance with anchors.
+    """UfM*.
 
     Attributes:
         preset: Segment with the thresholds of the authors' code for a kind of recording.
         ufm_preset: Start from the paper's own settings (UfMStarConfig.paper; with --plain, its method), or ours.
         set: Set a value of UfMStarConfig as NAME=VALUE, as segment.min_pixels=100; it wins over presets; repeatable.
-        anchors: Correct the depth (docs/anchors.md) with depths searched in earlier images (dense, the default),
-            corners tracked in the images (corners), landmarks from a FILE with a line x y z sigma [m] each, or, with
-            run, the recording's own depth (sensor, sensor:stereo, sensor:tof).
-        plain: Leave the network's depth as it is, with the variance of UfM* alone; with --anchors, it includes B.
+        anchors: Measure the error on which all views agree (docs/anchors.md) with depths searched in earlier images
+            (dense), corners tracked in the images (corners), landmarks from a FILE with a line x y z sigma [m] each,
+            or the recording's own depth (sensor, sensor:stereo, sensor:tof).
         scale_from: Poses of COLMAP without a scale get the network's; anchors then show shape only.
         recalibration: Map the variance by this file of `ufmstar recalibrate`.
     """
@@ -181,7 +180,6 @@ class UfMOptions:
     ufm_preset: Literal["paper", "default"] = "default"
     set: Repeated = ()
     anchors: Text = None
-    plain: Flag = False
     scale_from: Annotated[Literal["network"] | None, one_of("network")] = None
     recalibration: File = None
 
@@ -189,21 +187,21 @@ class UfMOptions:
         self.config()  # checks the settings
 
     @property
-    def chosen(self) -> bool:
-        """True if the user chooses anchors, or settings of anchors or the posterior."""
-        return self.anchors is not None or any(key.startswith(("anchors.", "posterior.")) for key in assigned(self.set))
+    def posterior(self) -> bool:
+        """True if anchors correct the depth."""
+        return False
 
-    def config(self) -> UfMStarConfig:
-        """The configuration. Raises ValueError: an impossible value, or settings of anchors or posterior while these
-        are off."""
+    def config(self, **first: Any) -> UfMStarConfig:
+        """The configuration; ``first`` replaces values of the presets. Raises ValueError: an impossible value, or
+        settings of anchors or posterior while these are off."""
         values = assigned(self.set)
-        used = {"anchors": self.anchors is not None or not self.plain, "posterior": not self.plain}
-        for name, needed in (("anchors", "--anchors"), ("posterior", "the posterior, without --plain")):
+        used = {"anchors": self.anchors is not None or self.posterior, "posterior": self.posterior}
+        for name, needed in (("anchors", "--anchors"), ("posterior", "the posterior, as run and live without --plain")):
             if not used[name] and any(key.startswith(f"{name}.") for key in values):
                 raise ValueError(f"--set {name}.* needs {needed}")
         start = started(self.ufm_preset, **used).replace(on_bad_frame="skip")
         start = start if self.preset is None else start.replace(segment=SPGFConfig.preset(self.preset))
-        return start.with_values(values)
+        return start.with_values(first | values)
 
     def load_recalibration(self, config: UfMStarConfig, source: DepthSource) -> Recalibration | None:
         """Read the recalibration of the option.
@@ -222,3 +220,27 @@ class UfMOptions:
         except ValueError as error:
             raise ValueError(f"--recalibration {self.recalibration}: {error}") from error
         return recalibration
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosteriorOptions(UfMOptions):
+    """UfM*, and the posterior that corrects its depth and variance with anchors.
+
+    Attributes:
+        anchors: Correct the depth (docs/anchors.md) with depths searched in earlier images (dense, the default),
+            corners tracked in the images (corners), landmarks from a FILE with a line x y z sigma [m] each, or, with
+            run, the recording's own depth (sensor, sensor:stereo, sensor:tof).
+        plain: Leave the network's depth as it is, with the variance of UfM* alone; with --anchors, it includes B.
+    """
+
+    plain: Flag = False
+
+    @property
+    def chosen(self) -> bool:
+        """True if the user chooses anchors, or settings of anchors or the posterior."""
+        return self.anchors is not None or any(key.startswith(("anchors.", "posterior.")) for key in assigned(self.set))
+
+    @property
+    def posterior(self) -> bool:
+        """True if anchors correct the depth."""
+        return not self.plain

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from time import monotonic
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from ufmstar_torch.eval.commands.depth import NetworkOptions, UfMOptions
+from ufmstar_torch.eval.commands.depth import NetworkOptions, PosteriorOptions
 from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import Recording
 from ufmstar_torch.eval.commands.options import (
@@ -85,7 +85,7 @@ class LiveOptions(MachineOptions):
     json: Flag = False
     opening: Recording
     network: NetworkOptions
-    uncertainty: UfMOptions
+    uncertainty: PosteriorOptions
 
     def __post_init__(self) -> None:
         require_least(self, max_wait=0, save_every=0)
@@ -241,7 +241,7 @@ def _model(options: LiveOptions) -> UncertainDepth:
         source.networks,
         config,
         mode="full" if chosen.mode == "full" else "alternate",
-        posterior=not options.uncertainty.plain,
+        posterior=options.uncertainty.posterior,
         samples=source.passes if len(source.networks) == 1 and chosen.mode == "full" else None,
         anchors=None if anchors is None else landmarks_of(anchors, None),
         recalibration=options.uncertainty.load_recalibration(config, source),

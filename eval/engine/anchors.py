@@ -184,7 +184,7 @@ def landmarks_of(value: str, folder: Path | None, scale: float = 1.0) -> Landmar
         scale: metres per unit of the poses, which is the unit of the file.
     """
     if value.partition(":")[0] == SENSOR:
-        raise ValueError(f"anchors: {value!r} is the depth of a recording, for `ufmstar run`")
+        raise ValueError(f"anchors: {value!r} is the depth of a recording, for `ufmstar run` and `rank`")
     is_file = Path(value).suffix.lower() in FILE_TYPES
     source = landmark_source(resolve(folder or Path(), value) if is_file else value)
     if isinstance(source, LandmarkMap) and scale != 1:

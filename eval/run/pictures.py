@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ufmstar_torch.eval.engine.rows import RowResult
 from ufmstar_torch.eval.run.colours import INVALID_GREY, known_where
 from ufmstar_torch.eval.run.panels import FramePanel, MapColumn, contact_sheet, map_columns
 from ufmstar_torch.eval.run.writers import frame_file, read_frame
@@ -81,6 +82,19 @@ class FinishedRun:
         if len(stamps) < 2 or len(stamps) < len(times) or not np.median(np.diff(stamps)) > 0:
             return DEFAULT_FPS
         return float(np.clip(1 / np.median(np.diff(stamps)), *FPS_RANGE))
+
+
+def panel_of(name: str, note: str, frame: Frame, row: RowResult) -> FramePanel:
+    """The image of a frame and a row's maps: depth, sigma and, with ground truth, the absolute error."""
+    assert frame.image is not None
+    maps = {"depth": row.depth.float().numpy(), "sigma": row.out.std[0].float().numpy()}
+    if row.truth is not None:
+        maps["error"] = absolute_error(maps["depth"], row.truth)
+    if (measured := row.map("measured")) is not None:
+        maps["measured"] = measured.float().numpy()
+    image = field_of_view(frame.image, frame.intrinsics, row.intrinsics, row.size)
+    shown = {key: known_where(row.valid.numpy(), values) for key, values in maps.items()}
+    return FramePanel(name, image, shown, note)
 
 
 def common_columns(finished: FinishedRun) -> list[MapColumn]:

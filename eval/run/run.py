@@ -56,8 +56,7 @@ def run(
         folder, row, ufm = RunFolder(job, path), *job.row()
         cache = PredictionCache(path / CACHE) if job.source.cacheable else None
         with _summarised(folder, ufm):
-            # Compile the kernels before the first frame.
-            warm_up_command(job.config, progress, [] if job.config.anchors is None else [job.landmarks])
+            warm_up_job(job, progress)
             shown = frame_progress(progress, len(job.indices))
             results = frame_results(job.sequence, job.indices, [row], cache=cache, stop=stop)
             with closing(results), call_behind() as call:
@@ -87,6 +86,11 @@ def _summarised(folder: RunFolder, ufm: UfMStar) -> Iterator[None]:
         raise
     finally:
         write_summary(folder, ufm.mixture, *ending)
+
+
+def warm_up_job(job: RunJob, progress: Show) -> None:
+    """Compile a job's kernels before its first frame."""
+    warm_up_command(job.config, progress, [] if job.config.anchors is None else [job.landmarks])
 
 
 def _ending(folder: RunFolder) -> tuple[str, str]:

@@ -31,10 +31,13 @@ from ufmstar_torch.eval.run.folder import FolderKind
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.writers import (
     FRAMES,
+    PNGS,
     frame_file,
     is_frame,
+    is_length_png,
     output_arrays,
     write_frame,
+    write_pngs,
 )
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.own_output import RECORDS
@@ -51,15 +54,11 @@ RUN = FolderKind(
     manifest="run.json",
     format=7,
     lock="run.lock",
-    files=(f"{FRAMES}/*.npz", "summary.json", RECORDS, *_MADE_AT_END),
-    recognise={f"{FRAMES}/*.npz": is_frame},
+    files=(f"{FRAMES}/*.npz", *(f"{f}/*.png" for f in PNGS), "summary.json", RECORDS, *_MADE_AT_END),
+    recognise={f"{FRAMES}/*.npz": is_frame, **{f"{folder}/*.png": is_length_png for folder in PNGS}},
     allowed=(CACHE,),
     temporary=(".*.tmp", "*/.*.tmp", f"{CACHE}/*/*/.*.tmp"),
 )
-
-
-# The network's depth map [h, w], its valid pixels, and the intrinsics of map and image.
-_FirstMap = tuple[NDArray[Any], NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]
 
 
 class RunFolder:
@@ -70,6 +69,7 @@ class RunFolder:
         metrics: of these frames.
         seconds: time from the beginning to the last of these frames.
         outputs: by file that is made from all frames None, or why it was not made.
+        first_maps: of ``keep_first_map``.
     """
 
     def __init__(self, job: RunJob, path: Path) -> None:
@@ -77,7 +77,8 @@ class RunFolder:
         self.records: list[dict[str, Any]] = []
         self.outputs: dict[str, str | None] = {}
         self.metrics = RunMetrics(load_plugins(job.settings.get("plugin", ())).metrics)
-        self._first_maps: dict[int, _FirstMap] = {}
+        self.first_maps: FirstMaps = {}
+        self._unit: float | None = None  # of the depth PNGs [m per count]
         RUN.clear(path)  # of an earlier run with the same values
         (path / FRAMES).mkdir(exist_ok=True)
         write_bytes_atomic(path / RECORDS, b"")
@@ -88,8 +89,10 @@ class RunFolder:
         if (row := result.rows.get(UFM)) is not None:
             self.metrics.add(row)
             judged = perf_counter() - started
-            write_frame(frame_file(self.path, result.name), frame_arrays(result.frame, row))
-            self._keep_first_map(result, row)
+            arrays = frame_arrays(result.frame, row)
+            write_frame(frame_file(self.path, result.name), arrays)
+            self._unit = write_pngs(self.path, result.name, arrays, self._unit)
+        keep_first_map(self.job, result, self.first_maps)
         ms = {"metrics": 1000 * judged, "write": 1000 * (perf_counter() - started - judged)}
         record: dict[str, Any] = to_json(frame_record(result, UFM, ms))
         with (self.path / RECORDS).open("ab") as file:
@@ -97,23 +100,29 @@ class RunFolder:
         self.records.append(record)
         self.seconds += result.ms["cycle"] / 1000
 
-    def _keep_first_map(self, result: FrameResult, row: RowResult) -> None:
-        """Keep the map of a frame in which tracked corners begin."""
-        if result.frame is not None and any(result.index == one.first for one in self.job.corners):
-            depth, valid = row.prediction.depth[0].numpy(), row.valid.numpy()
-            self._first_maps[result.index] = depth, valid, row.intrinsics, result.frame.intrinsics
 
-    def fitted_depth(self) -> DepthFit | None:
-        """Compare the kept maps with the depth of the corners that begin in them; None if the motion is too small, or
-        if the poses contradict the images."""
-        job, maps = self.job, self._first_maps
-        if job.image_fit is None or job.image_fit.problem:
-            return None
+# By index of a frame: the network's depth map [h, w], its valid pixels, and the intrinsics of map and image.
+FirstMaps = dict[int, tuple[NDArray[Any], NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]]
 
-        def depth_at(index: int, pixel: NDArray[np.float64]) -> NDArray[Any] | None:
-            return depth_at_pixels(*maps[index], pixel) if index in maps else None
 
-        return depth_fit(job.sequence, job.corners, depth_at)
+def keep_first_map(job: RunJob, result: FrameResult, maps: FirstMaps) -> None:
+    """Add the depth map of a frame in which tracked corners of the job begin."""
+    row = result.rows.get(UFM)
+    if row is not None and result.frame is not None and any(result.index == one.first for one in job.corners):
+        depth, valid = row.prediction.depth[0].numpy(), row.valid.numpy()
+        maps[result.index] = depth, valid, row.intrinsics, result.frame.intrinsics
+
+
+def fitted_depth(job: RunJob, maps: FirstMaps) -> DepthFit | None:
+    """Compare maps with the depth of the corners that begin in them; None if the motion is too small, or if the poses
+    contradict the images."""
+    if job.image_fit is None or job.image_fit.problem:
+        return None
+
+    def depth_at(index: int, pixel: NDArray[np.float64]) -> NDArray[Any] | None:
+        return depth_at_pixels(*maps[index], pixel) if index in maps else None
+
+    return depth_fit(job.sequence, job.corners, depth_at)
 
 
 def frame_arrays(frame: Frame | None, row: RowResult) -> dict[str, NDArray[Any]]:

@@ -17,7 +17,7 @@ from ufmstar_torch.eval.engine.judge import ALONE, POSTERIOR, UFM
 from ufmstar_torch.eval.engine.maps import MapSource
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.machine import hardware, versions
-from ufmstar_torch.eval.run.run_folder import RUN, RunFolder
+from ufmstar_torch.eval.run.run_folder import RUN, RunFolder, fitted_depth
 from ufmstar_torch.eval.run.writers import frame_file, read_frame
 from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.eval.sequences.intrinsics import pinhole
@@ -71,7 +71,7 @@ def write_summary(folder: RunFolder, mixture: GaussianMixture, state: str, reaso
         "versions": versions(),
         "machine": hardware(),
     }
-    depth = folder.fitted_depth()
+    depth = fitted_depth(job, folder.first_maps)
     summary |= {"image_fit": job.image_fit, "depth_fit": depth, "warnings": _warnings(folder, depth, done)}
     plain: dict[str, Any] = to_json(summary)
     write_json_atomic(folder.path / SUMMARY, plain)

@@ -1,4 +1,4 @@
-"""The file of every frame: OUT/frames/NAME.npz of ``ufmstar run``, OUT/STAMP.npz of ``ufmstar live``; and 16-bit PNGs.
+"""The files of every frame: OUT/frames/NAME.npz of ``ufmstar run``, OUT/STAMP.npz of ``ufmstar live``, and 16-bit PNGs.
 
 The npz has
 
@@ -9,6 +9,9 @@ The npz has
 - with anchors anchored [m^2] (B), bias (r: the network's depth times 1 + r is to be expected), and anchors [N, 4]: u, v
   in the maps [px], depth and its standard deviation [m];
 - T_world_cam [4, 4] camera-to-world [m] and intrinsics [3, 3] of the maps [px].
+
+depth/NAME.png and sigma/NAME.png are depth and the root of variance; with a posterior, network_depth/ and ufm_sigma/
+are network_depth and the root of ufm_variance.
 """
 
 from __future__ import annotations
@@ -22,15 +25,19 @@ from zipfile import BadZipFile, ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.engine.files import write_atomic
+from ufmstar_torch.eval.engine.files import write_atomic, write_bytes_atomic
 from ufmstar_torch.files.read import read_npz_whole
 from ufmstar_torch.frames.output import MAPS, UncertaintyOutput
 
 FRAMES = "frames"
-_BEFORE = ("network_depth", "ufm_variance")  # arrays with a posterior: before its correction
+# Folders of the PNGs, and the arrays of the npz with a frame's depth and variance for them.
+_RESULT = ("depth", "sigma"), ("depth", "variance")
+_BEFORE = ("network_depth", "ufm_sigma"), ("network_depth", "ufm_variance")
+PNGS = (*_RESULT[0], *_BEFORE[0])
 _OF_NETWORK = ("aleatoric", "epistemic", "confidence", "features")  # maps that are not stored
-# Arrays of every frame.
+# Arrays of every frame, and the texts of every PNG.
 _NEEDED = ("depth", "variance", "disagreement", "valid", "T_world_cam", "intrinsics")
+_TEXTS = {"depth_scale", "unit", "quantity", "invalid", "saturated"}
 
 
 def frame_file(out: Path, name: str) -> Path:
@@ -42,7 +49,7 @@ def frame_file(out: Path, name: str) -> Path:
 
 def output_arrays(out: UncertaintyOutput, T_world_cam: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
     """The maps of an output of one stream, its pose and its intrinsics, by name."""
-    left_out = _OF_NETWORK if out.posterior_outlier is not None else (*_OF_NETWORK, *_BEFORE)
+    left_out = _OF_NETWORK if out.posterior_outlier is not None else (*_OF_NETWORK, *_BEFORE[1])
     maps = {name: value for name in MAPS if name not in left_out and (value := getattr(out, name)) is not None}
     arrays = {name: value[0].cpu().numpy().astype(np.float32, copy=False) for name, value in maps.items()}
     camera = {"T_world_cam": T_world_cam, "intrinsics": out.intrinsics[0].cpu().double().numpy()}
@@ -56,12 +63,29 @@ def write_frame(file: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     write_atomic(file, lambda opened: np.savez(opened, allow_pickle=False, **arrays))
 
 
+def write_pngs(out: Path, name: str, maps: Mapping[str, NDArray[Any]], unit: float | None) -> float:
+    """Write the PNGs of a frame's maps (0 = not valid). ``unit`` is the metres per count of depth, equal in a whole
+    run; None = chosen from this frame. Sigma's unit is a tenth of it. Returns ``unit``."""
+    for folders, names in (_RESULT, _BEFORE) if _BEFORE[1][0] in maps else (_RESULT,):
+        depth, variance = (np.where(maps["valid"], maps[key], np.nan) for key in names)
+        with np.errstate(invalid="ignore"):
+            sigma = np.sqrt(variance)
+        unit = unit or fitting_unit(depth)
+        for folder, values, metres in zip(folders, (depth, sigma), (unit, unit / 10), strict=True):
+            kind = "sigma" if values is sigma else "depth"
+            content, file = encode_length_png(values, metres, kind), out / folder / f"{name}.png"
+            file.parent.mkdir(exist_ok=True)
+            write_bytes_atomic(file, content)
+    assert unit is not None
+    return unit
+
+
 def read_frame(path: str | Path) -> dict[str, NDArray[Any]]:
     """The arrays of a frame's file. Errors as ``read_npz_whole``; also ValueError: an array is missing, or has another
     form; the message names file and array."""
     arrays = read_npz_whole(path)
     corrected = any(name.startswith("posterior_") for name in arrays)
-    if missing := [name for name in (*_NEEDED, *(_BEFORE if corrected else ())) if name not in arrays]:
+    if missing := [name for name in (*_NEEDED, *(_BEFORE[1] if corrected else ())) if name not in arrays]:
         raise ValueError(f"{path} is no frame of `ufmstar run`: it has no array {missing[0]}")
     size = arrays["depth"].shape
     for name, values in arrays.items():
@@ -85,6 +109,17 @@ def is_frame(path: Path) -> bool:
         with ZipFile(path) as archive:
             return {f"{name}.npy" for name in _NEEDED} <= set(archive.namelist())
     except (OSError, BadZipFile, ValueError):
+        return False
+
+
+def is_length_png(path: Path) -> bool:
+    """True if a file is a PNG of :func:`encode_length_png`, by its texts."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            return set(image.info) >= _TEXTS
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError):
         return False
 
 

@@ -26,9 +26,9 @@ class OwnOutput(NamedTuple):
 
 
 def own_output(path: Path) -> OwnOutput | None:
-    """The output of a run in a folder, which may also be OUT/frames; None if there is none. Raises
+    """The output of a run in a folder, which may also be OUT/frames or OUT/depth; None if there is none. Raises
     ValueError: a line of frames.jsonl is no record; the message names file and line."""
-    for out in (path, path.parent) if path.name == "frames" else (path,):
+    for out in (path, path.parent) if path.name in ("frames", "depth") else (path,):
         if (out / RECORDS).is_file() and (out / "frames").is_dir():
             records = read_records((out / RECORDS).read_bytes(), out / RECORDS)
             done = [record for record in records if record["state"] == "done"]
