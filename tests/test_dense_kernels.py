@@ -229,15 +229,6 @@ def test_a_cell_keeps_the_landmark_that_is_known_best(scene, better):
     assert landmarks.used.tolist() == [False, True, False]
 
 
-def test_a_patch_without_contrast_is_zero_and_never_shown():
-    """Its values are grey levels, so that their product with a window would exceed any correlation."""
-    image = np.full((72, 96), 100, np.uint8)
-    image[36, 48] = 108
-    landmarks = stored(image, np.array([[48.0, 36.0]]))
-    assert not landmarks.patch.any()
-    assert sight(landmarks, 2, plane(0, np.eye(4)), np.eye(4), K, 8).shown[0] == -1
-
-
 def test_a_search_along_the_last_row_reads_nothing_beyond_the_image():
     """Python checks bounds; compiled code would read memory behind the image."""
     height, width = 12, 24
