@@ -175,7 +175,6 @@ MISTAKES = {
     "eval: no root": (f"{EVAL} --root /nowhere", "no such file or folder: /nowhere"),
     "eval: frames": (f"{EVAL} --root /nowhere --frames 5", "--frames must be START:STOP"),
     "eval: two kinds of processes": (f"{EVAL} --processes 2 --scheduler tcp://h:1", "give one of them"),
-    "eval: both": (f"{EVAL} --resume --overwrite", "--resume and --overwrite contradict"),
     "eval: processes": (f"{EVAL} --processes 0", "--processes must be at least 1"),
     "eval: sequences": (f"{EVAL} --sequences 0", "--sequences must be at least 1"),
     "eval: list": (f"{EVAL} --sequence-list /nowhere.txt", "/nowhere.txt"),

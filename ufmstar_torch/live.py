@@ -29,7 +29,6 @@ from ufmstar_torch.frames.clock import require_stamp
 from ufmstar_torch.frames.frame import FRAME_FAULTS, NOT_FINITE
 from ufmstar_torch.frames.image_queue import CLOSED, ImageQueue, QueuedImage
 from ufmstar_torch.frames.output import UncertaintyOutput
-from ufmstar_torch.kernels.cpu.check import pose_fault
 from ufmstar_torch.uncertain_depth import UncertainDepth
 
 
@@ -299,7 +298,9 @@ def _pose(T: CameraLike, tolerance: float) -> np.ndarray:
     if pose.dim() != 2:
         raise ValueError(f"T must be one pose, [4, 4] or [3, 4], got {tuple(pose.shape)}")
     rigid = np.array(pose.numpy())
-    fault = pose_fault(rigid.tolist(), tolerance)
+    from ufmstar_torch.kernels.cpu.check import camera_faults  # kernels compile when they are first needed
+
+    [fault] = camera_faults(rigid[None], np.eye(3)[None], (1, 1), tolerance)
     if fault == NOT_FINITE:
         return np.full((4, 4), np.nan)
     if fault:

@@ -95,8 +95,8 @@ class EvalOutputOptions:
     """Output.
 
     Attributes:
-        out: Write everything to this folder.
-        resume: Continue the evaluation in --out: compute what is missing, also rows and sequences added since.
+        out: Write everything to this folder; of an evaluation there, compute what is missing, also rows and sequences
+            added since.
         overwrite: Replace the evaluation in --out, but for the predictions in its cache.
         cache: Keep the networks' predictions in this folder (default: OUT/cache).
         examples: Keep some frames of this many sequences of each data set for pictures.
@@ -105,7 +105,6 @@ class EvalOutputOptions:
     """
 
     out: Text = None
-    resume: Flag = False
     overwrite: Flag = False
     cache: Text = None
     examples: int = 3
@@ -120,8 +119,8 @@ class EvalOutputOptions:
 class EvalOptions(MachineOptions):
     """The rows of a table or figure of the paper, on sequences of your own.
 
-    A sequence's rows are written when its last frame is done: whatever ends the program, --resume computes what is
-    missing. The sequences can be divided: --processes on one computer, --scheduler on a Dask cluster.
+    A sequence's rows are written when its last frame is done: whatever ends the program, the same command computes
+    what is missing. The sequences can be divided: --processes on one computer, --scheduler on a Dask cluster.
 
     Attributes:
         device: Run on cpu or cuda; each of several --processes takes the next GPU in turn.
@@ -153,8 +152,6 @@ class EvalOptions(MachineOptions):
             if not values[name]:
                 raise ValueError(f"--{name} is missing; ufmstar eval --help, and --list for the suites")
         parse_slice(self.data.frames)
-        if self.output.resume and self.output.overwrite:
-            raise ValueError("--resume and --overwrite contradict each other")
         if self.scheduler is not None and self.processes > 1:
             raise ValueError("--processes are of this computer, --scheduler has its own: give one of them")
 
@@ -216,7 +213,7 @@ def _evaluate(options: EvalOptions) -> int:
     from ufmstar_torch.eval.engine.progress import warm_up_command
     from ufmstar_torch.eval.suite.tasks import evaluate_suite, executor_of
 
-    how: dict[str, Any] = {"resume": options.output.resume, "overwrite": options.output.overwrite}
+    how: dict[str, Any] = {"overwrite": options.output.overwrite}
     with Bars() as bars, stop_signals(bars.say) as stop:
         job = job_from(options)
         for base in job.unused:
@@ -257,10 +254,13 @@ def _report(job: EvalJob, outcome: EvalOutcome, options: EvalOptions) -> int:
     for label, reason in outcome.failed.items():
         print(f"ufmstar eval: {label} failed: {reason}", file=sys.stderr)
     if outcome.stopped:
-        print(f"ufmstar eval: stopped; finished rows are in {job.out / 'records'}; --resume continues", file=sys.stderr)
+        print(
+            f"ufmstar eval: stopped; finished rows are in {job.out / 'records'}; the same command continues",
+            file=sys.stderr,
+        )
         return 130
     if outcome.failed or not outcome.finished:
-        print("ufmstar eval: not all sequences are complete; --resume tries the rest again", file=sys.stderr)
+        print("ufmstar eval: not all sequences are complete; the same command tries the rest again", file=sys.stderr)
         return 1
     return 0
 

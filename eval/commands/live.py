@@ -134,7 +134,7 @@ def main(options: LiveOptions) -> int:
     with ExitStack() as stack:
         with usage_errors(ImportError, OSError, ValueError):
             if options.out is not None:
-                kind.earlier(options.out, resume=False, overwrite=options.overwrite)
+                kind.earlier(options.out, overwrite=options.overwrite)
             K = None if (intrinsics := options.opening.of_reader.intrinsics) is None else read_intrinsics(intrinsics)
             events = _events(options, K)
             model = _model(options)

@@ -18,7 +18,6 @@ from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, LandmarkSource,
 from ufmstar_torch.anchors.sources import landmark_source
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.frames.frame import FRAME_FAULTS
-from ufmstar_torch.kernels.cpu.check import intrinsics_fault, pose_fault
 
 _LOG = logging.getLogger("ufmstar_torch")
 _CAUSES = (
@@ -113,6 +112,8 @@ class StreamLandmarks:
         self._require(b)
         before, faults = self._states(), [0] * b
         if rotation_tolerance is not None:
+            from ufmstar_torch.kernels.cpu.check import camera_faults  # kernels compile when they are first needed
+
             size = (torch.inf, torch.inf) if images is None else images.shape[1:3]
             faults = camera_faults(T, K.numpy(), size, rotation_tolerance)
         if not skip and (faulty := [f"stream {i}: {FRAME_FAULTS[fault]}" for i, fault in enumerate(faults) if fault]):
@@ -234,14 +235,6 @@ def _padded(motion: Sequence[Tensor | None]) -> Tensor | None:
         if m is not None:
             result[stream, : m.shape[1]] = m[0]
     return result
-
-
-def camera_faults(
-    pose: NDArray[np.float64], K: NDArray[np.float64], size: tuple[float, ...], tolerance: float
-) -> list[int]:
-    """Indices into ``FRAME_FAULTS`` of poses [B, 4, 4] and intrinsics [B, 3, 3] of images of a size (H, W)."""
-    cameras = zip(pose.tolist(), K.tolist(), strict=True)
-    return [pose_fault(T, tolerance) or intrinsics_fault(camera, *size) for T, camera in cameras]
 
 
 def as_bytes(image: Tensor) -> Tensor:
