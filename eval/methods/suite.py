@@ -36,7 +36,7 @@ from typing import Any
 from ufmstar_torch.eval.methods.method import BASES, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import setting_from
-from ufmstar_torch.files.limits import read_text
+from ufmstar_torch.files.limits import read_settings
 
 _NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 _SHIPPED = files("ufmstar_torch.eval.methods") / "suites"
@@ -146,7 +146,7 @@ def _file(name: str) -> Traversable:
 def _read(name: str) -> dict[str, Any]:
     """The content of a suite's file. Raises ValueError: unknown keys or bases."""
     file = _file(name)
-    values = tomllib.loads(read_text(file) if isinstance(file, Path) else file.read_text(encoding="utf-8"))
+    values = read_settings(file) if isinstance(file, Path) else tomllib.loads(file.read_text(encoding="utf-8"))
     _check(values, _KEYS, "the suite")
     for base in (*values.get("bases", []), values.get("base", "ensemble")):
         _require_base(base)
