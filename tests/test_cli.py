@@ -109,11 +109,11 @@ MISTAKES = {
     "size": ("--depth self --size 24", "--size must be HxW"),
     "plug-in in a configuration": (
         "--depth self --config {plugin}",
-        "--plugin allows code to run: type it on the command line",
+        "plugin allows code to run: type it on the command line",
     ),
     "trust in a configuration": (
         "--depth self --config {trust}",
-        "--trust-code allows code to run: type it on the command line",
+        "trust_code allows code to run: type it on the command line",
     ),
     "trust without a program": (
         "--model fastdepth --weights a --trust-code",
@@ -175,7 +175,6 @@ MISTAKES = {
     "eval: no root": (f"{EVAL} --root /nowhere", "no such file or folder: /nowhere"),
     "eval: frames": (f"{EVAL} --root /nowhere --frames 5", "--frames must be START:STOP"),
     "eval: two kinds of processes": (f"{EVAL} --processes 2 --scheduler tcp://h:1", "give one of them"),
-    "eval: both": (f"{EVAL} --resume --overwrite", "--resume and --overwrite contradict"),
     "eval: processes": (f"{EVAL} --processes 0", "--processes must be at least 1"),
     "eval: sequences": (f"{EVAL} --sequences 0", "--sequences must be at least 1"),
     "eval: list": (f"{EVAL} --sequence-list /nowhere.txt", "/nowhere.txt"),

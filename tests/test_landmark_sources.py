@@ -13,7 +13,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.anchors import landmark_source
-from ufmstar_torch.anchors.dense import DenseConfig, DenseEvidence, _pixels
+from ufmstar_torch.anchors.dense import DenseConfig, DenseEvidence
+from ufmstar_torch.anchors.kernels.dense import free_pixels
 from ufmstar_torch.anchors.kernels.windows import LEAST_CONTRAST
 from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
@@ -324,7 +325,7 @@ def test_surfaces_without_fine_texture_are_measured_by_wider_windows():
         where = [v + 150, u + 150 + 200 * T[0, 3] / 2]
         image = np.rint(map_coordinates(texture, where, order=1)).astype(np.uint8)
         found.append(evidence.update(image, T, K))
-        pixel = _pixels(image, 10, np.zeros((0, 2)))
+        pixel = free_pixels(image, 10, np.zeros((0, 2)))
         patch = np.stack([image[y - 4 : y + 4, x - 4 : x + 4].std() for x, y in pixel.astype(int)])
         fine += int((patch > LEAST_CONTRAST).sum())
     depth, sigma = (np.concatenate(x) for x in zip(*((f.depth, np.sqrt(f.variance)) for f in found[4:]), strict=True))

@@ -98,11 +98,11 @@ def test_every_head_on_a_module(frames, tmp_path, head, members, fine_tune):
 
 
 def test_a_training_goes_on_and_starts_another(frames, tmp_path):
-    """Resuming a finished training changes nothing. Its weights can start an ensemble and a network with another
+    """The same training again changes nothing. Its weights can start an ensemble and a network with another
     head."""
     train(Own(), "aleatoric", frames, tmp_path / "a")
     first = (tmp_path / "a" / "trained.safetensors").read_bytes()
-    train(Own(), "aleatoric", frames, tmp_path / "a", resume=True)
+    train(Own(), "aleatoric", frames, tmp_path / "a")
     assert len((tmp_path / "a" / "trained.safetensors").read_bytes()) == len(first)
     start = {"settings": {**QUIET, "init": tmp_path / "a" / "trained.safetensors"}, "max_steps": 1}
     trained = load_network("trained", tmp_path / "a" / "trained.safetensors", backbone=Own())

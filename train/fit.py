@@ -31,12 +31,12 @@ from ufmstar_torch.train.presets import text_table
 from ufmstar_torch.train.settings import Job
 
 
-def fit(job: Job, *, resume: bool = False, overwrite: bool = False, command: Sequence[str] = ()) -> dict[str, Any]:
+def fit(job: Job, *, overwrite: bool = False, command: Sequence[str] = ()) -> dict[str, Any]:
     """Train all members that are not finished, and write OUT/trained.safetensors and OUT/summary.json.
 
     Args:
         job: recipe, data and settings.
-        resume, overwrite: treatment of an earlier training in the folder; see ``folder.open_folder``.
+        overwrite: True to replace an earlier training in the folder, which otherwise continues.
         command: the command line, for the summary.
 
     Returns:
@@ -44,7 +44,7 @@ def fit(job: Job, *, resume: bool = False, overwrite: bool = False, command: Seq
         processes except the first return an empty one.
 
     Raises:
-        FolderError: the folder cannot be used with these options.
+        FolderError: the folder cannot be used.
         NonFiniteLossError: a training has diverged.
         ResumeError: a checkpoint cannot be read.
         KeyboardInterrupt: Ctrl-C or SIGTERM. After this and after other errors, the weights of the checkpoints are
@@ -55,7 +55,7 @@ def fit(job: Job, *, resume: bool = False, overwrite: bool = False, command: Seq
     with quiet_lightning():
         trainer = make_trainer(job, 0)
     first = trainer.is_global_zero
-    folder = open_folder(job, resume=resume, overwrite=overwrite) if first else nullcontext()
+    folder = open_folder(job, overwrite=overwrite) if first else nullcontext()
     with folder, torch.random.fork_rng(devices=range(torch.cuda.device_count())):
         try:
             _meet(trainer, job.settings.out)

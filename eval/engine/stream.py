@@ -26,7 +26,6 @@ from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence,
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.frames.frame import FRAME_FAULTS
 from ufmstar_torch.frames.prediction import DepthPrediction
-from ufmstar_torch.kernels.cpu.check import intrinsics_fault, pose_fault
 
 _CPU = torch.device("cpu")
 
@@ -144,8 +143,10 @@ def _truths(frame: Frame, predictions: Mapping[str, DepthPrediction]) -> dict[st
 
 def require_camera(frame: Frame, K: NDArray[np.float64], size: Size) -> None:
     """Raises FrameError: UfM* cannot use the frame's pose, or intrinsics K [3, 3] [px] of images of ``size`` (h, w)."""
-    pose, tolerance = frame.T_world_cam.tolist(), UfMStarConfig.rotation_tolerance
-    if fault := pose_fault(pose, tolerance) or intrinsics_fault(K.tolist(), *size):
+    from ufmstar_torch.kernels.cpu.check import camera_faults  # kernels compile when they are first needed
+
+    [fault] = camera_faults(frame.T_world_cam[None], K[None], size, UfMStarConfig.rotation_tolerance)
+    if fault:
         raise FrameError(frame.name, FRAME_FAULTS[fault])
 
 

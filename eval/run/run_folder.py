@@ -54,7 +54,6 @@ RUN = FolderKind(
     manifest="run.json",
     format=7,
     lock="run.lock",
-    repeats=True,
     files=(f"{FRAMES}/*.npz", *(f"{f}/*.png" for f in PNGS), "summary.json", RECORDS, *_MADE_AT_END),
     recognise={f"{FRAMES}/*.npz": is_frame, **{f"{folder}/*.png": is_length_png for folder in PNGS}},
     allowed=(CACHE,),
@@ -80,6 +79,7 @@ class RunFolder:
         self.metrics = RunMetrics(load_plugins(job.settings.get("plugin", ())).metrics)
         self.first_maps: FirstMaps = {}
         self._unit: float | None = None  # of the depth PNGs [m per count]
+        RUN.clear(path)  # of an earlier run with the same values
         (path / FRAMES).mkdir(exist_ok=True)
         write_bytes_atomic(path / RECORDS, b"")
 

@@ -20,14 +20,11 @@ from ufmstar_torch.eval.engine.stream import Stopped
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.run.machine import hardware, versions
-from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.suite.job import EvalJob
 from ufmstar_torch.eval.suite.work_items import TOUR, WorkItem
 from ufmstar_torch.frames.warnings import LOGGER
-from ufmstar_torch.posterior.recalibrate import Recalibration
 
 _NO_POSES = "its images have no poses: the rows of networks alone are finished, {} that compare views cannot be had"
-_FITTED = "{} recalibrated rows were fitted to this sequence and are not judged on it"
 
 
 def evaluate_item(
@@ -66,7 +63,7 @@ def evaluate_item(
     except (*BROKEN, OSError) as error:
         return folder.fail(item, error, missing)
     folder.require_same_sequence(item, made_of["sequence"], landmarks)
-    possible = _possible(job.suite.rows, item, sequence)
+    possible = [row for row in job.suite.rows if sequence.posed or row.method.fusion == ALONE]
     todo = [row for row in missing if row in possible]
     left_out = [row for row in missing if row not in possible]
     lines = []
@@ -88,19 +85,10 @@ def evaluate_item(
         frames, seconds = records[0].frames.get("done", 0), time.monotonic() - started
         lines.append(f"{item.label}: {len(todo)} rows, {frames} frames, {seconds:.1f} s")
     if left_out:
-        reason = (_FITTED if sequence.posed else _NO_POSES).format(len(left_out))
-        lines.append(folder.fail(item, reason, left_out))
+        lines.append(folder.fail(item, _NO_POSES.format(len(left_out)), left_out))
     else:
         folder.succeeded(item)
     return "; ".join(lines)
-
-
-def _possible(rows: Sequence[Row], item: WorkItem, sequence: FrameSequence) -> list[Row]:
-    """The rows that can be judged on a sequence: without poses, no row that compares views; and no recalibration that
-    was fitted to it."""
-    files = {row: row.setting.recalibration for row in rows}
-    fitted = {row for row, file in files.items() if file and item.label in Recalibration.from_json(file).sequences}
-    return [row for row in rows if row not in fitted and (sequence.posed or row.method.fusion == ALONE)]
 
 
 def with_references(missing: Sequence[Row], rows: Sequence[Row]) -> list[Row]:

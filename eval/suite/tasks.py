@@ -1,7 +1,7 @@
 """The tasks of an evaluation, one for each sequence, on an executor: processes of this computer, or a Dask cluster.
 
 A task writes its sequence's records into the output folder, which all processes share. Finished records are not
-computed again, so an evaluation that was killed, or that lost its cluster, continues with ``resume``.
+computed again, so an evaluation that was killed, or that lost its cluster, continues with the same command.
 """
 
 from __future__ import annotations
@@ -55,7 +55,6 @@ def evaluate_suite(
     executor: Executor | None = None,
     *,
     threads: int | None = None,
-    resume: bool = False,
     overwrite: bool = False,
     stop: Stop = lambda: False,
     report: Report = lambda _: None,
@@ -69,7 +68,7 @@ def evaluate_suite(
             processes need this package, and all files and the working folder under the paths that they have here.
             Each evaluates one sequence at a time, whatever its number of threads.
         threads: CPU threads of each process of the executor; None = its own choice.
-        resume, overwrite: see ``evaluation_folder``.
+        overwrite: see ``evaluation_folder``.
         stop: called before every frame; True ends the work.
         report: receives a line for every finished sequence.
         progress: called after every frame, with the sequence's label as the stage; with an executor, after every
@@ -82,7 +81,7 @@ def evaluate_suite(
     """
     device = torch.device(device_of(job.device, 0) if executor is None else "cpu")
     networks, folder = job.load(device), job.folder
-    with evaluation_folder(job.out, job.about(networks), resume=resume, overwrite=overwrite), warned_once():
+    with evaluation_folder(job.out, job.about(networks), overwrite=overwrite), warned_once():
         if executor is None:
             finished = _one_by_one(job, job.judge(networks, device), stop, report, progress)
         else:
