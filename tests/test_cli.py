@@ -109,11 +109,11 @@ MISTAKES = {
     "size": ("--depth self --size 24", "--size must be HxW"),
     "plug-in in a configuration": (
         "--depth self --config {plugin}",
-        "--plugin allows code to run: type it on the command line",
+        "plugin allows code to run: type it on the command line",
     ),
     "trust in a configuration": (
         "--depth self --config {trust}",
-        "--trust-code allows code to run: type it on the command line",
+        "trust_code allows code to run: type it on the command line",
     ),
     "trust without a program": (
         "--model fastdepth --weights a --trust-code",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,12 @@ from pages import blocks
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from ufmstar_torch.eval.metrics import NLL, ECEDelta, ECEQuantile, SequenceMetrics, base
+from ufmstar_torch.eval.metrics import NLL, Coverage, ECEDelta, ECEQuantile, SequenceMetrics, base
 from ufmstar_torch.eval.metrics.intervals import GatedPixels, IntervalCoverage
 from ufmstar_torch.eval.metrics.mixture import Mixture
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "evaluation.md"
-KINDS = [*ALL, GatedPixels, IntervalCoverage, Mixture]
+KINDS = [*ALL, Coverage, GatedPixels, IntervalCoverage, Mixture]
 
 
 def frames() -> tuple[Tensor, ...]:
@@ -90,6 +91,19 @@ def test_a_sequence_s_metrics_on_a_device(as_on_a_device, monkeypatch):
     monkeypatch.undo()
     host.update(depth, variance, truth, valid, (inlier, outlier), level)
     assert device.compute() == pytest.approx(host.compute(), rel=1e-9, abs=1e-9, nan_ok=True)
+
+
+def test_coverage_and_width_of_normal_errors():
+    depth, variance, truth = maps(400, 500)
+    for level in (0.5, 0.9):
+        figures = Coverage(level)(depth, variance, truth)
+        assert float(figures["coverage"]) == pytest.approx(level, abs=0.005)
+        width = 2 * torch.special.ndtri(torch.tensor(0.5 + level / 2, dtype=torch.float64)) * variance.sqrt().mean()
+        assert float(figures["interval_width"]) == pytest.approx(float(width), rel=1e-12)
+    nothing = Coverage()(depth, variance, torch.zeros_like(truth))
+    assert math.isnan(nothing["coverage"])
+    with pytest.raises(ValueError, match=r"level must lie in \(0, 1\)"):
+        Coverage(1.0)
 
 
 @pytest.mark.gpu

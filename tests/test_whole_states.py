@@ -119,9 +119,9 @@ DAMAGED = {
     "an image in floats": ("anchored", "landmarks.0.gray", torch.Tensor.double, r"state\['gray'\] must have shape"),
     "a key frame in floats": (
         "dense",
-        "landmarks.0.image0",
+        "landmarks.0.images",
         torch.Tensor.double,
-        r"state\['image0'\] must have shape",
+        r"state\['images'\] must have shape",
     ),
     "depths of infinity": ("dense", "landmarks.0.landmark_sigma", at_end(torch.inf), "landmark_sigma.* must be finite"),
     "a checksum in floats": ("plain", "weights_mark", torch.Tensor.double, "weights_mark must be a whole number"),

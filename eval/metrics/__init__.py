@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from ufmstar_torch.eval.metrics.accuracy import DepthAccuracy as DepthAccuracy
     from ufmstar_torch.eval.metrics.calibration import ECEDelta as ECEDelta
     from ufmstar_torch.eval.metrics.calibration import ECEQuantile as ECEQuantile
+    from ufmstar_torch.eval.metrics.intervals import Coverage as Coverage
     from ufmstar_torch.eval.metrics.likelihood import NLL as NLL
     from ufmstar_torch.eval.metrics.likelihood import EntropyHistogram as EntropyHistogram
     from ufmstar_torch.eval.metrics.ranking import NLLByError as NLLByError

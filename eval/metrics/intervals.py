@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from statistics import NormalDist
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import COUNT, Pixels, Selection, SumMetric, share
+from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, Selection, SumMetric, share
 
 LEVELS = (0.5, 0.9, 0.99)
 _PERCENT = 100  # classes of levels
@@ -46,6 +48,35 @@ class IntervalCoverage(SumMetric):
         named = {f"coverage_{level:.0%}".rstrip("%"): found[round(level * _PERCENT) - 1] for level in LEVELS}
         levels = torch.arange(1, _PERCENT + 1, dtype=torch.float64, device=found.device) / _PERCENT
         return {**named, "coverage_levels": levels, "coverage_found": found}
+
+
+class Coverage(SumMetric):
+    """Coverage and mean width of the central interval of N(d, v) of a level, over the pixels with ground truth.
+
+    ``compute()``: ``coverage``, the share of the pixels whose ground truth lies in the interval, which equals ``level``
+    for a calibrated variance; ``interval_width`` [m]. NaN without a pixel. Of two variances with the right coverage,
+    the one with the narrower intervals says more.
+
+    Args:
+        level: probability of the interval, in (0, 1).
+    """
+
+    OF_VARIANCE = "the coverage"
+    STATES = (("covered", COUNT), ("width", SUM), ("pixels", COUNT))
+
+    def __init__(self, level: float = 0.9, **kwargs: Any) -> None:
+        if not 0 < level < 1:
+            raise ValueError(f"level must lie in (0, 1), got {level}")
+        self.half_width, self.settings = NormalDist().inv_cdf(0.5 + level / 2), {"level": level}
+        super().__init__(**kwargs)
+
+    def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
+        d, v, g = chosen = pixels.judged
+        covered = chosen.number((g - d).square() <= self.half_width**2 * v)
+        return {"covered": covered, "width": chosen.total(2 * self.half_width * v.sqrt()), "pixels": chosen.number()}
+
+    def compute(self) -> dict[str, Tensor]:
+        return {"coverage": share(self.covered, self.pixels), "interval_width": share(self.width, self.pixels)}
 
 
 class GatedPixels(SumMetric):

@@ -20,7 +20,7 @@ from ufmstar_torch.eval.report.quantities import row_labels
 from ufmstar_torch.eval.run.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range
 from ufmstar_torch.eval.run.panels import Bar, GridRow, Panel, draw_grid
 
-STRIP, BREAKDOWN, COMPARE = "strip", "breakdown", "compare"
+OVERVIEW, STRIP, BREAKDOWN, COMPARE = "overview", "strip", "breakdown", "compare"
 MOST_FRAMES = 4  # keeps a report of a hundred sequences readable and small
 _BREAKDOWN_BASES = ("ensemble", "aleatoric")
 # [nats] One scale for all strips, so that they can be compared. 6 is an error of about 3.5 sigma (for sigma = .3 m); a
@@ -48,6 +48,7 @@ def pictures_of(results: Results, folder: Path) -> Iterator[Drawing]:
     labels = {row.slug: label for row, label in row_labels(results.rows).items()}
     examples = [e for key in results.sequences() for e in find_examples(results.folder(*key), *key, labels)]
     chosen = choose(examples, MOST_FRAMES)
+    yield from _overview(results, folder, chosen)
     for e in chosen:
         yield from _of_frame(results, folder, e)
 
@@ -77,6 +78,18 @@ def strip_rows(rows: Sequence[Row], base: str) -> list[Row]:
     return [*alone, *points[:1], *star]
 
 
+def _overview(results: Results, folder: Path, examples: Sequence[Example]) -> Iterator[Drawing]:
+    """The overview of the last frame of the first sequence, if a base has UfM* alone and with a posterior."""
+    first = [e for e in examples if (e.dataset, e.sequence) == (examples[0].dataset, examples[0].sequence)]
+    for e in first[-1:]:
+        shown = [row for row in results.rows if row.slug in e.rows and row.method.fusion == UFM_STAR]
+        for corrected in (row for row in shown if row.setting.posterior):
+            alone = next((row for row in shown if row.method == corrected.method and row.setting.plain), None)
+            if alone is not None:
+                yield f"{e.title}: overview", partial(draw_overview, folder, e, alone.slug, corrected.slug)
+                return
+
+
 def _of_frame(results: Results, folder: Path, e: Example) -> Iterator[Drawing]:
     shown = [row for row in results.rows if row.slug in e.rows]
     strips = {base: strip_rows(shown, base) for base in dict.fromkeys(row.method.base for row in shown)}
@@ -103,6 +116,24 @@ def fit_strip_scales(example: Example, rows: Sequence[str]) -> tuple[ColourScale
     depth = robust_range([example.truth, *(maps.depth for maps in shown)], from_zero=False)
     length = robust_range([m for maps in shown for m in (maps.error, maps.sigma)], from_zero=True)
     return ColourScale(*depth, DEPTH_MAP), ColourScale(*length, ERROR_MAP)
+
+
+def draw_overview(folder: Path, example: Example, plain: str, corrected: str) -> Picture:
+    """The image above the truth; depth, standard deviation and error of UfM* alone above those of the posterior."""
+    rows = (plain, corrected)
+    depth, length = fit_strip_scales(example, rows)
+    body = []
+    first = (Panel(example.image, "image"), Panel(depth.rgb(example.truth), "true depth"))
+    for row, panel, title in zip(rows, first, ("UfM* alone", "posterior"), strict=True):
+        maps = example.rows[row]
+        panels = (depth.rgb(maps.depth), _sigma(maps, length), length.rgb(maps.error))
+        captions = ("depth", "standard deviation σ", "true error")
+        body.append(GridRow(title, figures_of(maps), [panel, *map(Panel, panels, captions)]))
+    bars = [Bar("depth [m]", depth, 0, span=2), Bar("σ and error [m]", length, 2, span=2)]
+    name = file_name(OVERVIEW, example.dataset, example.sequence, example.frame)
+    draw_grid(folder / name, body, bars, aspect=example.aspect)
+    caption = "A good standard deviation looks like the error beside it. Above: the network's depth; below: corrected."
+    return Picture(name, f"{example.title}: UfM* alone and with the posterior", caption)
 
 
 def draw_strip(folder: Path, example: Example, rows: Sequence[str], base: str) -> Picture:
