@@ -187,8 +187,8 @@ def pair_by_name(names: Sequence[str], files: Iterable[Path]) -> dict[str, Path]
 
 
 def pair_depth(names: Sequence[str], folder: Path) -> dict[str, Path]:
-    """The depth maps of a folder by frame name. A folder with other files alone is logged. Raises ValueError: no map has
-    a partner."""
+    """The depth maps of a folder by frame name; one with other files alone is logged. Raises ValueError: no map has a
+    partner."""
     files = list_files(folder, DEPTH_SUFFIXES)
     if not files and (other := next((path.name for path in folder.iterdir() if not is_hidden(path)), None)):
         LOGGER.warning("%s holds no depth map (%s), but %s: it is left out", folder, ", ".join(DEPTH_SUFFIXES), other)
