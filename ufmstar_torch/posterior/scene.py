@@ -15,10 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, part
-from ufmstar_torch.posterior.cells import cell_means, highest_over_lowest
+from ufmstar_torch.kernels.compile_cpu import empty, leaf, part
+from ufmstar_torch.posterior.cells import cell_means, highest_over_lowest, windows_around
 from ufmstar_torch.posterior.field import Observed, Prior, at, conditioned, distance, invert
-from ufmstar_torch.posterior.nodes import windows_around
 from ufmstar_torch.posterior.running import FEATURES, Floats
 
 # Largest number of nodes in a row and in a column (the field's window allows 31 in a row).
@@ -96,7 +95,7 @@ class LeftOut(NamedTuple):
     total: Floats
 
 
-@kernel
+@part
 def grid_of(logs, valid, rows, cols, config):
     """The :class:`Grid` of log d [H, W], which is read where ``valid`` [H, W]."""
     log_depth, n, total = cell_means(logs, valid, rows, cols), rows * cols, 0.0
@@ -121,7 +120,7 @@ def features(log_depth, u, v, x, k):
 @part
 def _scene_of(grid, depth, valid, anchors, ratios, expected, config):
     """The :class:`Scene` of the :class:`AnchorRows` of a frame of depth d [H, W] [m]. ``ratios`` and ``expected``
-    (``Running.expected``) are those of the frames before."""
+    (``running.expected``) are those of the frames before."""
     N, k, n = 0, 0, grid.log_depth.size
     for i in range(anchors.valid.size):
         N += anchors.valid[i]
