@@ -69,7 +69,7 @@ def surfaces(scene, b, memory, priors, ratios, config, sums):
         config: of the posterior.
         sums: changed.
     """
-    nu, s2, mean = config.degrees_of_freedom, ratios.between, ratios.centre
+    nu, s2, mean = config.degrees_of_freedom, ratios[BETWEEN], ratios[CENTRE]
     variance = _CHANGE**2 if memory.frames[0] > 0 else config.prior_sigma**2
     y = _at_nodes(scene, b)
     if not y.size:

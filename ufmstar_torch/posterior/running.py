@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -42,21 +42,7 @@ LEAST_FACTOR, LARGEST_FACTOR = 0.1, 10.0
 LARGEST_LOG, LARGEST = 14.0, 1e9
 
 
-class Ratios(NamedTuple):
-    """The ratios by name; for each, a number or what belongs to it."""
-
-    amplitude: Any
-    roughness: Any
-    noise: Any
-    unseen: Any
-    wrong: Any
-    inlier: Any
-    between: Any
-    centre: Any
-    calibration: Any
-
-
-RATIOS = len(Ratios._fields)
+RATIOS = 9
 AMPLITUDE, ROUGHNESS, NOISE, UNSEEN, WRONG, INLIER, BETWEEN, CENTRE, CALIBRATION = range(RATIOS)
 
 
@@ -65,18 +51,18 @@ def priors(config: PosteriorConfig) -> Floats:
     """[4, R] value and weight [anchors] of each ratio's prior, and the limits of the ratio. The calibration has no
     prior."""
     weight = config.prior_weight
-    columns = Ratios(
-        amplitude=(1.0, weight, 0.1, 100.0),
-        roughness=(config.roughness**2, weight, 0.01**2, 0.2**2),
-        noise=(1.0, weight, 0.25, 16.0),
-        unseen=(config.unseen, weight, 0.0, 16.0),
-        wrong=(config.wrong, weight, config.wrong / 10, 10 * config.wrong),
-        inlier=(1.0, weight, 0.05, 4.0),
-        between=(config.between**2, weight, 0.03**2, 1.0),
-        centre=(0.0, 0.0, -LARGEST_LOG, LARGEST_LOG),
-        calibration=(0.0, 0.0, 0.0, 1e6),
-    )
-    return np.ascontiguousarray(np.array(columns).T)
+    columns = {
+        AMPLITUDE: (1.0, weight, 0.1, 100.0),
+        ROUGHNESS: (config.roughness**2, weight, 0.01**2, 0.2**2),
+        NOISE: (1.0, weight, 0.25, 16.0),
+        UNSEEN: (config.unseen, weight, 0.0, 16.0),
+        WRONG: (config.wrong, weight, config.wrong / 10, 10 * config.wrong),
+        INLIER: (1.0, weight, 0.05, 4.0),
+        BETWEEN: (config.between**2, weight, 0.03**2, 1.0),
+        CENTRE: (0.0, 0.0, -LARGEST_LOG, LARGEST_LOG),
+        CALIBRATION: (0.0, 0.0, 0.0, 1e6),
+    }
+    return np.ascontiguousarray(np.array([columns[ratio] for ratio in range(RATIOS)]).T)
 
 
 SIZE = 2 + 2 * RATIOS + SLOPES + FEATURES + _MATRIX + 1 + len(LEVELS)
@@ -142,20 +128,12 @@ def _before(memory, priors, ratio):
 
 
 @leaf
-def _ratio(memory, priors, ratio):
-    above, below = _before(memory, priors, ratio)
-    value = above / max(below, 1e-12) if below > 0 else priors[0, ratio]
-    return min(max(value, priors[2, ratio]), priors[3, ratio])
-
-
-@leaf
-def ratios_of(memory, priors):
-    """The :class:`Ratios` of a :class:`Memory`, within their limits; ``priors`` [4, R] of :func:`priors`."""
-    return Ratios(
-        _ratio(memory, priors, AMPLITUDE), _ratio(memory, priors, ROUGHNESS), _ratio(memory, priors, NOISE),
-        _ratio(memory, priors, UNSEEN), _ratio(memory, priors, WRONG), _ratio(memory, priors, INLIER),
-        _ratio(memory, priors, BETWEEN), _ratio(memory, priors, CENTRE), _ratio(memory, priors, CALIBRATION),
-    )  # fmt: skip
+def write_ratios(memory, priors, out):
+    """Write the ratios [R] of a :class:`Memory`, within their limits; ``priors`` [4, R] of :func:`priors`."""
+    for ratio in range(RATIOS):
+        above, below = _before(memory, priors, ratio)
+        value = above / max(below, 1e-12) if below > 0 else priors[0, ratio]
+        out[ratio] = min(max(value, priors[2, ratio]), priors[3, ratio])
 
 
 @leaf

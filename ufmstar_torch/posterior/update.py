@@ -92,16 +92,21 @@ from ufmstar_torch.posterior.learn import sums_of
 from ufmstar_torch.posterior.moments import divide, second_moments
 from ufmstar_torch.posterior.motion import finite, in_image, probability, surfaces, tests_at
 from ufmstar_torch.posterior.running import (
+    BETWEEN,
     CALIBRATION,
     FEATURES,
+    RATIOS,
+    ROUGHNESS,
+    UNSEEN,
+    WRONG,
     Floats,
     drift,
     expected,
     learn,
     priors,
-    ratios_of,
     restart,
     views,
+    write_ratios,
 )
 from ufmstar_torch.posterior.scene import (
     MOST_WRONG,
@@ -236,7 +241,8 @@ def of_frame(memory, maps, anchors, motion, wrong, priors, config, outputs, show
     depth, valid, logs, _ = maps
     if wrong:
         restart(memory, config)
-    ratios, frames = ratios_of(memory, priors), memory.frames[0]
+    ratios, frames = empty(RATIOS, np.float64), memory.frames[0]
+    write_ratios(memory, priors, ratios)
     grid = grid_of(logs, valid, min(SIDE, depth.shape[0]), min(SIDE, depth.shape[1]), config)
     before = expected(memory, grid.mean, config)
     scene, field, left_out, weight, away = fitted(grid, depth, valid, anchors, ratios, before, config)
@@ -250,7 +256,7 @@ def of_frame(memory, maps, anchors, motion, wrong, priors, config, outputs, show
     elif frames > 0 and _any(valid):
         b, covariance = expected(memory, grid.mean, config)
         drift(memory, grid.mean, b, covariance, config)
-    ratios = ratios_of(memory, priors)
+    write_ratios(memory, priors, ratios)
     nodes, x, mean, wide = _nodes(scene, field, left_out, away, ratios, config)
     _add_motion(nodes, x, mean, c, wide, motion, depth.shape, scene, field.coefficients, ratios, config)
     slopes = empty(FEATURES - 1, np.float64)
@@ -260,8 +266,8 @@ def of_frame(memory, maps, anchors, motion, wrong, priors, config, outputs, show
         nodes[1, i] += slopes_away(config, x, i, away[i], slopes)
     divide(nodes[2], nodes[3], nodes[4])
     interpolate(maps, nodes, field.coefficients, grid, config, outputs)
-    shown[0] = ratios.calibration if memory.sums[1, CALIBRATION] > 0 else np.nan
-    shown[1] = ratios.unseen
+    shown[0] = ratios[CALIBRATION] if memory.sums[1, CALIBRATION] > 0 else np.nan
+    shown[1] = ratios[UNSEEN]
     quantiles(memory.intervals, shown, 2)
 
 
@@ -294,9 +300,9 @@ def _nodes(scene, field, left_out, away, ratios, config):
         offset = mean
         for f in range(FEATURES):
             offset -= x[i, f] * b[f]
-        unseen, factor = away[i] * ratios.unseen, inlier_factor(config, ratios, away[i])
-        variance = at_pixels(config, factor, variance, ratios.roughness, unseen, steep[i], share)
-        p = min(ratios.wrong * wrong_factor(config, away[i], scales[i]), MOST_WRONG)
+        unseen, factor = away[i] * ratios[UNSEEN], inlier_factor(config, ratios, away[i])
+        variance = at_pixels(config, factor, variance, ratios[ROUGHNESS], unseen, steep[i], share)
+        p = min(ratios[WRONG] * wrong_factor(config, away[i], scales[i]), MOST_WRONG)
         p, wide = misscaled(config, share, p, elsewhere_variance(config, around[i], unseen))
         means[i], wides[i], nodes[0, i], nodes[1, i] = mean, wide, grid.log_depth[i], offset
         nodes[2, i], nodes[3, i] = second_moments(config, scales[i] * variance, p, offset, wide)
@@ -326,7 +332,7 @@ def _add_motion(nodes, x, mean, c, wide, motion, size, scene, b, ratios, config)
     for i in range(e.size):
         e[i] = mean[i] - c - in_image(x, i, b)
     tests = tests_at(motion, size[0], size[1], grid.rows, grid.cols)
-    P = probability(e, grid.log_depth, nodes[5], tests, ratios.between, grid.rows, grid.cols)
+    P = probability(e, grid.log_depth, nodes[5], tests, ratios[BETWEEN], grid.rows, grid.cols)
     for i in range(e.size):
         if P[i] > 0:
             tail = second_moments(config, nodes[2, i], 1.0, e[i], wide[i])[0]
