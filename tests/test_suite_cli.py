@@ -44,8 +44,9 @@ def test_an_evaluation_ends_with_its_table_and_report(ufmstar, rooms, tmp_path):
     assert err.count("rooms/") == 3
     about = json.loads((out / "eval.json").read_text())
     assert about["settings"] == {"frames": [0, 2, None]}
-    code, again, err = ufmstar(*words_for(rooms, out, "--frames", "0:2", "--examples", "1"))
-    assert (code, again, "rooms/" in err) == (0, text, False), "the same command computes nothing again"
+    code, again, err = ufmstar(*words_for(rooms, out, "--frames", "0:2", "--no-report"))
+    assert (code, "rooms/" in err) == (0, False), "the same command computes nothing again"
+    assert text.startswith(again)
     code, _, err = ufmstar(*words_for(rooms, out))
     assert code == 2
     assert "settings.frames was [0, 2, null], now [null, null, null]" in err

@@ -9,14 +9,13 @@ from typing import Any
 
 import torch
 
-from ufmstar_torch.eval.engine.evaluate import Judge
 from ufmstar_torch.eval.engine.load import NetworkChoice
-from ufmstar_torch.eval.engine.predictions import DepthSource, PredictionCache
+from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.method import FUSIONS
 from ufmstar_torch.eval.methods.suite import Suite
 from ufmstar_torch.eval.run.machine import hardware, versions
 from ufmstar_torch.eval.sequences.plugins import load_plugins
-from ufmstar_torch.eval.suite.folder import CACHE, EvalFolder
+from ufmstar_torch.eval.suite.folder import EvalFolder
 from ufmstar_torch.eval.suite.work_items import WorkItem
 from ufmstar_torch.models.inference import Inference
 
@@ -57,11 +56,6 @@ class EvalJob:
         needed = [self.networks[base] for base in self.suite.bases if base in self.networks]
         inference = Inference(self.runtime, self.precision)
         return {choice.base: choice.load(device, samples=self.samples, inference=inference) for choice in needed}
-
-    def judge(self, networks: Mapping[str, DepthSource], device: torch.device) -> Judge:
-        """The judge with the loaded networks. Raises CacheError: the folder of predictions cannot be written."""
-        store = PredictionCache(self.cache or self.out / CACHE)
-        return Judge(networks, device, store, self.frames, self.bins, load_plugins(self.plugin))
 
     def about(self, networks: Mapping[str, DepthSource]) -> dict[str, Any]:
         """The content of eval.json."""
