@@ -170,7 +170,7 @@ MISTAKES = {
     "eval: nothing": ("ufmstar eval", "--suite is missing"),
     "eval: no network": ("ufmstar eval --suite depth-only --root x --out o", "--network is missing"),
     "eval: no file": (f"{EVAL} --suite /nowhere/mine.toml", "/nowhere/mine.toml"),
-    "eval: base twice": (f"{EVAL} --network depth_only=ground-truth", "time and energy, got depth_only, depth_only"),
+    "eval: base twice": (f"{EVAL} --network depth_only=ground-truth", "every base once, got depth_only twice"),
     "eval: spec": (f"{EVAL} --network depth_only=torchscript:n.ts --spec s", "--spec must be a file *.json"),
     "eval: no root": (f"{EVAL} --root /nowhere", "no such file or folder: /nowhere"),
     "eval: frames": (f"{EVAL} --root /nowhere --frames 5", "--frames must be START:STOP"),
@@ -211,7 +211,7 @@ def test_debug_shows_the_traceback(ufmstar, tmp_path):
 @pytest.mark.parametrize(
     ("words", "unbuffered"),
     [(["--help"], ""), (["--help"], "1"), (["run", "--help"], "1"), (["eval", "--list"], ""),
-     (["data", "check", "{path}"], "")],
+     pytest.param(["data", "check", "{path}"], "", marks=pytest.mark.slow)],
 )  # fmt: skip
 def test_a_reader_that_closes_the_output_ends_the_command_quietly(words, unbuffered, path):
     """As ``ufmstar eval --list | head -1`` does."""

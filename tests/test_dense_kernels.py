@@ -8,7 +8,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from ufmstar_torch.anchors.dense_keyframes import Keyframes
+from ufmstar_torch.anchors.dense_keyframes import Keyframes, halved
 from ufmstar_torch.anchors.kernels import dense as dense_cpu
 from ufmstar_torch.anchors.kernels.dense import ACROSS, Search, Views, free_pixels, measure
 from ufmstar_torch.anchors.kernels.landmarks import Columns, Sighted, settle, sight
@@ -43,7 +43,8 @@ def pose(x=0.0, y=0.0, z=0.0, turned=(0.0, 0.0, 0.0)):
 def views(images, poses, T, noise=0.0):
     H = np.stack([K @ p[:3, :3].T @ T[:3, :3] @ np.linalg.inv(K) for p in poses])
     b = np.stack([K @ p[:3, :3].T @ (T[:3, 3] - p[:3, 3]) for p in poses])
-    return Views(np.stack(images), H, b, np.full(len(poses), noise))
+    each = np.arange(len(poses))
+    return Views(np.stack(images), each, each, H, b, np.full(len(poses), noise))
 
 
 MOVED = [pose(0.06, 0.01), pose(0.16, -0.03, 0.02, (0.01, -0.02, 0.03)), pose(0.35, 0.02, -0.05, (0.0, 0.03, -0.05))]
@@ -252,17 +253,64 @@ def test_a_search_along_the_last_row_reads_nothing_beyond_the_image():
 def test_images_of_half_the_size_are_those_of_the_stored_keyframes():
     """Also when the ring has replaced an image, when a state is loaded, and when images have another size."""
     keyframes, states = Keyframes(2), []
+
+    def stored_values():
+        return [(int(keyframes._image[i, 0, 0]), int(keyframes._half[i, 0, 0])) for i in range(3)]
+
     for i in range(4):
-        T = np.eye(4)
-        T[0, 3] = i
-        keyframes.add(np.full((8, 8), 10 * i, np.uint8), T, 2.0, i)
-        assert keyframes.halves(np.array([i % 2]))[0, 0, 0] == 10 * i
+        image = np.full((8, 8), 10 * i, np.uint8)
+        keyframes.add(image, halved(image), pose(x=i), 2.0, i)
         states.append(keyframes.state())
+    assert stored_values() == [(30, 30), (10, 10), (20, 20)]
     keyframes.load_state(states[1])
-    assert keyframes.halves(np.arange(2))[:, 0, 0].tolist() == [0, 10]
+    assert stored_values() == [(0, 0), (10, 10), (0, 0)]
     keyframes.reset()
-    keyframes.add(np.full((6, 6), 7, np.uint8), np.eye(4), 2.0, 0)
-    assert keyframes.halves(np.array([0])).tolist() == [[[7] * 3] * 3]
+    image = np.full((6, 6), 7, np.uint8)
+    keyframes.add(image, halved(image), np.eye(4), 2.0, 0)
+    assert keyframes._half[0].tolist() == [[7] * 3] * 3
+
+
+def test_a_new_keyframe_leaves_those_of_the_state_before_unchanged():
+    keyframes = Keyframes(3)
+    for i in range(9):
+        state, snapshot = keyframes.state(), keyframes.snapshot()
+        image = np.full((8, 8), 10 * i, np.uint8)
+        keyframes.add(image, halved(image), pose(x=i), 2.0, i)
+        assert keyframes._added == i + 1
+        keyframes.restore(snapshot)
+        if i > 0:
+            newest = [(i - 1 - k) % 4 for k in range(min(i, 3))]
+            np.testing.assert_array_equal(keyframes._image[newest], state["images"][newest])
+            assert all(
+                np.array_equal(state[name], value) for name, value in keyframes.state().items() if name != "images"
+            )
+        keyframes.add(image, halved(image), pose(x=i), 2.0, i)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_keyframes_are_chosen_by_baseline_and_overlap(seed):
+    """A ring of 7 of 10 keyframes on a way, some of which look elsewhere."""
+    rng, keyframes, poses = np.random.default_rng(seed), Keyframes(7), []
+    for i in range(10):
+        turned = rng.normal([0, 1.5 * (i % 4 == 1), 0], 0.02)
+        poses.append(pose(0.12 * i + rng.uniform(0, 0.02), rng.normal(0, 0.01), rng.normal(0, 0.01), turned))
+        keyframes.add(np.zeros((72, 96), np.uint8), np.zeros((36, 48), np.uint8), poses[-1], 2.0, i)
+    baselines, T = np.array([0.04, 0.1, 0.22, 0.45]), pose(1.2, 0.03, 0.02, (0.01, 0.02, -0.01))
+    views, half, longest = keyframes.compared(T, K, 2.0, baselines)
+    expected = oracle_dense.chosen(poses[3:], T, K, (72, 96), 2.0, baselines)
+    assert [(int(s), int(n)) for s, n in zip(views.share, views.slot, strict=True)] == [
+        (s, (n + 3) % 8) for s, n in expected
+    ]
+    assert len(expected) >= 2
+    assert longest == pytest.approx(np.linalg.norm(poses[3 + expected[-1][1]][:3, 3] - T[:3, 3]))
+    for k, (_, n) in enumerate(expected):
+        relative = np.linalg.inv(poses[n + 3]) @ T
+        np.testing.assert_allclose(views.H[k], K @ relative[:3, :3] @ np.linalg.inv(K), atol=1e-9)
+        np.testing.assert_allclose(views.b[k], K @ relative[:3, 3], atol=1e-9)
+        for u in rng.uniform(0, 90, (5, 2)):
+            at = oracle_dense.project(2 * u + 0.5, 0.5, views.H[k], views.b[k])
+            fine = oracle_dense.project(u, 0.5, half.H[k], half.b[k])
+            np.testing.assert_allclose(2 * fine + 0.5, at, atol=1e-9)
 
 
 def measured_again(rho, variance=0.005**2, storable=True, frame=3):

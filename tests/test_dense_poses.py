@@ -13,7 +13,6 @@ from ufmstar_torch.anchors.kernels.dense import Measured, Views
 from ufmstar_torch.anchors.kernels.poses import linearised, rotated, solve
 
 K = np.array([[250.0, 0, 159.5], [0, 252.0, 119.5], [0, 0, 1]])
-SHARES = np.arange(3)
 
 
 def scene(seed, count=40, moved=0.3):
@@ -22,7 +21,8 @@ def scene(seed, count=40, moved=0.3):
     pixel, rho = rng.uniform([10, 10], [310, 230], (count, 2)), rng.uniform(0.3, 1.2, count)
     R = Rotation.from_rotvec(rng.normal(0, 0.05, (3, 3))).as_matrix()
     t = rng.normal(0, moved, (3, 3)) * np.array([[0.2], [0.5], [1]])
-    return pixel, rho, Views(np.zeros((3, 240, 320), np.uint8), K @ R @ np.linalg.inv(K), t @ K.T, np.zeros(3))
+    H, image = K @ R @ np.linalg.inv(K), np.zeros((3, 240, 320), np.uint8)
+    return pixel, rho, Views(image, np.arange(3), np.arange(3), H, t @ K.T, np.zeros(3))
 
 
 def lines(pixel, rho, views):
@@ -55,7 +55,7 @@ def measured(pixel, rho, views, error, noise, rng):
 
 def corrected(errors, pixel, found, views, trusted=True):
     """Inverse depths, their variances and the distances from the lines after a frame, all pixels accepted."""
-    return errors.corrected(pixel, np.ones(len(pixel), np.bool_), found, views, SHARES, K, 2.0, trusted)
+    return errors.corrected(pixel, np.ones(len(pixel), np.bool_), found, views, K, 2.0, trusted)
 
 
 def test_derivatives_agree_with_differences():

@@ -61,7 +61,7 @@ def test_the_real_judge_gives_what_it_gives_when_called_alone(rooms, tmp_path):
     go(job, evaluate_sequence)
     networks = job.load(torch.device("cpu"))
     for item in job.items:
-        for slug, result in evaluate(item.open(), job.suite.rows, networks, limit=job.frames).items():
+        for slug, result in evaluate(item.open(), job.suite.rows, networks, frames=job.frames).items():
             record = job.folder.records(item)[slug]
             assert record.frames["done"] == 2
             assert {k: v for k, v in record.figures.items() if v is not None} == {

@@ -183,8 +183,9 @@ def test_a_loss_that_is_not_finite_names_its_step_and_loses_nothing(
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["stopped"] == "failed"
     assert [(m["steps"], m["finished"]) for m in summary["members"]] == [(6, True), (3, False)]
-    monkeypatch.undo()
-    assert fit(job)["stopped"] is None
+    if average:  # once is enough
+        monkeypatch.undo()
+        assert fit(job)["stopped"] is None
 
 
 def test_a_gradient_that_is_not_finite_is_found_before_a_checkpoint(frames, tmp_path, monkeypatch):

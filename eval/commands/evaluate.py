@@ -52,10 +52,7 @@ class SuiteOptions:
         base: A figure or ablation is about this network instead of the paper's: depth_only, ...
         ufm_preset: All rows of UfM* start from the paper's settings (UfMStarConfig.paper) or ours, not the suite's.
         network: Name a network for every base as BASE=MODEL:FILE[,FILE...]; rows without one are left out; repeatable.
-            A FILE.json is its spec, --spec that of all others. With paper-table-1, -2 and -4 a base may have a second
-            one, whose time, energy and memory are measured as well.
-        recalibration: Judge the row of this file of `ufmstar recalibrate` also under it, as a row of its own, on
-            sequences other than those that it was fitted to; repeatable.
+            A FILE.json is its spec, --spec that of all others.
         list: Show the suites and stop.
     """
 
@@ -63,7 +60,6 @@ class SuiteOptions:
     base: Text = None
     ufm_preset: Annotated[Literal["paper", "default"] | None, one_of("paper", "default")] = None
     network: Words = ()
-    recalibration: Words = ()
     list: Flag = False
 
 
@@ -175,22 +171,18 @@ def job_from(options: EvalOptions) -> EvalJob:
     """The job of the options. Opens no sequence. Raises FileNotFoundError, ValueError: a file does not exist, options
     contradict each other, a base is named twice, no row has a network, or there is no sequence."""
     from ufmstar_torch.eval.engine.load import NetworkChoice
-    from ufmstar_torch.eval.suite.job import EvalJob, require_methods, with_recalibrations
+    from ufmstar_torch.eval.suite.job import EvalJob, require_methods
     from ufmstar_torch.eval.suite.work_items import find_work, read_names
 
     what, data, output, values = options.what, options.data, options.output, as_dict(options)
-    suite = with_recalibrations(suite_named(str(what.suite), what.base, what.ufm_preset), joined(what.recalibration))
+    suite = suite_named(str(what.suite), what.base, what.ufm_preset)
     require_methods(suite, options.opening.plugin)
-    architectures: list[dict[str, NetworkChoice]] = [{}]
-    for text in joined(what.network):  # a base's n-th network belongs to the n-th architecture
+    networks: dict[str, NetworkChoice] = {}
+    for text in joined(what.network):
         choice = replace(NetworkChoice.parse(text).with_spec(values["spec"]), trust_code=values["trust_code"])
-        number = sum(choice.base in architecture for architecture in architectures)
-        architectures += [{}] if number == len(architectures) else []
-        architectures[number][choice.base] = choice
-    networks, *further = architectures
-    if further and not suite.efficiency:
-        bases = ", ".join(text.partition("=")[0] for text in joined(what.network))
-        raise ValueError(f"--network: every base once, but in a suite that measures time and energy, got {bases}")
+        if choice.base in networks:
+            raise ValueError(f"--network: every base once, got {choice.base} twice: evaluate each into its own --out")
+        networks[choice.base] = choice
     only = None if data.sequence_list is None else read_names(Path(data.sequence_list))
     items = find_work(
         joined(data.root), sample=data.sequences, seed=data.seed, only=only, opening=options.opening.of_reader
@@ -198,7 +190,6 @@ def job_from(options: EvalOptions) -> EvalJob:
     return EvalJob(
         suite=suite.with_bases(networks) if networks else suite,
         networks=networks,
-        further=tuple(further),
         items=tuple(items),
         out=Path(str(output.out)),
         missing_bases=tuple(base for base in suite.bases if base not in networks),

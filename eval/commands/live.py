@@ -244,7 +244,7 @@ def _model(options: LiveOptions) -> UncertainDepth:
         posterior=options.uncertainty.posterior,
         samples=source.passes if len(source.networks) == 1 and chosen.mode == "full" else None,
         anchors=None if anchors is None else landmarks_of(anchors, None),
-        recalibration=options.uncertainty.load_recalibration(config, chosen.weights, source),
+        recalibration=options.uncertainty.load_recalibration(config, source),
         check_poses=0 if options.recorded else 40,  # those of a recording are compared before
         multiview_device="cpu",  # for one camera faster than a GPU
     ).to(options.device)

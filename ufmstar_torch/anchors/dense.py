@@ -29,14 +29,13 @@ from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, OtherCameraErro
 from ufmstar_torch.anchors.motion import LANDMARK, LINE, OFF_LINE, SEARCH, MotionTests, Tested, located, moves
 from ufmstar_torch.anchors.saved_state import POSITIVE, SavedState
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
-from ufmstar_torch.gaussians.camera import inverse_intrinsics
 from ufmstar_torch.runtime.checked import Checked, number
 
 if TYPE_CHECKING:
     from ufmstar_torch.anchors.kernels.dense import Search, Views
 
 # Baselines of the keyframes with which a frame is compared, as shares of the median depth.
-_BASELINES = (0.04, 0.1, 0.22, 0.45)
+_BASELINES = np.array([0.04, 0.1, 0.22, 0.45])
 # Range of the first search of inverse depth, over 1/median depth.
 _NEAREST, _FARTHEST = 6.0, -0.03
 # Least number of anchors for an update of the running estimates.
@@ -45,9 +44,6 @@ _ENOUGH = 10
 _JUMPED = 3
 # Variance of a match of the wide windows over that computed from its residual; 2 to 4 on tours.
 _COARSE_NOISE = 4.0
-# Mapping of pixels to those of an image of half the size, and back.
-_HALVED = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
-_DOUBLED = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1]])
 _CORNERS = "corners_"  # prefix of the names of the tracker's state
 
 
@@ -105,20 +101,6 @@ class Depths(NamedTuple):
     pixel: NDArray[np.float64]
     rho: NDArray[np.float64]
     variance: NDArray[np.float64]
-
-
-class Compared(NamedTuple):
-    """V keyframes that a frame is compared with.
-
-    Attributes:
-        views: with the mapping of the frame's pixels to theirs.
-        shares: [V] indices of their baselines.
-        half: [V, H // 2, W // 2] their images at half the size.
-    """
-
-    views: Views
-    shares: NDArray[np.int64]
-    half: NDArray[np.uint8]
 
 
 class DenseEvidence(SavedState):
@@ -217,10 +199,11 @@ class DenseEvidence(SavedState):
         self._keyframes.correct(number, poses)
         if self._tracker.jumped:
             self._forget()
-        result = self._measured(small, scale, T, scale @ K, corners)
+        half = halved(small)
+        result = self._measured(small, half, scale, T, scale @ K, corners)
         if self._contradicted >= _JUMPED:
             self._forget()
-        self._keyframes.add(small, T, self._depth, int(number.max()))
+        self._keyframes.add(small, half, T, self._depth, int(number.max()))
         return result
 
     def _forget(self) -> None:
@@ -230,9 +213,16 @@ class DenseEvidence(SavedState):
         self._memory.forget()
 
     def _measured(
-        self, small: NDArray[np.uint8], scale: NDArray, T: NDArray, K: NDArray, corners: Landmarks
+        self,
+        small: NDArray[np.uint8],
+        half: NDArray[np.uint8],
+        scale: NDArray,
+        T: NDArray,
+        K: NDArray,
+        corners: Landmarks,
     ) -> Landmarks:
-        """Measure the depths in a reduced image, and add corners where there are none."""
+        """Measure the depths in a reduced image, and add corners where there are none. ``half`` is the image at half
+        the size."""
         from ufmstar_torch.anchors.kernels.check import check_anchors  # kernels compile when they are first needed
 
         cell, K = _cell(small.shape[1]), self._errors.camera(K)
@@ -242,7 +232,7 @@ class DenseEvidence(SavedState):
         found, searched, trusted, tested, disagree = self._in_cells(small, T, K, cell, compared, trusted)
         self._contradicted = 0 if trusted else self._contradicted + 1
         if compared is not None and trusted:
-            coarse = self._coarse(small, found.pixel, compared, cell)
+            coarse = self._coarse(small, half, found.pixel, compared[1], cell)
             found = Depths(*(np.concatenate(pair) for pair in zip(found, coarse, strict=True)))
         ratios = self._motion.log_ratios(tested, small.shape, cell) if trusted else None
         moving = np.zeros(len(found.pixel), np.bool_) if ratios is None else moves(ratios, found.pixel, cell)
@@ -269,7 +259,7 @@ class DenseEvidence(SavedState):
         T: NDArray,
         K: NDArray,
         cell: int,
-        compared: Compared | None,
+        compared: tuple[Views, Views] | None,
         trusted: bool,
     ) -> tuple[Depths, int, bool, Tested, int]:
         """Measure visible landmarks again where the camera has moved, and new pixels in the cells without a landmark.
@@ -290,13 +280,11 @@ class DenseEvidence(SavedState):
             measured = np.zeros(searched, np.int64), np.zeros(searched, np.bool_), *np.zeros((2, searched))
             searched = disagree = 0
         else:
-            views, shares, _ = compared
-            self._baseline = float(np.linalg.norm(inverse_intrinsics(K) @ views.b[-1]))
             pixel = sighted.pixel[sighted.searched]
-            matches = measure(small, pixel, views, self._search())
+            matches = measure(small, pixel, compared[0], self._search())
             accepted, (several, reliable, disagree) = confirmed(pixel, matches, cell)
             trusted = several < _ENOUGH or reliable >= self.config.min_share * several
-            arguments = matches, views, shares, K, self._depth, trusted
+            arguments = matches, compared[0], K, self._depth, trusted
             rho, variance, off_line = self._errors.corrected(pixel, accepted, *arguments)
             measured = matches.agreed, accepted, rho, variance
             seen, on_line = matches.shown > 1, np.isfinite(off_line)
@@ -306,7 +294,14 @@ class DenseEvidence(SavedState):
         depths = Depths(sighted.pixel[:found], sighted.rho[:found], sighted.variance[:found])
         return depths, count + searched, trusted, Tested.of(*tests), disagree + refuted
 
-    def _coarse(self, small: NDArray[np.uint8], occupied: NDArray[np.float64], compared: Compared, cell: int) -> Depths:
+    def _coarse(
+        self,
+        small: NDArray[np.uint8],
+        half: NDArray[np.uint8],
+        occupied: NDArray[np.float64],
+        views: Views,
+        cell: int,
+    ) -> Depths:
         """Search the cells without a pixel of ``occupied`` [N, 2] with windows of twice the width, in images of half
         the size.
 
@@ -314,15 +309,12 @@ class DenseEvidence(SavedState):
         matched.
         """
         from ufmstar_torch.anchors.kernels.check import confirmed
-        from ufmstar_torch.anchors.kernels.dense import Views, free_pixels, measure
+        from ufmstar_torch.anchors.kernels.dense import free_pixels, measure
         from ufmstar_torch.anchors.kernels.landmarks import SCALE
         from ufmstar_torch.anchors.kernels.windows import MARGIN
 
-        half, (views, _, images) = halved(small), compared
-        H, b = _HALVED @ views.H @ _DOUBLED, views.b @ _HALVED.T
-        reduced = Views(images, np.ascontiguousarray(H), np.ascontiguousarray(b), views.noise / 4)
         pixel = free_pixels(half, cell // 2, (occupied - 0.5) / 2)
-        found = measure(half, pixel, reduced, self._search())
+        found = measure(half, pixel, views, self._search())
         variance = _COARSE_NOISE * found.variance + np.square(SCALE * found.rho)
         fine = confirmed(pixel, found, cell // 2)[0] & (found.rho > np.sqrt(variance))
         matched = 2 * (pixel[fine] + found.centre[fine]) + 0.5
@@ -346,21 +338,16 @@ class DenseEvidence(SavedState):
         accepted = config.sigmas, config.least_score, config.rival, config.match_noise
         return Search(rho, _FARTHEST * rho, _NEAREST * rho, *accepted)
 
-    def _compared(self, T: NDArray, K: NDArray, width: int) -> Compared | None:
-        """Choose keyframes to compare with a camera T [4, 4]; None if there is no suitable one."""
-        from ufmstar_torch.anchors.kernels.dense import Views
-
-        chosen = self._keyframes.choose(T, K, self._depth, _BASELINES)
-        if not chosen:
+    def _compared(self, T: NDArray, K: NDArray, width: int) -> tuple[Views, Views] | None:
+        """Choose keyframes to compare with a camera T [4, 4]: at the full and at half the size; None if there is no
+        suitable one."""
+        views, half, longest = self._keyframes.compared(T, K, self._depth, _BASELINES)
+        if not len(views.slot):
             return None
-        shares, keyframes = (np.array(column) for column in zip(*chosen, strict=True))
-        image, pose = self._keyframes.images(keyframes), self._keyframes.poses(keyframes)
-        R_keyframe_world = pose[:, :3, :3].transpose(0, 2, 1)
-        H = K @ R_keyframe_world @ T[:3, :3] @ inverse_intrinsics(K)
-        b = ((T[:3, 3] - pose[:, :3, 3])[:, None] @ pose[:, :3, :3])[:, 0] @ K.T
-        noise = self._errors.positions(K, width, self._depth)[shares]
-        views = Views(image, np.ascontiguousarray(H), np.ascontiguousarray(b), noise)
-        return Compared(views, shares, self._keyframes.halves(keyframes))
+        self._baseline = longest
+        views.noise[:] = self._errors.positions(K, width, self._depth)[views.share]
+        half.noise[:] = views.noise / 4
+        return views, half
 
 
 def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:

@@ -84,7 +84,6 @@ class PoseErrors(SavedState):
         accepted: NDArray[np.bool_],
         measured: Measured,
         views: Views,
-        shares: NDArray[np.int64],
         K: NDArray[np.float64],
         depth: float,
         trusted: bool = True,
@@ -96,7 +95,6 @@ class PoseErrors(SavedState):
             accepted: [M] bool, True for the pixels to use, each with a match in at least one view.
             measured: their matches.
             views: V keyframes.
-            shares: [V] index of each view's baseline.
             K: [3, 3] from :meth:`camera`, as in the views [px].
             depth: median of the scene [m].
             trusted: False = poses and images contradict each other; the camera's errors are not updated.
@@ -107,6 +105,6 @@ class PoseErrors(SavedState):
         """
         rho, variance, off_line = np.zeros(len(pixel)), np.zeros(len(pixel)), np.full(len(pixel), np.nan)
         errors = Errors(self._variance, self._unexplained, self._camera, self._covariance, self._disagreement)
-        cameras = views, shares, K, inverse_intrinsics(K), depth, trusted, self._memory
+        cameras = views, K, inverse_intrinsics(K), depth, trusted, self._memory
         correct(pixel, accepted, measured, *cameras, errors, rho, variance, off_line)
         return rho, variance, off_line

@@ -45,19 +45,28 @@ VALUE, NOISE, ALONG, SPEED, SLOPE, ACROSS, ACROSS_NOISE = 0, 1, 2, 4, 5, 6, 7
 
 
 class Views(NamedTuple):
-    """Keyframes to search, the shortest baseline first.
+    """V keyframes to search, the shortest baseline first.
 
     Attributes:
-        image: [V, H, W] uint8.
+        image: [R, H, W] uint8, of more keyframes.
+        slot: [V] indices of their images.
+        share: [V] indices of their baselines among the requested ones.
         H: [V, 3, 3] of a pixel at infinity into the view.
         b: [V, 3] [px m].
         noise: [V] variance of a position from errors of the poses [px^2].
     """
 
     image: NDArray[np.uint8]
+    slot: NDArray[np.int64]
+    share: NDArray[np.int64]
     H: NDArray[np.float64]
     b: NDArray[np.float64]
     noise: NDArray[np.float64]
+
+    def first(self, count: int) -> Views:
+        """The first ``count`` keyframes."""
+        slot, share, H, b, noise = (column[:count] for column in self[1:])
+        return Views(self.image, slot, share, H, b, noise)
 
 
 class Search(NamedTuple):
@@ -119,10 +128,10 @@ def measure(image: NDArray[np.uint8], pixel: NDArray[np.float64], views: Views, 
         views: in the same pixels.
         search: settings.
     """
-    n, v = len(pixel), len(views.image)
+    n, v = len(pixel), len(views.slot)
     (rho, variance), (agreed, contradicted, shown) = np.zeros((2, n)), np.zeros((3, n), np.int64)
     result = Measured(rho, variance, agreed, contradicted, shown, np.full((n, v, 8), np.nan), np.zeros((n, 2)))
-    _measure(image, pixel, eights(views.image), views.H, views.b, views.noise, search, *result)
+    _measure(image, pixel, eights(views.image), views, search, *result)
     return result
 
 
@@ -169,7 +178,8 @@ def steepest(image, cell, row, column, pixel):
 
 
 @reordered
-def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, contradicted, shown, each, centre):
+def _measure(image, pixel, keys, views, search, rho, variance, agreed, contradicted, shown, each, centre):
+    H, b, noise = views.H, views.b, views.noise
     start, first_low, first_high, sigmas, least_score, least_rival, match = search
     height, width = image.shape
     flat = image.reshape(image.size)
@@ -181,8 +191,8 @@ def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, con
     scores, best, out = empty(LONGEST + 1, np.float32), empty(4, np.float64), empty(8, np.float64)
     for n in range(len(pixel)):
         u, v, weight = pixel[n, 0], pixel[n, 1], 0.0
-        for k in range(len(keys)):
-            key = keys[k]
+        for k in range(len(H)):
+            key = keys[views.slot[k]]
             first = agreed[n] == 0
             at = start if first else rho[n]
             x, y = H[k, 0, 0] * u + H[k, 0, 1] * v + H[k, 0, 2], H[k, 1, 0] * u + H[k, 1, 1] * v + H[k, 1, 2]

@@ -60,7 +60,7 @@ class Errors(NamedTuple):
 
 
 @reordered
-def correct(pixel, accepted, measured, views, shares, K, K_inverse, depth, trusted, memory, errors, rho, variance, off):
+def correct(pixel, accepted, measured, views, K, K_inverse, depth, trusted, memory, errors, rho, variance, off):
     """Correct inverse depths for the most likely errors, by ``ROUNDS`` rounds of Student-t weights with the depths
     eliminated, and update the running estimates.
 
@@ -69,7 +69,6 @@ def correct(pixel, accepted, measured, views, shares, K, K_inverse, depth, trust
         accepted: [M] bool, True for the pixels to use, each measured in at least one view.
         measured: their matches (``dense.Measured``).
         views: V keyframes (``dense.Views``).
-        shares: [V] indices of their baselines.
         K, K_inverse: [3, 3] [px].
         depth: median of the scene [m].
         trusted: False = the camera's errors are not updated.
@@ -87,7 +86,7 @@ def correct(pixel, accepted, measured, views, shares, K, K_inverse, depth, trust
             count += 1
     if count == 0:
         return
-    each, view_count = measured.each, len(shares)
+    each, shares, view_count = measured.each, views.share, len(views.share)
     size = POSE * view_count + CAMERA
     change, across_change = empty((view_count, EACH, count), np.float64), empty((view_count, EACH, count), np.float64)
     offset, weight = empty((view_count, count), np.float64), empty((view_count, count), np.float64)
