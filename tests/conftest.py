@@ -21,6 +21,7 @@ PROCESSOR, MOST_SECONDS = "processor_seconds", 20
 MAX_WORKERS = 4  # each takes up to 3 GB
 COMPILE = Path(__file__).with_name("compile_kernels.py")
 COMPILERS: pytest.StashKey[list[subprocess.Popen[bytes]]] = pytest.StashKey()
+MODULES: pytest.StashKey[int] = pytest.StashKey()  # number of imported modules
 
 settings.register_profile("fast", deadline=None, max_examples=10)
 settings.register_profile("thorough", deadline=None, max_examples=50, print_blob=True)
@@ -58,11 +59,28 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items[:] = [item for item in items if item not in set(left_out)]
 
 
-def pytest_collection_finish(session: pytest.Session) -> None:
-    """Leave all imported modules out of later garbage collections, which take a second with them: each warm-up collects
-    once."""
-    gc.collect()
-    gc.freeze()
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Collect no garbage while the tests are collected, since that takes a quarter of the time, and leave all imported
+    modules out of later garbage collections, which take a second with them: each warm-up collects once."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item: pytest.Item) -> Iterator[None]:
+    """Do likewise after a test that has imported further packages."""
+    try:
+        return (yield)
+    finally:
+        if len(sys.modules) > item.config.stash.get(MODULES, 0):
+            item.config.stash[MODULES] = len(sys.modules)
+            gc.collect()
+            gc.freeze()
 
 
 def pytest_sessionfinish() -> None:

@@ -115,7 +115,7 @@ class LiveDepth:
         if not callable(on_result):
             raise TypeError(f"on_result must be callable, got {type(on_result).__name__}")
         self._intrinsics = None if intrinsics is None else as_intrinsics(intrinsics)
-        self._state = None if state is None else StateFile(as_path("state", state), model)
+        self._state = None if state is None else StateFile(as_path("state", state), model.load_stream_state)
         self.model, self._on_result = model, on_result
         self._save_every = save_every
         self._changed = Condition()  # guards everything below
@@ -228,17 +228,21 @@ class LiveDepth:
             self._worker.join()
 
     def _run(self) -> None:
-        with ExitStack() as stack:
+        with ExitStack() as stack:  # in reverse order, whatever fails
+            stack.callback(self._finish)
+            stack.push(self._keep_error)
+            if self._state is not None:
+                stack.callback(self._state.release)
             stack.push(self._keep_error)
             self._work()
-        if self._state is not None:
-            self._state.release()
+
+    def _finish(self) -> None:
         with self._changed:
             self._busy, self._ended = False, True
             self._changed.notify_all()
 
     def _keep_error(self, _: object, error: BaseException | None, __: object) -> bool:
-        self._error = error
+        self._error = self._error or error
         return True
 
     def _work(self) -> None:
@@ -283,7 +287,7 @@ class LiveDepth:
 
     def _save(self) -> None:
         if self._state is not None:
-            self._state.save(self.model)
+            self._state.save(self.model.stream_state())
             with self._changed:
                 self._counts["saved"] += 1
 

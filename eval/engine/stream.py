@@ -21,7 +21,6 @@ from ufmstar_torch.eval.engine.predictions import FramePredictions, PredictionCa
 from ufmstar_torch.eval.engine.progress import Progress, timed
 from ufmstar_torch.eval.engine.rows import RowResult, RowRunner
 from ufmstar_torch.eval.engine.threads import read_ahead
-from ufmstar_torch.eval.methods.perturb import selects
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.frames.frame import FRAME_FAULTS
@@ -81,13 +80,13 @@ def frame_results(
                 predictions.prepare(row.source)
         return predictions
 
-    selected = [index for n, index in enumerate(indices) if any(selects(row.setting, n) for row in rows)]
+    selected = [index for n, index in enumerate(indices) if any(row.selects(n) for row in rows)]
     last = perf_counter()
     with closing(read_ahead(read, selected)) as reading:
         for number, index in enumerate(indices):
             if stop():
                 raise Stopped
-            active, ms = [row for row in rows if selects(row.setting, number)], dict[str, float]()
+            active, ms = [row for row in rows if row.selects(number)], dict[str, float]()
             results, skipped, frame = dict[str, RowResult](), dict[str, str](), None
             try:
                 if active:
