@@ -14,7 +14,7 @@ from ufmstar_torch.frames.output import SampleStatistics
 from ufmstar_torch.kernels.compile_cpu import kernel, leaf
 from ufmstar_torch.kernels.cpu.calls import array
 from ufmstar_torch.steps.regress import HALF
-from ufmstar_torch.steps.sample import Summary, random_order
+from ufmstar_torch.steps.sample import random_order
 
 
 def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:
@@ -39,7 +39,9 @@ def _choose(valid, order, index, used):
                     n += 1
 
 
-def sample_summary(maps: Sequence[Tensor], used: Tensor, measured: Tensor, valid_pixels: Tensor) -> Summary:
+def sample_summary(
+    maps: Sequence[Tensor], used: Tensor, measured: Tensor, valid_pixels: Tensor
+) -> tuple[list[SampleStatistics], Tensor, Tensor]:
     """As :func:`ufmstar_torch.steps.sample.sample_summary`, without gradients: the same bits but for the
     standard error."""
     values = [array(value) for value in maps]
