@@ -97,7 +97,9 @@ class Keyframes(SavedState):
 
         b, ring = len(baselines), self._count + 1
         whole, half = (
-            Views(images, *np.zeros((2, b), np.int64), np.zeros((b, 3, 3)), np.zeros((b, 3)), np.zeros(b))
+            Views(
+                images, np.zeros(b, np.int64), np.zeros(b, np.int64), np.zeros((b, 3, 3)), np.zeros((b, 3)), np.zeros(b)
+            )
             for images in (self._image, self._half)
         )
         newest, number = (self._added - 1) % ring, min(self._added, self._count)
@@ -125,4 +127,6 @@ def halved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Average blocks of two by two pixels; an odd last row or column is dropped."""
     cv2 = opencv()
     height, width = image.shape[0] // 2, image.shape[1] // 2
+    if height == 0 or width == 0:
+        return np.zeros((height, width), np.uint8)
     return np.asarray(cv2.resize(image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA))
