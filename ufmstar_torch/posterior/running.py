@@ -53,7 +53,7 @@ _RECORD = np.dtype((np.record, [(name, np.float64) for name in PosteriorConfig._
 @functools.lru_cache(maxsize=4)  # a posterior has the same config in every frame
 def constants(config: PosteriorConfig) -> Any:
     """The settings and constants of a config as numbers by name, for compiled code."""
-    return np.array(tuple(float(getattr(config, name)) for name in _RECORD.names), _RECORD)[()]
+    return np.array(tuple(float(getattr(config, name)) for name in PosteriorConfig.__annotations__), _RECORD)[()]
 
 
 @functools.lru_cache(maxsize=4)
