@@ -29,7 +29,7 @@ from ufmstar_torch.eval.commands import live as live_command
 from ufmstar_torch.eval.run import rerun_log
 from ufmstar_torch.eval.sequences import live as sources
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.eval.sequences.live import PoseFile, growing_folder, json_lines, replay
+from ufmstar_torch.eval.sequences.live import LONGEST_LINE, PoseFile, growing_folder, json_lines, replay
 from ufmstar_torch.eval.tour import export_tour
 from ufmstar_torch.files.write import hold
 from ufmstar_torch.frames.prediction import NetworksInTurn
@@ -189,25 +189,39 @@ def test_lines_of_json(tmp_path):
     np.testing.assert_array_equal(file.image, image)
     np.testing.assert_array_equal(both.image, image)
     np.testing.assert_array_equal(both.T_world_cam, np.eye(4))
-    assert file.intrinsics.tolist() == [5, 5, 4, 4]
+    assert file.intrinsics.tolist() == [[5, 0, 4], [0, 5, 4], [0, 0, 1]]
+
+
+def test_an_unfinished_last_line_and_names_that_no_file_has_are_left_out(tmp_path, caplog):
+    """As of a program that is killed; a line without an end is refused."""
+    lines = ['\ufeff{"stamp": 1, "pose": [1, 2, 3, 0, 0, 0, 1], "intrinsics": [9, 9, 4, 4]}\n']
+    lines += [json.dumps({"stamp": 2, "image": name}) + "\n" for name in (5000 * "a" + ".png", "\0.png", "")]
+    assert [event.stamp for event in json_lines([*lines, '{"stamp": 3, "pose": [1, 2'], tmp_path)] == [1]
+    assert "line 5 is unfinished and left out" in caplog.text
+    assert "3 images could not be read" in caplog.text
+    with pytest.raises(ValueError, match="line 1: it is longer than"):
+        list(json_lines(["0" * LONGEST_LINE], tmp_path))
 
 
 @pytest.mark.parametrize(
     ("line", "text"),
     [
-        ("{", "line 1: no JSON: {"),
+        ("{\n", "line 1: no JSON: {"),
         ("[1]", "line 1: expected"),
         ('{"stamp": 1}', "line 1: a stamp and a pose or an image"),
         ('{"stamp": 1, "poses": []}', "line 1: expected"),
         ('{"stamp": "now", "pose": [1, 2, 3, 0, 0, 0, 1]}', "line 1: a stamp is a finite number .*'now'"),
         ('{"stamp": 1, "pose": [1, 2, 3]}', r"line 1: a pose has 7 \(x y z qx qy qz qw\) or 12"),
         ('{"stamp": 1, "pose": [1, 2, 3, 0, 0, 0, 2]}', "line 1: pose: the quaternion's norm is 2"),
-        ('{"stamp": 1, "pose": [[1, 2], [3]]}', "line 1: "),
+        ('{"stamp": 1, "pose": [[1, 2], [3]]}', "line 1: a pose has 7"),
+        ('{"stamp": 1, "pose": {"x": 1}}', "line 1: a pose has 7"),
         (
             '{"stamp": 1, "image": "none.png"}',
             "line 1: an image needs intrinsics, in its line, an earlier",
         ),
         ('{"intrinsics": [1, 2]}', "line 1: intrinsics are fx, fy, cx, cy"),
+        ('{"intrinsics": "9 9 4 4"}', "line 1: intrinsics are fx, fy, cx, cy"),
+        ('{"intrinsics": [0, 9, 4, 4]}', "line 1: intrinsics must be a finite 3x3 matrix with positive focal lengths"),
         ('{"stamp": 1, "image": "data:;base64,%", "intrinsics": [9, 9, 4, 4]}', "line 1: "),
         *(
             (f'{{"stamp": {stamp}, "pose": [1, 2, 3, 0, 0, 0, 1]}}', "line 1: .*(finite|too large)")
@@ -244,20 +258,21 @@ def test_a_recording_live(ufmstar, tmp_path):
     assert code == 0, err + out
     assert int(torch.load(tmp_path / "state.pt")["image_index"]) > images  # the run continued
     before = sorted((tmp_path / "out").iterdir())
-    code, _, err = ufmstar(TOUR, "--out", tmp_path / "out")
+    code, _, err = ufmstar(TOUR, "--plain", "--out", tmp_path / "out")
     assert code == 2
     assert f"--out {tmp_path / 'out'} holds an earlier live run: --overwrite replaces it" in err
     assert sorted((tmp_path / "out").iterdir()) == before
     lock = hold(tmp_path / ".state.pt.lock")
-    code, _, err = ufmstar(TOUR, "--out", tmp_path / "out", "--overwrite", "--state", tmp_path / "state.pt")
+    plain = (TOUR, "--plain", "--state", tmp_path / "state.pt")
+    code, _, err = ufmstar(*plain, "--out", tmp_path / "out", "--overwrite")
     assert (code, sorted((tmp_path / "out").iterdir())) == (2, before)  # refused before anything is replaced
     assert "another process is writing" in err
     lock.release()
-    assert ufmstar("tour:4?frames=2&size=64x96", "--out", tmp_path / "out", "--overwrite")[0] == 0
+    assert ufmstar("tour:4?frames=2&size=64x96", "--plain", "--out", tmp_path / "out", "--overwrite")[0] == 0
     assert not any((tmp_path / "out" / f"{line['stamp']:.6f}.npz").exists() for line in lines[2:])
     for content, text in ((b"no state", "it begins with b'no state'"), (malicious(tmp_path), "never loaded because")):
         (tmp_path / "state.pt").write_bytes(content)
-        code, _, err = ufmstar(TOUR, "--state", tmp_path / "state.pt")
+        code, _, err = ufmstar(*plain)
         assert code == 2
         assert "cannot be continued" in err
         assert text in err
@@ -280,7 +295,7 @@ def test_a_recording_waits_for_a_network_that_starts_slowly(ufmstar, monkeypatch
 
     monkeypatch.setattr(sources, "time", SimpleNamespace(sleep=time.sleep, perf_counter=perf_counter))
     monkeypatch.setattr(NetworksInTurn, "member", slow_at_first)
-    code, out, err = ufmstar(TOUR, "--speed", "100", "--json")
+    code, out, err = ufmstar(TOUR, "--plain", "--speed", "100", "--json")
     assert code == 0, err + out
     assert too_early == [False]
     assert running.is_set()
@@ -299,14 +314,14 @@ def test_lines_on_standard_input_live(ufmstar, tmp_path, monkeypatch):
     assert "of 5 images" in out
     monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join([*lines, "no JSON"])))
     intrinsics = ("--intrinsics", K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-    code, out, err = ufmstar("-", *intrinsics, "--out", tmp_path / "out")
+    code, out, err = ufmstar("-", "--plain", *intrinsics, "--out", tmp_path / "out")
     assert code == 1
     assert "line 11: no JSON" in err
     assert "of 5 images" in out, "the summary table"
     summary = json.loads((tmp_path / "out" / "realtime.json").read_text())
     assert (summary["state"], summary["reason"]) == ("failed", "line 11: no JSON: no JSON")
     monkeypatch.setattr(sys, "stdin", io.StringIO(lines[1]))
-    code, _, err = ufmstar("-")
+    code, _, err = ufmstar("-", "--plain")
     assert code == 1
     assert "line 1: an image needs intrinsics, in its line, an earlier one or --intrinsics" in err
 
@@ -323,7 +338,7 @@ def test_intrinsics_hold_for_later_lines_and_images_may_be_missing(tmp_path, cap
     ]
     events = list(json_lines(map(json.dumps, lines), tmp_path))
     assert [(event.stamp, event.image is not None) for event in events] == [(1, True), (3, False), (4, True), (5, True)]
-    assert [event.intrinsics[0] for event in events] == [9, 9, 8, 8]
+    assert [event.intrinsics[0, 0] for event in events] == [9, 9, 8, 8]
     assert "line 3: the image is left out: " in caplog.text
     assert "2 images could not be read" in caplog.text
 
@@ -351,7 +366,7 @@ def test_a_folder_that_grows_live(ufmstar, tmp_path, monkeypatch):
     writer.start()
     K = sequence.intrinsics
     words = ("--trajectory", tmp_path / "poses.txt", "--intrinsics", K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-    code, printed, err = ufmstar(folder, "--follow", "--seconds", "1", "--out", out, *words)
+    code, printed, err = ufmstar(folder, "--plain", "--follow", "--seconds", "1", "--out", out, *words)
     ended.set()
     writer.join()
     assert code == 0, err + printed
@@ -378,7 +393,7 @@ def test_a_viewer_shows_the_results_on_this_computer_alone(ufmstar, stand_in, mo
         return started[0]
 
     monkeypatch.setattr(rerun_log.subprocess, "Popen", viewer)
-    code, out, err = ufmstar(TOUR, "--view", "--speed", "0.2")
+    code, out, err = ufmstar(TOUR, "--plain", "--view", "--speed", "0.2")
     started[0].terminate()
     started[0].wait(10)
     if not display:
@@ -399,5 +414,5 @@ def test_poses_that_contradict_the_images_of_a_recording_are_named(ufmstar, tmp_
     path = export_tour(open_sequence("tour:41?frames=12&size=120x160"), tmp_path / "walk")
     for poses, named in (((), 0), (("--poses", "opengl"), 1)):
         caplog.clear()
-        assert ufmstar(path, "--speed", "100", *poses)[0] == 0
+        assert ufmstar(path, "--plain", "--speed", "100", *poses)[0] == 0
         assert sum(text.startswith(f"{path}: poses disagree with the images") for text in caplog.messages) == named

@@ -161,7 +161,8 @@ def export_cloud(frames: Iterator[RunFrame], out: Path, voxel: float) -> str:
     keys, sums = _merged([(keys, sums), *waiting])
     left_out = f"{far} pixels over {_HALF * voxel:.4g} m from the first camera left out (--voxel {voxel:g})" * bool(far)
     if not len(keys):
-        raise ValueError(f"{out}: the cloud is empty: {left_out or 'no pixel has a depth within the limits of sigma'}")
+        reason = left_out or "no pixel has a depth within the limits of sigma: raise these, or run without --plain"
+        raise ValueError(f"{out}: the cloud is empty: {reason}")
     weight, count = sums[:, :1], sums[:, 7:]
     position, colour, sigma = sums[:, 1:4] / weight, sums[:, 4:7] / weight, np.sqrt(count / weight)
     kinds, columns = dict.fromkeys(("x", "y", "z"), "<f8") | {"sigma": "<f4"}, [position, sigma]

@@ -1,4 +1,5 @@
-"""Means of pixels in cells, and interpolation from nodes to pixels, without smoothing across depth edges (numba)."""
+"""Means of pixels in cells, sums in windows around nodes, and interpolation from nodes to pixels, without smoothing
+across depth edges (numba)."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ import math
 import numpy as np
 
 from ufmstar_torch.anchors.check import FARTHEST_OFF
-from ufmstar_torch.kernels.compile_cpu import empty, kernel, part, reordered_leaf
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, part, reordered_leaf
 
 # Upper limit of |y|: anchors that are off by more are not valid.
 LARGEST = math.log(FARTHEST_OFF)
@@ -81,57 +82,120 @@ def _vary(f, rows, cols, out):
 
 
 @part
-def interpolate(depth, valid, logs, claimed, nodes, coefficients, grid, config, y, variance, inlier, outlier):
+def windows_around(scene, rows, width):
+    """[k, n] sums of ``rows`` [k, N] over the anchors of a scene in a Gaussian window around every node of standard
+    deviation ``width`` [image widths]."""
+    grid, node, layers = scene.grid, scene.observed.node, rows.shape[0]
+    out = empty((layers, grid.log_depth.size), np.float64)
+    windows = empty((grid.rows, grid.rows), np.float64), empty((grid.cols, grid.cols), np.float64)
+    work = empty((grid.rows, grid.cols), np.float64), empty(grid.cols, np.float64)
+    for layer in range(layers):
+        for i in range(out.shape[1]):
+            out[layer, i] = 0.0
+        for k in range(node.size):
+            out[layer, node[k]] += rows[layer, k]
+    _blur(out, windows[0], windows[1], work[0], work[1], width)
+    return out
+
+
+@reordered_leaf
+def _blur(cells, row_window, col_window, across, line, width):
+    """Replace sums over cells [k, R C] by those in Gaussian windows around every cell."""
+    rows, cols = across.shape
+    for window in (row_window, col_window):
+        n = window.shape[0]
+        for distance in range(n):
+            weight = math.exp(-((distance / n / width) ** 2) / 2)
+            for i in range(n - distance):
+                window[i, i + distance] = window[i + distance, i] = weight
+    for layer in range(cells.shape[0]):
+        for i in range(rows):
+            for c in range(cols):
+                line[c] = 0.0
+            for j in range(cols):
+                value = cells[layer, i * cols + j]
+                if value != 0:  # most cells have no anchor
+                    for c in range(cols):
+                        line[c] += value * col_window[j, c]
+            for c in range(cols):
+                across[i, c] = line[c]
+        for i in range(rows):
+            for c in range(cols):
+                line[c] = 0.0
+            for j in range(rows):
+                weight = row_window[i, j]
+                for c in range(cols):
+                    line[c] += weight * across[j, c]
+            for c in range(cols):
+                cells[layer, i * cols + c] = line[c]
+
+
+@part
+def interpolate(maps, nodes, coefficients, grid, config, outputs):
     """Write y, the two variances and the probability of another surface at every pixel [H, W].
 
     The four nodes around a pixel have their bilinear weights times 1/(1 + (D/edge_contrast)^2); D is the difference
     between the pixel's log d and the node's.
 
     Args:
-        depth: [H, W] d [m].
-        valid: [H, W].
-        logs: [H, W] log d.
-        claimed: [H, W] UfM*'s variance [m^2]; its product with the share without evidence is a lower limit.
+        maps: depth d [m]; valid; log d; and UfM*'s variance [m^2], whose product with the share without evidence is a
+            lower limit [H, W].
         nodes: [6, n] log d, y - b . x, variance over the squared depth, the same on the evidence's surface, probability
             of another surface, and share without evidence.
         coefficients: [4] of 1, log d - m_0, u, v.
         grid: of the nodes.
         config: of the posterior.
-        y, outlier: y and the probability, NaN where not valid.
-        variance, inlier: variance of the depth d e^y over e^2y [m^2], and that on the surface of the evidence.
+        outputs: [H, W], written: y, NaN where not valid; variance of the depth d e^y over e^2y [m^2]; the probability,
+            NaN where not valid; and the variance on the surface of the evidence.
     """
-    b, rows, cols, width = coefficients, grid.rows, grid.cols, depth.shape[1]
-    left, right = empty((rows, 6, width), np.float64), empty((rows, 6, width), np.float64)
+    depth, valid, logs, claimed = maps
+    y, variance, outlier, inlier = outputs
+    b, cols, width = coefficients, grid.cols, depth.shape[1]
+    lines, before = empty((2, 2, 6, width), np.float64), empty(width, np.int64)
     across, base = empty(width, np.float64), empty(width, np.float64)
     for j in range(width):
         u = (j + 0.5) / width
         position = min(max(u * cols - 0.5, 0.0), cols - 1.0)
-        before = min(int(position), max(cols - 2, 0))
-        after = min(before + 1, cols - 1)
-        across[j], base[j] = position - before, b[0] - b[1] * grid.mean + b[2] * (2 * u - 1)
-        for row in range(rows):
-            for k in range(6):
-                left[row, k, j], right[row, k, j] = nodes[k, row * cols + before], nodes[k, row * cols + after]
-    limits = config.edge_contrast**2, LARGEST
-    _pixels(depth, valid, logs, claimed, left, right, across, base, (b[1], b[3]), limits, y, variance, inlier, outlier)
+        before[j] = min(int(position), max(cols - 2, 0))
+        across[j], base[j] = position - before[j], b[0] - b[1] * grid.mean + b[2] * (2 * u - 1)
+    columns, limits = (across, base, before), (config.edge_contrast * config.edge_contrast, LARGEST)
+    _pixels(
+        depth, valid, logs, claimed, nodes, grid.rows, cols, lines, columns, b, limits, y, variance, inlier, outlier
+    )
+
+
+@leaf
+def _fill(nodes, row, cols, before, line):
+    """Write the nodes of a row before and after each column of pixels [2, 6, W]."""
+    for k in range(6):
+        for j in range(before.size):
+            i = row * cols + before[j]
+            line[0, k, j], line[1, k, j] = nodes[k, i], nodes[k, min(i + 1, row * cols + cols - 1)]
 
 
 @reordered_leaf
-def _pixels(depth, valid, logs, claimed, left, right, across, base, slopes, limits, y, spread, inlier, outlier):
+def _pixels(
+    depth, valid, logs, claimed, nodes, rows, cols, lines, columns, b, limits, y, spread, inlier, outlier
+):  # fmt: skip
     """As :func:`interpolate`.
 
-    ``left`` and ``right`` [R, 6, W] are the nodes before and after each column, ``across`` the weight of the one after.
+    ``columns`` are the weight of the node after each column, b . x without the parts that vary along the column, and
+    the node before it. ``lines`` [2, 2, 6, W] hold the two rows of nodes around a row of pixels (:func:`_fill`).
     The ratios of the four weights s/(1 + D^2) are those of s times the other three denominators.
     """
-    height, rows, width = logs.shape[0], left.shape[0], across.size
+    height, width, filled = logs.shape[0], logs.shape[1], -1
+    across, base, before = columns
     contrast2, largest = limits
-    by_depth, by_row = slopes
+    by_depth, by_row = b[1], b[3]
     for i in range(height):
         v = (i + 0.5) / height
         position = min(max(v * rows - 0.5, 0.0), rows - 1.0)
         top = min(int(position), max(rows - 2, 0))
         fv, bottom = position - top, min(top + 1, rows - 1)
-        n0, n1, n2, n3 = left[top], right[top], left[bottom], right[bottom]
+        while filled < bottom:
+            filled += 1
+            _fill(nodes, filled, cols, before, lines[filled % 2])
+        n0, n1, n2, n3 = lines[top % 2, 0], lines[top % 2, 1], lines[bottom % 2, 0], lines[bottom % 2, 1]
         depths, used, gs, Vs = depth[i], valid[i], logs[i], claimed[i]
         ys, variances, inliers, outliers = y[i], spread[i], inlier[i], outlier[i]
         for j in range(width):

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import functools
-from collections import namedtuple
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import ClassVar
 
 from ufmstar_torch.runtime.checked import Checked, number
 
@@ -95,15 +93,3 @@ class PosteriorConfig(Checked):
     def prior_variance(self) -> tuple[float, float, float, float]:
         """The variances of the coefficients b before the first anchor."""
         return (self.prior_sigma**2, self.slope_sigma**2, self.tilt_sigma**2, self.tilt_sigma**2)
-
-
-if TYPE_CHECKING:
-    Constants = Any
-else:
-    Constants = namedtuple("Constants", PosteriorConfig.__annotations__)
-
-
-@functools.lru_cache(maxsize=4)  # a posterior has the same config in every frame
-def constants(config: PosteriorConfig) -> Any:
-    """The settings and constants of a config as numbers by name, for compiled code."""
-    return Constants(*(float(getattr(config, name)) for name in PosteriorConfig.__annotations__))
