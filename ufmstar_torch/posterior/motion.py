@@ -20,6 +20,11 @@ log ratio of this one-sided density and the symmetric one, times 1 - distance/re
 nodes of similar predicted depth, in a Gaussian window: the network bounds the region that moves. A surface counts as
 still unless there is evidence of motion: the probability of motion is P = max(0, (sigma(l) - c_0)/(1 - c_0)).
 
+An anchor with |y - c| above ``_FARTHEST`` s and log F (``farthest``), by c and s of the frames before, is no evidence:
+a thing that keeps the camera's speed has no parallax, and its anchors, nearly infinitely far, would pull the field of
+the surfaces around. r is ``_BEYOND`` for such anchors, by their share in the node. Where they are the majority, c is
+wrong and all count.
+
 With the probability P, the depth is that of the prediction at the scale of most surfaces: e is normal with the variance
 w (``update``). The stated depth stays that of the evidence, which is right more often than the prediction even where P
 exceeds one half; its variance is the second moment about it. P adds to the probability p of another surface:
@@ -39,7 +44,7 @@ import numpy as np
 from ufmstar_torch.kernels.compile_cpu import reordered
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.running import Floats, Running
-from ufmstar_torch.posterior.scene import Scene
+from ufmstar_torch.posterior.scene import AnchorRows, Scene
 
 # Standard deviation of log depth that motion adds; probability that motion that passes all tests looks nearer.
 _MOVING, _NEARER = 0.8, 0.05
@@ -49,8 +54,32 @@ _PRIOR, _PASSING, _WEIGHT, _CERTAIN = -1.57, 0.12, 1.06, 0.15
 _SIGMA, _HALF, _CONTRAST = 1.5, 3, 0.3
 # Number of nodes that count as one surface in the choice of c, and as one anchor in the estimate of s.
 _SURFACE, _ANCHOR = 40.0, 8.0
+# Largest |y - c| of evidence over s, the 99 % quantile of |t_2|; and the log ratio of motion where all is beyond.
+_FARTHEST, _BEYOND = 9.92, 50.0
 # Standard deviation of c about its running mean; number of first candidates, and of iterations.
 _CHANGE, _CANDIDATES, _ITERATIONS = 0.15, 33, 8
+
+
+def plausible(
+    anchors: AnchorRows, running: Running, image: tuple[int, ...], size: tuple[int, int], config: PosteriorConfig
+) -> tuple[AnchorRows, Floats]:
+    """The anchors whose ratio a surface that stands still may have, and [R C] the share of the others at every node.
+
+    Args:
+        anchors: of the frame.
+        running: up to the frame before.
+        image: H and W of the depth map.
+        size: R and C of the nodes.
+        config: of the posterior.
+    """
+    c, limit = running.ratios.centre, max(_FARTHEST * math.sqrt(running.ratios.between), math.log(config.farthest))
+    far = anchors.valid & (np.abs(np.log(anchors.depth / anchors.predicted) - c) > limit)
+    if not running.frames or 2 * far.sum() > anchors.valid.sum():
+        return anchors, np.zeros(size[0] * size[1])
+    cell = (anchors.pixel + 0.5) * (size[1], size[0]) // (image[1], image[0])
+    node = cell.clip(0, (size[1] - 1, size[0] - 1)).astype(np.int64) @ (1, size[1])
+    count, beyond = (np.bincount(node, mask, size[0] * size[1]) for mask in (anchors.valid, far))
+    return anchors._replace(valid=anchors.valid & ~far), beyond / np.maximum(count, 1)
 
 
 def surfaces(
@@ -121,7 +150,7 @@ def _spread(u, v, value, sums, weights):
 
 
 def probability(
-    e: Floats, log_depth: Floats, away: Floats, tests: Floats, between: float, size: tuple[int, int]
+    e: Floats, log_depth: Floats, away: Floats, tests: Floats, beyond: Floats, between: float, size: tuple[int, int]
 ) -> Floats:
     """[n] probability P that the surface at a node moves.
 
@@ -130,6 +159,7 @@ def probability(
         log_depth: [n] of the prediction.
         away: [n] distance from evidence as a share of ``reach``.
         tests: [n] from :func:`tests_at`.
+        beyond: [n] from :func:`plausible`.
         between: s^2, the squared scale of e over still surfaces.
         size: R and C of the nodes.
     """
@@ -138,7 +168,8 @@ def probability(
     still = -1.5 * np.log1p(square / between / 2) - math.log(2 * math.sqrt(2 * between))
     side = np.where(e > 0, math.log(2 * (1 - _NEARER)), math.log(2 * _NEARER))
     means = np.zeros((2, *size))
-    for value, mean in zip((near * (moving - still), near * side), means, strict=True):
+    ratio = (1 - beyond) * near * (moving - still) + beyond * _BEYOND
+    for value, mean in zip((ratio, near * side), means, strict=True):
         _mean_around(value.reshape(size), log_depth.reshape(size), mean)
     r, q = _WEIGHT * means.reshape(2, -1)
     odds = _PRIOR + r + np.log(_PASSING * np.exp(q) + (1 - _PASSING) * np.exp(tests))

@@ -59,7 +59,8 @@ a is the variance of the anchors' y in a Gaussian window: depths differ more bet
 farther the evidence, the more surfaces lie between. v and w are at most ``widest``. Contradictory evidence thus limits
 the certainty of every pixel.
 
-Anchors that matching has measured are wrong on surfaces that move. With the probability P of ``motion``, the depth is
+Anchors that matching has measured are wrong on surfaces that move. Those whose ratio to the prediction no surface of
+the stream has are left out (``motion.plausible``). With the probability P of ``motion``, the depth is
 that of the prediction at the scale of most surfaces: the variance becomes (1 - P) V + P tail, with the tail about
 their ratio instead of b . x, and p includes P.
 
@@ -90,7 +91,7 @@ from ufmstar_torch.posterior.distribution import TAIL
 from ufmstar_torch.posterior.field import at
 from ufmstar_torch.posterior.learn import sums_of
 from ufmstar_torch.posterior.moments import divide, second_moments
-from ufmstar_torch.posterior.motion import in_image, probability, surfaces, tests_at
+from ufmstar_torch.posterior.motion import in_image, plausible, probability, surfaces, tests_at
 from ufmstar_torch.posterior.running import BETWEEN, CENTRE, FEATURES, Floats, Running
 from ufmstar_torch.posterior.scene import (
     MOST_WRONG,
@@ -211,6 +212,9 @@ def _of_stream(
         logs = np.log(depth)
     grid = grid_of(logs, valid, rows, cols, numbers)
     expected = running.expected(grid.mean, config)
+    beyond = np.zeros(rows * cols)
+    if motion is not None:
+        anchors, beyond = plausible(anchors, running, depth.shape, (rows, cols), config)
     of_frame = grid, depth, valid, anchors, running.ratios, expected, running.frames, numbers
     scene, field, left_out, away, sums, (below, distance, area) = evidence_of(*of_frame)
     scores, (c, of_surfaces) = np.zeros((2, 0)), surfaces(scene, field.coefficients, running, config)
@@ -227,7 +231,7 @@ def _of_stream(
     if motion is not None:
         tests = tests_at(motion, depth.shape[0], depth.shape[1], rows, cols)
         e = mean - c - in_image(x, field.coefficients)
-        P = probability(e, grid.log_depth, nodes[5], tests, updated.ratios.between, (rows, cols))
+        P = probability(e, grid.log_depth, nodes[5], tests, beyond, updated.ratios.between, (rows, cols))
     slopes = updated.slopes - field.coefficients[1:]
     maps = depth, valid, logs, claimed
     at_every_pixel(maps, nodes, x, wide, (e, P), away, slopes, field.coefficients, grid, numbers, outputs)
