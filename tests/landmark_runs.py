@@ -16,10 +16,9 @@ def walk():
 
 
 @functools.cache
-def long_walks():
-    """Two times 60 frames of 240 x 320."""
-    names = ("tour:71?style=mixed&frames=60&size=240x320", "tour:72?frames=60&size=240x320")
-    return [list(open_sequence(name)) for name in names]
+def long_walk(n):
+    """60 frames of 240 x 320, of the first or the second tour."""
+    return list(open_sequence(("tour:71?style=mixed&frames=60&size=240x320", "tour:72?frames=60&size=240x320")[n]))
 
 
 def true_depth(frame, pixel):

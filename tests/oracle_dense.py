@@ -167,3 +167,28 @@ def confirmed(pixel, rho, variance, agreed, contradicted, cell):
         supported = len(agreeing) >= 3 and len(agreeing) >= 0.9 * len(near)
         fine[n] |= agreed[n] == 1 and (supported or variance[n] >= (0.2 * rho[n]) ** 2)
     return fine
+
+
+def chosen(poses, T, K, size, depth, baselines):
+    """Pairs (index of the baseline, keyframe), the shortest first: the keyframe, not chosen before, whose baseline over
+    the depth differs from the requested one by the smallest factor, at most 2.5, where a frame of age counts as .2 %. A
+    keyframe shows at least half of 16 points of the view at the depth."""
+    height, width = size
+    points = [
+        T[:3, :3] @ (np.linalg.inv(K) @ [(i + 0.5) / 4 * width, (j + 0.5) / 4 * height, 1]) * depth + T[:3, 3]
+        for j in range(4)
+        for i in range(4)
+    ]
+    baseline, candidates, result = [], [], []
+    for n, pose in enumerate(poses):
+        baseline.append(np.linalg.norm(pose[:3, 3] - T[:3, 3]) / depth)
+        seen = [K @ pose[:3, :3].T @ (x - pose[:3, 3]) for x in points]
+        inside = [z > 0.2 * depth and 0 < u / z < width - 1 and 0 < v / z < height - 1 for u, v, z in seen]
+        if np.mean(inside) >= 0.5:
+            candidates.append(n)
+    for index, wanted in enumerate(baselines):
+        mismatch = {n: abs(np.log(baseline[n] / wanted)) for n in candidates if n not in [m for _, m in result]}
+        fine = {n: m + 0.002 * (len(poses) - 1 - n) for n, m in mismatch.items() if m < np.log(2.5)}
+        if fine:
+            result.append((index, min(fine, key=fine.get)))
+    return sorted(result, key=lambda pair: baseline[pair[1]])

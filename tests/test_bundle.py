@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import oracle_bundle
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from landmark_runs import true_depth, walk
@@ -206,6 +207,18 @@ def test_a_pose_that_jumps_once_starts_a_new_trajectory_and_teaches_nothing():
             np.testing.assert_array_equal(poses, off)
             assert refinement.state()["given_pose_variance"].equal(before["given_pose_variance"])
     assert jumps == [i == 12 for i in range(20)]
+
+
+@pytest.mark.parametrize(("recent", "jumped", "kept"), [(60.0, True, 496), (110.0, False, 496), (1e3, False, 800)])
+def test_only_an_error_far_above_the_recent_ones_is_a_jump(recent, jumped, kept):
+    """The error's score is 496."""
+    refinement = PoseRefinement()
+    refinement.load_state(refinement.state() | {"surprise_lately": torch.tensor(recent, dtype=torch.float64)})
+    poses, pixel = scene(np.random.default_rng(0), noise=0.2)
+    poses[-1, 0, 3] += 0.5
+    refinement.refine(pixel, np.ones(pixel.shape[:2], bool), poses, K, 2.0)
+    assert refinement.jumped == jumped
+    assert refinement.state()["surprise_lately"].item() == pytest.approx(kept, rel=0.01)
 
 
 @pytest.mark.parametrize("kind", [LandmarkTracker, DenseEvidence])

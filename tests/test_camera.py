@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from random_gaussians import covariances, means
+from random_gaussians import covariances, means, mixture
 from scipy.spatial.transform import Rotation
 
 import oracle
@@ -77,3 +77,16 @@ def test_projected_covariance(seed):
         np.testing.assert_allclose(image_mean[0, i].numpy(), m, rtol=1e-12)
         covariance = image_cov[0, i].numpy() + oracle.PIXEL_VARIANCE * np.eye(2)
         np.testing.assert_allclose(covariance, S, rtol=1e-11, atol=1e-11)
+
+
+def test_the_usual_camera_is_53_degrees_wide_and_looks_through_the_images_centre():
+    assert camera.camera_of((48, 64)).tolist() == [[64, 0, 32], [0, 64, 24], [0, 0, 1]]
+
+
+def test_a_mixture_in_another_frame_and_its_empty_slots_stay_zero():
+    here, (R, t) = mixture(1, 6, 0, empty=2), (pose(0)[None, :3, :3], pose(0)[None, :3, 3])
+    there = here.rigid(R, t)
+    torch.testing.assert_close(there.mean[0, :4], here.mean[0, :4] @ R[0].T + t[0])
+    torch.testing.assert_close(there.covariance, R @ here.covariance @ R.mT)
+    assert not there.mean[0, 4:].any()
+    assert torch.equal(there.reference, here.reference)

@@ -25,7 +25,7 @@ from ufmstar_torch import (
 )
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.eval.engine.estimators import make_estimator
-from ufmstar_torch.eval.engine.evaluate import Judge, evaluate_sequence
+from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.engine.predictions import PredictionCache
 from ufmstar_torch.eval.methods.method import Method
@@ -220,8 +220,7 @@ def test_the_engine_passes_it(tmp_path):
     rows = [Row(method), Row(method, Setting(anchors="truth"))]
     assert make_estimator(rows[1], CPU, source).ufm.config.confidence == ConfidenceConfig()
     for _ in range(2):
-        judge = Judge({"depth_only": source}, CPU, PredictionCache(tmp_path))
-        for result in evaluate_sequence(sequence, rows, judge):
+        for result in evaluate_sequence(sequence, rows, {"depth_only": source}, cache=PredictionCache(tmp_path)):
             samples = result.sums["confidence"]["samples"]
             assert samples.shape == (3 * 384, 3)
             assert bool(((samples[:, 0] >= 0) & (samples[:, 0] <= 1)).all())

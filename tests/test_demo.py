@@ -19,7 +19,7 @@ from ufmstar_torch.eval.report.data import load_results
 from ufmstar_torch.eval.report.tables import main_table
 from ufmstar_torch.models import save_trained
 
-FRAMES, SEED = 3, 5
+FRAMES, SEED = 2, 5
 SHIPPED = Path(str(files("ufmstar_torch.models").joinpath("weights", "demo.safetensors")))
 ROWS = ["Aleatoric", "Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble", "UfM*-Ensemble (anchors dense, posterior)"]
 README = Path(__file__).parent.parent / "README.md"

@@ -13,7 +13,6 @@ from ufmstar_torch.anchors.kernels.dense import Measured, Views
 from ufmstar_torch.anchors.kernels.poses import linearised, rotated, solve
 
 K = np.array([[250.0, 0, 159.5], [0, 252.0, 119.5], [0, 0, 1]])
-SHARES = np.arange(3)
 
 
 def scene(seed, count=40, moved=0.3):
@@ -22,7 +21,8 @@ def scene(seed, count=40, moved=0.3):
     pixel, rho = rng.uniform([10, 10], [310, 230], (count, 2)), rng.uniform(0.3, 1.2, count)
     R = Rotation.from_rotvec(rng.normal(0, 0.05, (3, 3))).as_matrix()
     t = rng.normal(0, moved, (3, 3)) * np.array([[0.2], [0.5], [1]])
-    return pixel, rho, Views(np.zeros((3, 240, 320), np.uint8), K @ R @ np.linalg.inv(K), t @ K.T, np.zeros(3))
+    H, image = K @ R @ np.linalg.inv(K), np.zeros((3, 240, 320), np.uint8)
+    return pixel, rho, Views(image, np.arange(3), np.arange(3), H, t @ K.T, np.zeros(3))
 
 
 def lines(pixel, rho, views):
@@ -48,10 +48,14 @@ def measured(pixel, rho, views, error, noise, rng):
     normal = np.stack([-along[..., 1], along[..., 0]], -1)
     value, same = rho[:, None] + (off * along).sum(-1) / speed, np.full(speed.shape, noise**2)
     n = len(rho)
-    return Measured(
-        value.mean(1), np.ones(n), np.full(n, 3), *np.zeros((2, n), np.int64), value, same, along, speed,
-        np.zeros(speed.shape), (off * normal).sum(-1), same, np.zeros((n, 2)),
-    )  # fmt: skip
+    columns = value, same, along[..., 0], along[..., 1], speed, np.zeros(speed.shape), (off * normal).sum(-1), same
+    each = np.ascontiguousarray(np.stack(columns, -1))
+    return Measured(value.mean(1), np.ones(n), np.full(n, 3), *np.zeros((2, n), np.int64), each, np.zeros((n, 2)))
+
+
+def corrected(errors, pixel, found, views, trusted=True):
+    """Inverse depths, their variances and the distances from the lines after a frame, all pixels accepted."""
+    return errors.corrected(pixel, np.ones(len(pixel), np.bool_), found, views, K, 2.0, trusted)
 
 
 def test_derivatives_agree_with_differences():
@@ -106,16 +110,16 @@ def filtered(frames=1, seed=0, noise=0.05, **wrong):
         error[:, :6] = rng.normal(0, 1, (3, 6)) * np.repeat([wrong.get("turned", 0), wrong.get("moved", 0)], 3)
         found = measured(pixel, rho, views, error, noise, rng)
         errors.positions(K, 320, 2.0)
-        fit = errors.corrected(pixel, np.arange(len(pixel)), found, SHARES, views, K, 2.0)
+        fit = corrected(errors, pixel, found, views)
     return errors, found, fit, rho
 
 
 def test_wrong_poses_are_corrected_and_what_remains_is_stated():
     better, normalised = [], []
     for seed in range(10):
-        _, found, fit, rho = filtered(8, seed, turned=0.002, moved=0.004)
-        better.append(np.median(np.abs(fit.rho - rho)) / np.median(np.abs(found.rho - rho)))
-        normalised.append(np.median(np.abs(fit.rho - rho) / np.sqrt(fit.variance)) / 0.674)
+        _, found, (fitted, variance, _), rho = filtered(8, seed, turned=0.002, moved=0.004)
+        better.append(np.median(np.abs(fitted - rho)) / np.median(np.abs(found.rho - rho)))
+        normalised.append(np.median(np.abs(fitted - rho) / np.sqrt(variance)) / 0.674)
     assert np.median(better) < 0.6
     assert 0.5 < np.median(normalised) < 2.2, "few frames, which also estimate the usual pose errors"
 
@@ -132,8 +136,8 @@ def test_what_remains_of_wrong_poses_is_stated_beyond_first_order():
         errors._variance[:], errors._unexplained[:] = np.square([0.002, 0.008]), 0
         errors._covariance *= 1e-4
         found = measured(pixel, rho, views, error, 0.02, rng)
-        fit = errors.corrected(pixel, np.arange(len(pixel)), found, SHARES, views, K, 2.0)
-        sizes.append(np.abs(fit.rho - rho) / np.sqrt(fit.variance))
+        fitted, variance, _ = corrected(errors, pixel, found, views)
+        sizes.append(np.abs(fitted - rho) / np.sqrt(variance))
     assert 0.65 < np.median(sizes) / 0.674 < 1.3
     assert np.quantile(sizes, 0.9) / 1.645 < 1.5
 
@@ -149,18 +153,17 @@ def test_frames_that_contradict_their_poses_teach_nothing_of_the_camera():
     errors, found, *_ = filtered(3, camera=np.array([0.004, 1.0, -0.8, 0.0]))
     pixel, _, views = scene(5)
     before = errors.camera(K)
-    errors.corrected(pixel, np.arange(len(pixel)), found, SHARES, views, K, 2.0, trusted=False)
+    corrected(errors, pixel, found, views, trusted=False)
     np.testing.assert_array_equal(errors.camera(K), before)
 
 
 def test_nothing_measured_leaves_what_is_believed_of_the_poses():
     errors, found, *_ = filtered(3)
     pixel, _, views = scene(5)
-    empty = Measured(*(np.full_like(x, np.nan) if x.dtype == float and x.ndim > 1 else np.zeros_like(x)
-                       for x in vars(found).values()))  # fmt: skip
+    empty = Measured(*(np.full_like(x, np.nan) if x.dtype == float and x.ndim > 1 else np.zeros_like(x) for x in found))
     before = errors.positions(K, 320, 2.0)
-    fit = errors.corrected(pixel, np.arange(len(pixel)), empty, SHARES, views, K, 2.0)
-    assert np.isinf(fit.variance).all()
+    _, variance, _ = corrected(errors, pixel, empty, views)
+    assert np.isinf(variance).all()
     np.testing.assert_allclose(errors.positions(K, 320, 2.0), before, rtol=1e-6)
 
 
@@ -206,10 +209,12 @@ def test_matches_of_one_view_hold_where_the_oracle_finds_support():
         rho = np.where(rng.random(n) < 0.03, rng.uniform(0.2, 2, n), surface * rng.normal(1, 0.02, n))
         variance = np.square(rho * rng.choice([0.01, 0.05, 0.3], n, p=[0.5, 0.48, 0.02]))
         agreed, contradicted = rng.choice([0, 1, 1, 2, 3], n), rng.choice([0, 0, 0, 0, 1], n)
-        each = np.full((n, 3), np.nan)
-        result = confirmed(pixel, Measured(rho, variance, agreed, contradicted, agreed, *[each] * 8), 10)
+        each = np.full((n, 3, 8), np.nan), np.zeros((n, 2))
+        result, counts = confirmed(pixel, Measured(rho, variance, agreed, contradicted, agreed, *each), 10)
         expected = oracle_dense.confirmed(pixel, rho, variance, agreed, contradicted, 10)
         np.testing.assert_array_equal(result, expected)
+        several = agreed + contradicted > 1
+        assert counts == (several.sum(), (several & expected).sum(), (contradicted > 0).sum())
         seen.append([np.mean(result[agreed == 1]), np.mean(~result[(agreed == 1) & (contradicted == 0)])])
     assert np.mean(seen, 0).min() > 0.1, "some measurements are accepted and some are not"
 
@@ -224,5 +229,6 @@ def test_pixels_far_from_all_others(count):
 
 def test_nothing_is_confirmed_where_nothing_was_measured():
     none = np.zeros(0)
-    empty = Measured(none, none, *[none.astype(int)] * 3, *[np.zeros((0, 3))] * 8)
-    assert len(confirmed(np.zeros((0, 2)), empty, 10)) == 0
+    empty = Measured(none, none, *[none.astype(int)] * 3, np.zeros((0, 3, 8)), np.zeros((0, 2)))
+    reliable, counts = confirmed(np.zeros((0, 2)), empty, 10)
+    assert (len(reliable), counts) == (0, (0, 0, 0))

@@ -19,7 +19,7 @@ from ufmstar_torch.eval.bench.energy import CPU, GPU
 from ufmstar_torch.eval.bench.measure import Plan, measure
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork
 from ufmstar_torch.eval.bench.parts import MULTIVIEW, time_parts
-from ufmstar_torch.eval.engine.evaluate import Judge, evaluate_sequence
+from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.frames.image_check import reduced, shows_something
@@ -197,7 +197,7 @@ def test_all_selected_frames_are_measured_as_in_the_evaluation(sequence):
     assert message["plan"]["frames"] == 7
     one = network()
     source = NetworkSource(NetworksInTurn(one, preprocess=one.preprocess), torch.device("cpu"), {})
-    judged = evaluate_sequence(seen, rows, Judge({"aleatoric": source}, torch.device("cpu"), limit=selected))
+    judged = evaluate_sequence(seen, rows, {"aleatoric": source}, frames=selected)
     for row, figures in zip(message["rows"], judged, strict=True):
         assert row["latency"]["multiview"]["count"] == figures.frames["done"] == 7
         measured = row["memory"]["multiview"]

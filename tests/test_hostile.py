@@ -279,8 +279,8 @@ def test_a_few_damaged_recordings(layout, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", WRITERS)
-def test_hundreds_of_damaged_recordings(layout, tmp_path):
-    assert read_damaged(layout, tmp_path, range(100, 250)) > 30
+def test_many_damaged_recordings(layout, tmp_path):
+    assert read_damaged(layout, tmp_path, range(100, 160)) > 12
 
 
 # ---- damaged output folders ----
@@ -346,8 +346,8 @@ def test_a_few_damaged_output_folders(tmp_path, capfd):
 
 
 @pytest.mark.slow
-def test_hundreds_of_damaged_output_folders(tmp_path, capfd):
-    assert damaged_folders(tmp_path, range(100, 500)) > 50
+def test_many_damaged_output_folders(tmp_path, capfd):
+    assert damaged_folders(tmp_path, range(100, 250)) > 20
     assert "Traceback" not in capfd.readouterr().err
 
 

@@ -13,6 +13,7 @@ import torch
 from live_model import HANGS, PICTURE, K, Network, at, compiled, model, network, show
 
 from ufmstar_torch import LiveDepth, UncertainDepth
+from ufmstar_torch.files.state_file import StateFile
 
 __all__ = ["compiled", "model", "network"]
 
@@ -97,6 +98,24 @@ def test_a_state_that_cannot_be_written_is_an_error(model, tmp_path):
     show(live, 0)
     with pytest.raises(OSError, match=r"state\.pt"):
         live.close()
+
+
+@pytest.mark.parametrize(("picture", "words"), [(PICTURE, "no release"), (PICTURE + 255, "the network failed")])
+def test_a_lock_that_cannot_be_released_is_an_error_without_a_hang(model, tmp_path, monkeypatch, picture, words):
+    def release(_):
+        raise OSError("no release")
+
+    monkeypatch.setattr(StateFile, "release", release)
+    live = LiveDepth(model, lambda _: None, K, state=tmp_path / "s.pt")
+
+    def used():
+        show(live, 0, picture)
+        live.close()
+
+    with pytest.raises(OSError, match=words):
+        used()
+    with pytest.raises(OSError, match=words):  # the first error, and at once
+        live.wait_idle()
 
 
 @pytest.mark.slow

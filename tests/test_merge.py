@@ -203,8 +203,8 @@ def test_a_walk_merges_when_due_and_goes_on_from_a_saved_state():
 def test_a_skipped_frame_merges_nothing():
     state = walk(UfMStarConfig(), 0, 4).state
     config = UfMStarConfig(merge=MergeConfig(every=4))
-    assert merged(state, torch.tensor([False]), config) is state
-    assert merged(state, torch.tensor([True]), config) is not state
+    assert merged(state, torch.tensor([1]), config) is state  # a fault
+    assert merged(state, torch.tensor([0]), config) is not state
 
 
 @pytest.mark.parametrize("capacity", [1, 14, 150])

@@ -62,6 +62,16 @@ def test_anchors_in_wrong_pixels_or_units_are_named_once_a_stream(caplog, mistak
     assert sorted(text[:8] for text in caplog.messages if re.search(words, text)) == ["stream 0", "stream 1"]
 
 
+@pytest.mark.parametrize(("right", "named"), [(0, True), (3, True), (5, False)])
+def test_depth_counts_as_inverse_if_most_frames_show_it(caplog, right, named):
+    """A network may misjudge the surfaces of one view, and so those of the frames after it."""
+    ufm = UfMStar(CONFIG.replace(anchors=AnchorConfig()))
+    for i, (T, anchors) in enumerate(zip(WALK, on_surfaces(), strict=True)):
+        depth = torch.tensor(scenes.render(T, K, H, W)).repeat(2, 1, 1)
+        ufm(depth if i < right else 4 / depth, T, K, anchors=anchors)
+    assert any("is it inverse depth?" in text for text in caplog.messages) == named, caplog.messages
+
+
 @pytest.mark.parametrize("factor", [100, 1000])
 def test_views_that_never_meet_are_named_once_a_stream(caplog, factor):
     messages, statistics = warnings_on_walk(caplog, lambda T: scaled(T, factor))

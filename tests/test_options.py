@@ -124,8 +124,10 @@ def test_settings_are_numbers_words_and_json():
     ("name", "text"),
     [
         ("c.toml", "out = 'there'\nrate = 3\nresume = false\nno-video = true\nnames = ['a', 'b']\nfps = -2.0\n"
+                   "networks = ['c', '-d']\n"
                    "[set]\neta = .25\nprune = 'none'\nsegment.sparse = 3\n".replace("= .25", "= 0.25")),
         ("c.json", '{"out": "there", "rate": 3, "no_video": true, "names": ["a", "b"], "fps": -2.0, "long": null,'
+                   ' "networks": ["c", "-d"],'
                    ' "set": {"eta": 0.25, "prune": "none", "segment": {"sparse": 3}}}'),
     ],
 )  # fmt: skip
@@ -134,6 +136,7 @@ def test_a_configuration_file(name, text, tmp_path):
     options = _parse(f"seq --config {tmp_path / name} --rate 4 --set eta=.5")
     assert options.output == _Output(Path("there"), no_video=True)
     assert (options.rate, options.names, options.fps) == (4.0, ("a", "b"), -2.0)
+    assert as_dict(options)["networks"] == ["c", "-d"]
     assert assigned(options.set) == {"eta": 0.5, "prune": "none", "segment.sparse": 3}
 
 
@@ -175,9 +178,15 @@ def test_a_missing_configuration_file():
         ('{"nope": false}', "no option is called nope"),
         ('{"sequence": "a"}', "no option is called sequence"),
         ('{"set": 3}', "set must be a table"),
-        ('{"trust_code": true}', "--trust-code allows code to run"),
-        ('{"trust-code": true}', "--trust-code allows code to run"),
-        ('{"plugin": ["a.py"]}', "--plugin allows code to run"),
+        ('{"trust_code": true}', "trust_code allows code to run"),
+        ('{"trust-code": true}', "trust_code allows code to run"),
+        ('{"plugin": ["a.py"]}', "plugin allows code to run"),
+        ('{"resume": "--trust-code"}', "resume must be true or false, got '--trust-code'"),
+        ('{"no-video": 1}', "no_video must be true or false, got 1"),
+        ('{"fps": true}', "fps must be a text, a number, or a list of them, got True"),
+        ('{"names": [["a"]]}', "names must be a text, a number, or a list of them"),
+        ('{"names": {"a": 1}}', "names must be a text, a number, or a list of them"),
+        ('{"rate": 0}', "--rate must be positive, got 0.0"),
         ('{"names": "a --trust-code"}', None),
     ],
 )
@@ -190,6 +199,19 @@ def test_a_file_that_is_refused(text, reason, tmp_path):
     with pytest.raises(ValueError, match=reason) as refused:
         _parse(f"seq --out o --config {file}")
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_a_configuration_file_as_editors_and_shells_write_it(encoding, tmp_path):
+    (tmp_path / "C.TOML").write_text("out = 'ü'\r\n", encoding=encoding)
+    assert _parse(f"seq --config {tmp_path / 'C.TOML'}").output.out == Path("ü")
+
+
+def test_a_value_that_no_option_can_have(tmp_path):
+    for text in ("fps = 1979-05-27", "set.eta = 1979-05-27", "out = 1\nout = 2", "rate = 9" + 5000 * "9"):
+        (tmp_path / "c.toml").write_text(text)
+        with pytest.raises(ValueError, match=r"^--config .*c\.toml: "):
+            _parse(f"seq --out o --config {tmp_path / 'c.toml'}")
 
 
 def test_a_value_of_a_file_is_no_option(tmp_path):

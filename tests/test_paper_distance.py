@@ -46,7 +46,7 @@ def distance(frames):
 
 
 @pytest.mark.numerics
-@pytest.mark.parametrize("seed", [200, 31])
+@pytest.mark.parametrize("seed", [200, pytest.param(31, marks=pytest.mark.slow)])
 def test_the_distance_on_rendered_tours(seed):
     tour = open_sequence(f"tour:{seed}?frames=150&size=112x112&sensor=0")
     rng, frames = np.random.default_rng(seed), []
@@ -61,7 +61,9 @@ def test_the_distance_on_rendered_tours(seed):
     assert components > 3
 
 
-@pytest.mark.parametrize("name", RECORDINGS)
+@pytest.mark.parametrize(
+    "name", ["fr1", *(pytest.param(name, marks=pytest.mark.slow) for name in list(RECORDINGS)[1:])]
+)
 def test_the_distance_on_recordings(name):
     sequence = open_sequence(require_shared(f"data/{RECORDINGS[name]}"))
     network = load_network("fastdepth", require_shared("weights/fastdepth_nyu.onnx"), threads=1)

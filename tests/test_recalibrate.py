@@ -1,5 +1,4 @@
-"""Recalibration of the variance: the map's form, its fit to counts, and its use in eval, recalibrate, run and the
-module."""
+"""Recalibration of the variance: the map's form, its fit to counts, and its use in recalibrate, run and the module."""
 
 from __future__ import annotations
 
@@ -16,7 +15,6 @@ from tiny_suite import write_network, write_rooms
 from ufmstar_torch import Recalibration, UfMStar, UfMStarConfig, cli
 from ufmstar_torch.eval.metrics.ranking import SpearmanCorrelation
 from ufmstar_torch.eval.metrics.recalibration import figures, fit
-from ufmstar_torch.posterior.recalibrate import recalibration_path
 
 MAP = Recalibration((0.01, 0.1, 1.0), (0.2, 0.2, 4.0))
 
@@ -135,13 +133,13 @@ def evaluated(tmp_path_factory):
     return rooms, weights, root / "out"
 
 
-def eval_words(weights, out, *roots, more=()):
+def eval_words(weights, out, *roots):
     words = ["eval", "--suite", "depth-only", "--network", f"depth_only=trained:{weights}", "--no-report"]
-    return [*words, *(w for r in roots for w in ("--root", f"rooms={r}")), "--out", str(out), *map(str, more)]
+    return [*words, *(w for r in roots for w in ("--root", f"rooms={r}")), "--out", str(out)]
 
 
-def test_from_an_evaluation_to_other_sequences(evaluated, tmp_path, capsys):
-    rooms, weights, out = evaluated
+def test_a_fit_to_an_evaluation(evaluated, tmp_path, capsys):
+    out = evaluated[2]
     file = tmp_path / "map.json"
     assert cli.main(["recalibrate", str(out), "--row", "UfM*-DepthOnly", "--to", str(file)]) == 0
     printed = capsys.readouterr().out
@@ -150,50 +148,31 @@ def test_from_an_evaluation_to_other_sequences(evaluated, tmp_path, capsys):
     fitted = Recalibration.from_json(file)
     assert fitted.row == "UfM*-DepthOnly"
     assert fitted.sequences == ("rooms/ash", "rooms/birch")
-    again = eval_words(weights, tmp_path / "out", rooms / "ash", rooms / "cedar", more=["--recalibration", file])
-    assert cli.main(again) == 1  # the map was fitted to one of the sequences
-    assert "were fitted to this sequence" in capsys.readouterr().err
-    records = sorted(path.relative_to(tmp_path / "out" / "records") for path in (tmp_path / "out").rglob("*@*.json"))
-    result = [json.loads((tmp_path / "out" / "records" / path).read_text()) for path in records]
-    [record] = [record for record in result if "recalibration" in record["setting"]]
-    assert record["sequence"] == "cedar"
-    plain = json.loads((tmp_path / "out" / "records" / "rooms" / "cedar" / "UfMstar-DepthOnly.json").read_text())
-    assert record["figures"]["nll_left_out_share"] == 0
-    assert record["figures"]["spearman"] is not None
-    assert record["figures"]["rmse"] == plain["figures"]["rmse"]
-    assert record["figures"]["nll"] != plain["figures"]["nll"]
 
 
-def test_run_uses_the_map_beside_the_weights(evaluated, tmp_path, capsys, caplog):
+def test_run_applies_the_map(evaluated, tmp_path, capsys):
     rooms, weights, out = evaluated
     default = ["run", str(rooms / "cedar"), "--model", "trained", "--weights", str(weights), "--no-video", "--no-sheet"]
-    words = [*default, "--plain"]
+    words, file = [*default, "--plain"], tmp_path / "map.json"
+    mapping = ["--recalibration", str(file)]
     assert cli.main([*words, "--out", str(tmp_path / "plain")]) == 0
-    file = recalibration_path(weights)
     assert cli.main(["recalibrate", str(out), "--row", "UfM*-DepthOnly", "--to", str(file)]) == 0
-    try:
-        assert cli.main([*words, "--out", str(tmp_path / "mapped")]) == 0
-        assert cli.main([*words, "--out", str(tmp_path / "none"), "--recalibration", "none"]) == 0
-        assert cli.main(["run", str(rooms / "ash"), *words[2:], "--out", str(tmp_path / "fitted")]) == 0
-        capsys.readouterr()
-        assert cli.main([*default, "--out", str(tmp_path / "corrected"), "--frames", ":2"]) == 0
-        assert any("is not used: it was fitted to UfM* alone" in text for text in caplog.messages)
-        capsys.readouterr()
-        assert cli.main([*default, "--out", str(tmp_path / "named"), "--recalibration", str(file)]) == 2
-        assert "anchors.half_life = None (now 30.0)" in capsys.readouterr().err
-        assert cli.main([*words, "--out", str(tmp_path / "other"), "--set", "ema_alpha=0.7"]) == 2
-        assert "ema_alpha = " in capsys.readouterr().err
-        assert cli.main([*words, "--out", str(tmp_path / "plain")]) == 2
-    finally:
-        file.unlink()
+    assert cli.main([*words, *mapping, "--out", str(tmp_path / "mapped")]) == 0
+    assert cli.main(["run", str(rooms / "ash"), *words[2:], *mapping, "--out", str(tmp_path / "fitted")]) == 0
+    capsys.readouterr()
+    assert cli.main([*default, *mapping, "--out", str(tmp_path / "corrected")]) == 2
+    assert "anchors.half_life = None (now 30.0)" in capsys.readouterr().err
+    assert cli.main([*words, *mapping, "--out", str(tmp_path / "other"), "--set", "ema_alpha=0.7"]) == 2
+    assert "ema_alpha = " in capsys.readouterr().err
+    assert cli.main([*words, *mapping, "--out", str(tmp_path / "plain")]) == 2, "another run"
+    assert cli.main([*words, "--recalibration", str(tmp_path / "none.json"), "--out", str(tmp_path / "none")]) == 2
     fitted, other = (json.loads((tmp_path / n / "summary.json").read_text())["warnings"] for n in ("fitted", "mapped"))
     assert any("was fitted to this sequence" in text for text in fitted)
     assert not any("was fitted to this sequence" in text for text in other)
-    plain, mapped, none = (
+    plain, mapped = (
         np.stack([np.load(path)["variance"] for path in sorted((tmp_path / name / "frames").glob("*.npz"))])
-        for name in ("plain", "mapped", "none")
+        for name in ("plain", "mapped")
     )
-    np.testing.assert_array_equal(plain, none)
     assert (mapped[np.isfinite(mapped)] > 0).all()
     assert not np.array_equal(plain, mapped, equal_nan=True)
 

@@ -19,7 +19,16 @@ from ufmstar_torch.gaussians.camera import unproject
 from ufmstar_torch.kernels.cpu import regress as regress_cpu
 from ufmstar_torch.kernels.cpu.regress import fill_and_smooth
 from ufmstar_torch.kernels.cpu.vectors import vectors
-from ufmstar_torch.steps.regress import Regression, distribute, regress, regress_image, set_unmeasured, shares, smooth
+from ufmstar_torch.steps.regress import (
+    Regression,
+    distribute,
+    memory_for,
+    regress,
+    regress_image,
+    set_unmeasured,
+    shares,
+    smooth,
+)
 from ufmstar_torch.steps.sample import sample_pixels
 
 pytestmark = pytest.mark.numerics
@@ -184,6 +193,13 @@ def test_smooth_averages_where_both_are_known():
     memory, shown = smooth(before, current, 0.25)
     torch.testing.assert_close(memory, torch.tensor([[[1.5, 4.0, 2.0, nan]]]), equal_nan=True)
     torch.testing.assert_close(shown, torch.tensor([[[1.5, 4.0, nan, nan]]]).double(), equal_nan=True)
+
+
+def test_an_average_of_images_of_another_size_begins_again():
+    memory = torch.rand(2, 3, 4)
+    assert memory_for(memory, (3, 4)) is memory
+    assert memory_for(memory, (4, 3)).shape == (2, 4, 3)
+    assert memory_for(memory, (4, 3)).isnan().all()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from evaluations import KITCHEN, SHAPE
+from evaluations import KITCHEN, SHAPE, rows_of, write_evaluation, write_examples
 from PIL import Image
 
+from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics import NLL
 from ufmstar_torch.eval.report.data import load_results
 from ufmstar_torch.eval.report.examples import Example, RowMaps, find_examples
@@ -19,6 +20,7 @@ from ufmstar_torch.eval.report.pictures import (
     BREAKDOWN,
     COMPARE,
     NLL_SCALE,
+    OVERVIEW,
     STRIP,
     draw_comparison,
     draw_strip,
@@ -154,6 +156,16 @@ class TestWritePictures:
         assert [p.file.partition("-")[0] for p in pictures] == [STRIP, BREAKDOWN, COMPARE]
         assert all((evaluation / "figures" / p.file).is_file() for p in pictures)
         assert all(p.title.startswith(sequence) for p in pictures)
+
+    def test_the_first_picture_has_ufm_star_alone_beside_the_posterior(self, tmp_path: Path) -> None:
+        (alone,) = rows_of("UfM*-DepthOnly")
+        rows = [alone, replace(alone, setting=Setting(posterior=True, anchors="dense"))]
+        write_evaluation(tmp_path / "out", rows, [KITCHEN])
+        write_examples(tmp_path / "out", *KITCHEN, rows)
+        first = next(pictures_of(load_results(tmp_path / "out", with_sums=False), tmp_path))[1]()
+        assert first.file.startswith(OVERVIEW)
+        assert first.title.endswith("UfM* alone and with the posterior")
+        assert (tmp_path / first.file).is_file()
 
 
 @pytest.mark.parametrize(

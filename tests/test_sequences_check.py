@@ -104,10 +104,7 @@ def test_depth_agrees_five_frames_on(recording):
     assert max(errors) < 0.05
 
 
-SLOWER = [pytest.param(name, marks=pytest.mark.slow) for name in list(RECORDINGS)[1:]]
-
-
-@pytest.mark.parametrize("recording", [next(iter(RECORDINGS)), *SLOWER], indirect=True)
+@pytest.mark.slow  # test_data_check.py has the same mistakes in a rendered tour
 def test_the_check_recognises_inverted_poses_and_wrong_scale(recording):
     path, _, _, _, wrong_scale, factor = recording
     sequence = open_sequence(path)

@@ -51,18 +51,28 @@ LAYOUTS = {
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_the_files_that_macos_adds_are_no_frames(tmp_path, layout):
+def test_files_whose_names_begin_with_a_dot_are_no_frames(tmp_path, layout):
+    """Such as those that macOS adds, and unfinished downloads."""
     path = LAYOUTS[layout](tmp_path)
     path = path[0] if isinstance(path, tuple) else path
     before = open_sequence(path)
     for file in [file for file in tmp_path.rglob("*") if file.is_file()]:
-        (file.parent / f"._{file.name}").write_bytes(b"\x00\x05\x16\x07" + bytes(100))
+        for prefix in ("._", "."):
+            (file.parent / f"{prefix}{file.name}").write_bytes(b"\x00\x05\x16\x07" + bytes(100))
     after = open_sequence(path)
     assert (after.names, after.skipped, after.layout) == (before.names, before.skipped, layout)
     np.testing.assert_array_equal(after[-1].image, before[-1].image)
     if after.depth_size is not None:
         np.testing.assert_array_equal(after[-1].depth, before[-1].depth)
     assert [found.layout for found in find_sequences(tmp_path)] == [layout]
+
+
+def test_a_folder_of_depth_without_depth_maps_is_logged(tmp_path, caplog):
+    path, *_ = layouts.write_generic(tmp_path)
+    for file in (path / "depth").iterdir():
+        file.rename(file.with_suffix(".jpg"))
+    assert open_sequence(path)[0].depth is None
+    assert "depth holds no depth map (.png, " in caplog.text
 
 
 def backslashes(file, old):

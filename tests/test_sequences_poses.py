@@ -32,6 +32,9 @@ def write(tmp_path, text):
         ("7 0 -1 0 1  1 0 0 2  0 0 1 3", 7.0),
         ("0 -1 0 1  1 0 0 2  0 0 1 3  0 0 0 1", None),
         ("7 0 -1 0 1  1 0 0 2  0 0 1 3  0 0 0 1", 7.0),
+        (f"0.5,1,2,3,0,0,{QUARTER},{QUARTER},", 0.5),
+        (f"0.5; 1; 2; 3; 0; 0; {QUARTER}; {QUARTER}", 0.5),
+        (f"0.5 ,\t1 ,2, 3, 0, 0, {QUARTER} , {QUARTER}", 0.5),
     ],
 )
 def test_every_format_gives_the_same_pose(tmp_path, line, timestamp):
@@ -57,7 +60,9 @@ def test_rounded_quaternions_are_normalised(tmp_path):
         ("0 0 0 0 0 0 0 1\n# x\n1 0 0 0 0 0 zero 1\n", r"txt:3: expected a number, got 'zero'"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 1\n", r"txt:2: expected 8 numbers as in the first pose, got 7"),
         ("1 2 3\n", r"txt:1: expected a pose of .* got 3"),
-        ("0,0,0,0,0,0,0,1\n", r"txt:1: expected a number"),
+        ("0,5 0,5 0,5 0 0 0 1\n", r"txt:1: expected a number with a decimal point, got '0,5'"),
+        ("0,5;0,5;0,5;0;0;0;1\n", r"txt:1: expected a number with a decimal point, got '0,5'"),
+        ("0,5\t0,5\t0,5\t0\t0\t0\t1\n", r"txt:1: expected a number with a decimal point, got '0,5'"),
         ("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 2\n", r"txt:1: a pose's bottom row must be 0 0 0 1"),
         ("nan 0 0 0 0 0 0 1\n", r"txt:1: the timestamp must be finite"),
         ("# nothing\n", r"no pose found"),

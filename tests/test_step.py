@@ -176,7 +176,7 @@ def test_agrees_with_the_reference(compiled_backend, name, dtype, tolerance):
     if compiled_backend.name == "triton":  # as above
         config = config.replace(initial_capacity=config.max_components or 64)
     fast, reference = compiled_backend.module(config, dtype), UfMStar(config.replace(backend="torch"), dtype=dtype)
-    few = {"count": 2, "size": (21, 24)} if slow else {"count": 4, "size": (32, 48)}
+    few = {"count": 2, "size": (21, 24)} if slow else {"count": 3, "size": (24, 40)}
     for arguments, more in frames(config=config, dtype=dtype, streams=2, **few):
         a, b = tensors(fast(*arguments, **more)), tensors(reference(*arguments, **more))
         assert a.keys() == b.keys()
@@ -208,7 +208,7 @@ def test_a_stream_gives_the_same_bits_alone_and_on_any_number_of_threads(backend
     config = CONFIGS[name].replace(on_bad_frame="skip", backend=backend.name)
     counts = (1, 2, 3) if backend.name == "numba" else (1,)  # torch's sums are not deterministic
     # The reference processes an image row by row, so the images have few rows.
-    few = {"count": 4} if backend.name == "numba" else {"count": 3, "size": (24, 32)}
+    few = {"count": 4} if backend.name == "numba" else {"count": 2, "size": (21, 24)}
     together, alone = [UfMStar(config) for _ in counts], [UfMStar(config) for _ in range(3)]
     before = torch.get_num_threads()
     try:

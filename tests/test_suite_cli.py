@@ -44,9 +44,10 @@ def test_an_evaluation_ends_with_its_table_and_report(ufmstar, rooms, tmp_path):
     assert err.count("rooms/") == 3
     about = json.loads((out / "eval.json").read_text())
     assert about["settings"] == {"frames": [0, 2, None]}
-    code, _, err = ufmstar(*words_for(rooms, out, "--frames", "0:2"))
-    assert (code, "--resume goes on with it" in err) == (2, True)
-    code, _, err = ufmstar(*words_for(rooms, out, "--resume"))
+    code, again, err = ufmstar(*words_for(rooms, out, "--frames", "0:2", "--no-report"))
+    assert (code, "rooms/" in err) == (0, False), "the same command computes nothing again"
+    assert text.startswith(again)
+    code, _, err = ufmstar(*words_for(rooms, out))
     assert code == 2
     assert "settings.frames was [0, 2, null], now [null, null, null]" in err
 
@@ -60,7 +61,7 @@ def test_a_network_of_no_row_is_named(ufmstar, rooms, tmp_path):
         assert "--network ensemble=...: not used, suite depth-only has no row of it" in out + err
 
 
-def test_a_signal_stops_in_good_order_and_resume_goes_on(ufmstar, rooms, tmp_path, stubbed):
+def test_a_signal_stops_in_good_order_and_the_same_command_goes_on(ufmstar, rooms, tmp_path, stubbed):
     raised = []
 
     def before(name, done):
@@ -72,8 +73,8 @@ def test_a_signal_stops_in_good_order_and_resume_goes_on(ufmstar, rooms, tmp_pat
     assert code == 130
     assert "1 sequence" in text
     assert "stopped; finished rows are in " in err
-    assert "records; --resume continues" in err
-    assert ufmstar(*words_for(rooms, tmp_path / "out", "--resume", "--no-report"))[0] == 0
+    assert "records; the same command continues" in err
+    assert ufmstar(*words_for(rooms, tmp_path / "out", "--no-report"))[0] == 0
     assert [name for name, _ in stubbed.asked] == ["ash", "birch", "birch", "cedar"]
 
 
@@ -119,12 +120,10 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
     assert [one["sequence"] for one in written["sequences"]] == ["ash", "birch", "cedar"]
     assert measured == [(rows, name, None, 1) for name in ("ash", "birch", "cedar")]
     assert written["plan"]["frames"] == 9
-    assert ufmstar(*words, "--resume")[0] == 0
+    assert ufmstar(*words)[0] == 0
     assert len(measured) == 3
-    (tmp_path / "out" / "efficiency.json").unlink()
-    assert ufmstar(*words, "--resume", "--network", "depth_only=ground-truth:8x8")[0] == 0
-    written = json.loads((tmp_path / "out" / "efficiency.json").read_text())
-    assert (written["count"], [one["count"] for one in written["further"]]) == (5.0, [8.0]), "a second architecture"
+    code, _, err = ufmstar(*words, "--network", "depth_only=ground-truth:8x8")
+    assert (code, "every base once, got depth_only twice" in err) == (2, True)
 
 
 def test_a_warning_of_many_streams_is_logged_once(caplog):

@@ -118,5 +118,5 @@ def test_a_lost_scheduler_ends_the_evaluation_and_finished_records_remain(tmp_pa
     with pytest.raises(OSError, match="Timed out"), dask_cluster(address):
         pass
     (folder / "release").touch()
-    assert evaluate_suite(job, resume=True).finished
+    assert evaluate_suite(job).finished
     assert len(stored_results(job.out)) == 3

@@ -231,7 +231,7 @@ def test_every_inference_is_made_once(networks, sequence, monkeypatch):
 def test_skip_and_limit_choose_frames_and_turns(network_files, networks, sequence):
     members = members_of(network_files["ensemble"])
     one, two = row("UfM*-Ensemble", skip=1), row("UfM*-Ensemble")
-    result = evaluate(sequence, [one, two], networks, limit=slice(1, None))
+    result = evaluate(sequence, [one, two], networks, frames=slice(1, None))
     assert (result[one.slug].frames["done"], result[two.slug].frames["done"]) == (2, 4)
     skipping = judged(sequence, through(UfMStar(SKIP), members, sequence, indices=[1, 3]), [1, 3])
     assert agrees(result[one.slug].figures, skipping)
@@ -380,7 +380,7 @@ def test_a_sequence_that_cannot_be_used(networks, sequence, trouble):
         "no frames": "selected of 5",
     }
     with pytest.raises(SequenceError, match=message[trouble]):
-        evaluate(replace(sequence, entries=entries), [row("Aleatoric")], networks, limit=limit)
+        evaluate(replace(sequence, entries=entries), [row("Aleatoric")], networks, frames=limit)
 
 
 def test_sums_hold_all_that_the_figures_are_made_of(networks, sequence):

@@ -61,7 +61,7 @@ def test_the_real_judge_gives_what_it_gives_when_called_alone(rooms, tmp_path):
     go(job, evaluate_sequence)
     networks = job.load(torch.device("cpu"))
     for item in job.items:
-        for slug, result in evaluate(item.open(), job.suite.rows, networks, limit=job.frames).items():
+        for slug, result in evaluate(item.open(), job.suite.rows, networks, frames=job.frames).items():
             record = job.folder.records(item)[slug]
             assert record.frames["done"] == 2
             assert {k: v for k, v in record.figures.items() if v is not None} == {
@@ -71,12 +71,12 @@ def test_the_real_judge_gives_what_it_gives_when_called_alone(rooms, tmp_path):
     assert [path.parent.name for path in sorted(job.out.glob("records/*/*/examples"))] == ["ash"]
 
 
-def test_resume_computes_rows_and_sequences_added_since(rooms, tmp_path, whole):
+def test_the_same_evaluation_computes_rows_and_sequences_added_since(rooms, tmp_path, whole):
     job = job_on(rooms, tmp_path / "out")
     rows = job.suite.rows
     go(replace(job, suite=replace(job.suite, rows=rows[:2]), items=job.items[:2]))
     stub = Stub()
-    go(job, stub, resume=True)
+    go(job, stub)
     names = [row.method.name for row in rows]
     assert stub.asked == [("ash", names[2:]), ("birch", names[2:]), ("cedar", names)]
     assert stored_results(job.out) == whole
@@ -104,7 +104,7 @@ def test_a_broken_sequence_is_told_and_the_rest_goes_on(tmp_path, whole, rooms):
     # After the repair the sequence is evaluated again.
     write_rooms(root, ["birch"])
     stub = Stub()
-    assert go(job, stub, resume=True)[0].finished
+    assert go(job, stub)[0].finished
     assert [name for name, _ in stub.asked] == ["birch"]
     assert not job.folder.failures()
     assert stored_results(job.out) == whole
@@ -122,12 +122,12 @@ def test_what_the_judge_cannot_use_is_broken_and_what_it_cannot_write_ends_all(r
     job = job_on(rooms, tmp_path / "out")
     go(job, fails(SequenceError("no frame has ground truth")))
     assert job.folder.failures() == {("rooms", "birch"): "no frame has ground truth"}
-    go(job, fails(RuntimeError("out of memory")), resume=True)
+    go(job, fails(RuntimeError("out of memory")))
     assert job.folder.failures() == {("rooms", "birch"): "out of memory"}
     for error in (CacheError("disk full"), OSError("disk full"), TypeError("a mistake of ours")):
         with pytest.raises(type(error)):
-            go(job, fails(error), resume=True)
-    assert go(job, resume=True)[0].finished
+            go(job, fails(error))
+    assert go(job)[0].finished
 
 
 def test_images_without_poses_are_for_networks_alone(tmp_path):
@@ -142,7 +142,7 @@ def test_images_without_poses_are_for_networks_alone(tmp_path):
     assert "no poses" in failure["reason"]
     assert failure["rows"] == ["UfM-DepthOnly", "UfM-DepthOnly-100K", "UfMstar-DepthOnly"]
     assert sum("failed" in line for line in message) == 1
-    outcome, message = go(job, evaluate_sequence, resume=True)
+    outcome, message = go(job, evaluate_sequence)
     assert outcome.finished
     assert sum("failed" in line for line in message) == 1, "the failure is reported each time"
 
@@ -161,7 +161,7 @@ def test_poses_of_another_program(tmp_path):
     assert stored_results(job.out) == stored_results(tmp_path / "expected")
     assert json.loads((job.out / "eval.json").read_text())["settings"]["trajectory"] == "slam.txt"
     with pytest.raises(FolderError, match="settings"):
-        go(job_from(read(words)), resume=True)
+        go(job_from(read(words)))
     for wrong, message in (("--poses sideways", "--poses"), ("--fps 0", "fps must be positive")):
         with pytest.raises(ValueError, match=message):
             job_from(read([*words, *wrong.split()]))
@@ -174,7 +174,7 @@ def test_another_sequence_of_the_name_is_refused(tmp_path):
     poses = root / "ash" / "poses.txt"
     poses.write_text("\n".join(poses.read_text().splitlines()[::-1]))
     with pytest.raises(FolderError, match="rooms/ash has other frames, cameras or poses than when DepthOnly was"):
-        go(job, resume=True)
+        go(job)
 
 
 def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, whole, monkeypatch):
@@ -196,7 +196,7 @@ def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, who
     for file in (begun, mine):
         file.write_text("x")
     stub = Stub()
-    go(job, stub, resume=True)
+    go(job, stub)
     assert [(name, len(rows)) for name, rows in stub.asked] == [("birch", 2), ("cedar", 4)]
     assert (begun.exists(), mine.exists()) == (False, True), "temporary files of a killed process are removed"
     assert stored_results(job.out) == whole

@@ -93,17 +93,22 @@ def enter(*arguments, **how):
 def test_a_folder_is_begun_continued_and_replaced_only_as_asked(tmp_path):
     out = tmp_path / "out"
     enter(out, ABOUT)
-    with pytest.raises(FolderError, match="--resume goes on with it, --overwrite replaces it"):
-        enter(out, ABOUT)
-    enter(out, ABOUT, resume=True)
+    made = out / "records" / "d" / "s" / "A.json"
+    made.parent.mkdir(parents=True)
+    made.write_text("{}")
+    enter(out, ABOUT)
+    assert made.exists(), "the same evaluation continues"
+    with pytest.raises(FolderError, match="--overwrite replaces it"):
+        enter(out, {**ABOUT, "suite": "y"})
     enter(out, {**ABOUT, "suite": "y"}, overwrite=True)
     assert json.loads((out / "eval.json").read_text())["suite"] == "y"
+    assert not made.exists()
 
 
 def test_files_of_someone_else_are_not_touched(tmp_path):
     (tmp_path / "thesis.tex").write_text("x")
     with pytest.raises(FolderError, match="files of someone else"):
-        enter(tmp_path, ABOUT, resume=True)
+        enter(tmp_path, ABOUT)
     with pytest.raises(FolderError, match="files of someone else"):
         enter(tmp_path, ABOUT, overwrite=True)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
@@ -131,7 +136,7 @@ def test_overwriting_removes_our_files_alone(tmp_path):
 def test_a_folder_is_evaluated_by_one_process(tmp_path):
     out = tmp_path / "out"
     with evaluation_folder(out, ABOUT):
-        for how in ({"resume": True}, {"overwrite": True}):
+        for how in ({}, {"overwrite": True}):
             with pytest.raises(FolderError, match="another evaluation is writing there now"):
                 enter(out, ABOUT, **how)
     enter(out, ABOUT, overwrite=True)
@@ -146,13 +151,13 @@ def test_a_folder_is_evaluated_by_one_process(tmp_path):
         ({"settings": {"frames": [None, None, 2], "bins": "authors"}}, 'settings.bins was null, now "authors"'),
     ],
 )
-def test_resuming_something_else_is_refused_by_name(tmp_path, changed, told):
+def test_continuing_something_else_is_refused_by_name(tmp_path, changed, told):
     enter(tmp_path, ABOUT)
     with pytest.raises(FolderError, match=told):
-        enter(tmp_path, {**ABOUT, **changed}, resume=True)
+        enter(tmp_path, {**ABOUT, **changed})
 
 
-def test_resuming_adds_rows_sequences_and_networks(tmp_path):
+def test_continuing_adds_rows_sequences_and_networks(tmp_path):
     enter(tmp_path, ABOUT)
     more = {
         "networks": {"ensemble": {"sha256": "c"}},
@@ -160,7 +165,7 @@ def test_resuming_adds_rows_sequences_and_networks(tmp_path):
         "sequences": [{"dataset": "d", "sequence": "t"}],
         "missing_bases": ["aleatoric", "evidential"],
     }
-    enter(tmp_path, {**ABOUT, **more}, resume=True)
+    enter(tmp_path, {**ABOUT, **more})
     about = json.loads((tmp_path / "eval.json").read_text())
     assert about["networks"].keys() == {"aleatoric", "ensemble"}
     assert about["rows"] == [{"method": "A"}, {"method": "B"}]
@@ -177,7 +182,7 @@ def test_a_row_without_its_sums_or_with_half_a_record_is_missing(tmp_path):
     (folder.sequence_folder(item) / "DepthOnly.pt").unlink()
     (folder.sequence_folder(item) / "UfM-DepthOnly.json").write_text('{"format": 1')
     assert [row.method.name for row in folder.missing(item, rows)] == ["DepthOnly", "UfM-DepthOnly"]
-    go(job, resume=True)
+    go(job)
     assert folder.missing(item, rows) == []
 
 

@@ -203,6 +203,9 @@ each = { "segment.line_thresh" = [0.3, 0.6] }
     assert "UfM*-FullEnsemble" in {row.method.name for row in mine.rows}
 
 
+ROW = "[[rows]]\nmethods = ['UfM*-MCD']\n"
+
+
 @pytest.mark.parametrize(
     ("text", "told"),
     [
@@ -217,7 +220,14 @@ each = { "segment.line_thresh" = [0.3, 0.6] }
         ("rows = [1]", "rows 1 must be a table"),
         ("base = 'resnet'", "base must be one of ensemble"),
         ("bases = [1]", "bases must be a list of words"),
-        ("include = ['eta']", "no suite is called 'eta'"),
+        ("include = ['eta']", "include: no suite of the package is called 'eta'"),
+        ("include = ['../other.toml']", "include: no suite of the package is called '../other.toml'"),
+        ("include = ['bad.toml']", "include: no suite of the package is called"),
+        (f"{ROW}each = {{seed = {[*range(40)]}, skip = {[*range(40)]}}}", "the suite has more than 1000 rows"),
+        (f"{ROW}setting = {{anchors = '/etc/hosts.txt'}}", "anchors must be a file in the folder of each sequence"),
+        (f"{ROW}each = {{anchors = ['../hosts.txt']}}", "anchors must be a file in the folder of each sequence"),
+        (f"{ROW}setting = {{recalibration = '/etc/hosts'}}", "recalibration is no setting of a suite's file"),
+        (f"title = '{1_000_000 * 'x'}'", "larger than 1,000,000 bytes"),
         ("title = 'x'", "needs at least one row"),
         ("name = ", "Invalid value"),
         ("name = " + "[" * 200_000, "recursion"),

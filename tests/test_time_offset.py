@@ -9,7 +9,7 @@ import numpy as np
 import oracle_bundle
 import pytest
 import torch
-from landmark_runs import long_walks, true_depth, walk
+from landmark_runs import long_walk, true_depth, walk
 from scipy.spatial.transform import Rotation
 from shared_data import require_shared
 
@@ -103,7 +103,7 @@ def test_absurd_poses_and_errors_leave_a_finite_estimate(scale):
 
 
 def test_depths_of_late_poses_are_right_and_the_offset_is_named(caplog):
-    frames = long_walks()[1]
+    frames = long_walk(1)
     source, late = StreamLandmarks("dense"), [frames[0], *frames[:-1]]
     errors, lags = [], []
     with caplog.at_level(logging.WARNING, "ufmstar_torch"):
@@ -131,7 +131,9 @@ def test_the_estimate_is_saved_with_the_state():
     assert source.state()["corners_lag_information"].item() == 0
 
 
-@pytest.mark.parametrize("name", RECORDINGS)
+@pytest.mark.parametrize(
+    "name", [*RECORDINGS[:2], *(pytest.param(name, marks=pytest.mark.slow) for name in RECORDINGS[2:])]
+)
 def test_recordings_have_no_offset_until_their_poses_are_late(name):
     frames = list(islice(open_sequence(require_shared(f"data/{name}")).readable(lambda error: None), 31))
     K = frames[0].intrinsics

@@ -216,16 +216,16 @@ def world_points(tour: Tour, pose: torch.Tensor) -> torch.Tensor:
 
 def test_neighbouring_frames_overlap_and_places_are_seen_again(home):
     poses = tour_path(home, 150)
-    pairs = [(poses[i], poses[i + 1]) for i in range(0, 149, 5)]
+    pairs = [(poses[i], poses[i + 1]) for i in range(0, 149, 10)]
     shares = [float(seen_from(home, world_points(home, a), b).double().mean()) for a, b in pairs]
     assert min(shares) > 0.5
     assert np.median(shares) > 0.7
     assert len(set(rooms_at(home, poses[:, :3, 3]).tolist())) > 1, "the path leads through a doorway"
     for i in range(0, 60, 12):
         early = world_points(home, poses[i])
-        seen = np.array([float(seen_from(home, early, pose).double().mean()) for pose in poses[i::3]])
+        seen = np.array([float(seen_from(home, early, pose).double().mean()) for pose in poses[i::6]])
         gone = np.flatnonzero(seen < 0.05)
-        if len(gone) and (seen[max(gone.min(), 11) :] > 0.3).any():  # 11 x 3 frames later
+        if len(gone) and (seen[max(gone.min(), 6) :] > 0.3).any():  # 6 x 6 frames later
             return
     pytest.fail("a place must leave the view and come back")
 
@@ -378,7 +378,7 @@ def test_a_tour_with_movers_has_their_mask_and_their_depth_and_is_unchanged_besi
     name = "tour:62?style=hall&frames=30&size=48x64&sensor=0"
     plain, moved = open_sequence(name), open_sequence(f"{name}&movers=4")
     shares = []
-    for a, b in zip(plain, moved, strict=True):
+    for a, b in ((plain[i], moved[i]) for i in range(1, 30, 4)):
         assert a.moving is None
         np.testing.assert_array_equal(a.T_world_cam, b.T_world_cam)
         np.testing.assert_array_equal(a.depth[~b.moving], b.depth[~b.moving])
@@ -387,7 +387,7 @@ def test_a_tour_with_movers_has_their_mask_and_their_depth_and_is_unchanged_besi
     assert 0.02 < np.mean(shares) < 0.4
     again = open_sequence(f"{name}&movers=4")
     np.testing.assert_array_equal(again[7].image, moved[7].image)
-    assert in_memory(moved)[7].moving.dtype == bool
+    assert in_memory(open_sequence("tour:62?style=hall&frames=1&size=24x32&movers=1"))[0].moving.dtype == bool
     with pytest.raises(ValueError, match="movers must be a number of at least 0"):
         open_sequence(f"{name}&movers=-1")
 

@@ -77,10 +77,13 @@ def test_a_frozen_network_keeps_its_depth_and_gets_a_variance(frames, tmp_path):
         load_trained(tmp_path / "trained.safetensors")
 
 
-@pytest.mark.parametrize("fine_tune", [False, True])
 @pytest.mark.parametrize(
-    ("head", "members"), [("evidential", None), ("mc-dropout", None), ("ensemble", 2), ("batch-ensemble", 2)]
-)
+    ("head", "members", "fine_tune"),
+    [
+        ("evidential", None, False), ("evidential", None, True), ("mc-dropout", None, False), ("ensemble", 2, True),
+        ("batch-ensemble", 2, False),
+    ],
+)  # fmt: skip
 def test_every_head_on_a_module(frames, tmp_path, head, members, fine_tune):
     trained = train(Own(), head, frames, tmp_path, fine_tune=fine_tune, members=members)
     loaded = load_trained(tmp_path / "trained.safetensors", backbone=Own())
@@ -95,11 +98,11 @@ def test_every_head_on_a_module(frames, tmp_path, head, members, fine_tune):
 
 
 def test_a_training_goes_on_and_starts_another(frames, tmp_path):
-    """Resuming a finished training changes nothing. Its weights can start an ensemble and a network with another
+    """The same training again changes nothing. Its weights can start an ensemble and a network with another
     head."""
     train(Own(), "aleatoric", frames, tmp_path / "a")
     first = (tmp_path / "a" / "trained.safetensors").read_bytes()
-    train(Own(), "aleatoric", frames, tmp_path / "a", resume=True)
+    train(Own(), "aleatoric", frames, tmp_path / "a")
     assert len((tmp_path / "a" / "trained.safetensors").read_bytes()) == len(first)
     start = {"settings": {**QUIET, "init": tmp_path / "a" / "trained.safetensors"}, "max_steps": 1}
     trained = load_network("trained", tmp_path / "a" / "trained.safetensors", backbone=Own())

@@ -58,11 +58,11 @@ def test_interrupted_in_every_epoch_it_goes_on_from_the_last_whole_one_bit_for_b
         with monkeypatch.context() as patch:
             stop_in(patch, epoch)
             with pytest.raises(KeyboardInterrupt):
-                fit(job, resume=True)
+                fit(job)
         summary = json.loads((tmp_path / "out" / "summary.json").read_text())
         assert (summary["stopped"], summary["members"][0]["steps"]) == ("interrupted", 3 * epoch)
         assert (tmp_path / "out" / WEIGHTS).is_file()
-    assert fit(job, resume=True)["stopped"] is None
+    assert fit(job)["stopped"] is None
     mine, theirs = (trained(one).state_dict() for one in (job, whole))
     assert [key for key in theirs if not torch.equal(mine[key], theirs[key])] == []
     states = [stored(folder)["optimizer_states"][0]["state"] for folder in (tmp_path / "out", tmp_path / "whole")]
@@ -82,9 +82,9 @@ def test_a_time_budget_is_shared_by_the_members_and_resuming_goes_on(frames, tmp
     assert len(load_trained(tmp_path / "out" / WEIGHTS)) == 2
     seconds = [m["seconds"] for m in summary["members"]]
     # Each session has its own budget.
-    summary = fit(tiny_job(frames, tmp_path / "out", recipe, max_minutes=1e-9), resume=True)
+    summary = fit(tiny_job(frames, tmp_path / "out", recipe, max_minutes=1e-9))
     assert [m["steps"] for m in summary["members"]] == [2, 2]
-    summary = fit(tiny_job(frames, tmp_path / "out", recipe), resume=True)
+    summary = fit(tiny_job(frames, tmp_path / "out", recipe))
     assert summary["stopped"] is None
     assert [(m["steps"], m["finished"]) for m in summary["members"]] == [(6, True), (6, True)]
     assert all(m["seconds"] >= before for m, before in zip(summary["members"], seconds, strict=True))
@@ -105,15 +105,15 @@ def test_a_finished_member_is_not_trained_again(frames, tmp_path, monkeypatch):
             fit(tiny_job(frames, out, recipe))
     first = out / "member_0"
     before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in first.iterdir() if path.is_file()}
-    summary = fit(tiny_job(frames, out, recipe), resume=True)
+    summary = fit(tiny_job(frames, out, recipe))
     assert [m["finished"] for m in summary["members"]] == [True, True]
     assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in before} == before
     both = read_safetensors(out / WEIGHTS)[0]
     key = "backbone.encoder.0.conv.weight"
     assert not torch.equal(both[f"member.0.{key}"], both[f"member.1.{key}"])
-    # Resuming a finished training trains nothing; further members are added.
+    # The same training, when it is finished, trains nothing; further members are added.
     more = replace(recipe, members=3)
-    assert [m["seed"] for m in fit(tiny_job(frames, out, more), resume=True)["members"]] == [0, 1, 2]
+    assert [m["seed"] for m in fit(tiny_job(frames, out, more))["members"]] == [0, 1, 2]
     assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in before} == before
 
 
@@ -148,7 +148,7 @@ def test_signals_end_the_command_and_leave_the_last_epoch(ufmstar, frames, tmp_p
     before = signal.getsignal(number)
     code, _, err = ufmstar(*words, "--out", tmp_path / "out")
     assert signal.getsignal(number) == before
-    assert (code, err) == (130, "ufmstar train: interrupted; --resume goes on with the last whole epoch\n")
+    assert (code, err) == (130, "ufmstar train: interrupted; the same command goes on with the last whole epoch\n")
     assert stored(tmp_path / "out")["global_step"] == 3
     assert len(load_trained(tmp_path / "out" / WEIGHTS)) == 1
 
@@ -179,10 +179,10 @@ def test_a_damaged_checkpoint_is_named(frames, tmp_path):
     for broken in (whole[: len(whole) // 2], b"", b"hello"):
         file.write_bytes(broken)
         with pytest.raises(ResumeError, match=r"last\.ckpt cannot be read .*--overwrite"):
-            fit(job, resume=True)
+            fit(job)
     torch.save({"weights": torch.ones(1)}, file)
     with pytest.raises(ResumeError, match="no checkpoint of this program"):
-        fit(job, resume=True)
+        fit(job)
     assert fit(job, overwrite=True)["stopped"] is None
 
 
@@ -190,8 +190,6 @@ def test_a_folder_is_refused_that_is_not_this_training(frames, tmp_path):
     recipe = replace(RECIPE, epochs=1, max_steps=1)
     job = tiny_job(frames, tmp_path / "out", recipe)
     fit(job)
-    with pytest.raises(FolderError, match="--resume goes on with it, --overwrite replaces it"):
-        fit(job)
     others = [
         (replace(job, recipe=replace(recipe, learning_rate=0.5)), r"recipe\.learning_rate was 0\.01, now 0\.5"),
         (replace(job, settings=replace(job.settings, seed=3)), "seed was 0, now 3"),
@@ -199,10 +197,10 @@ def test_a_folder_is_refused_that_is_not_this_training(frames, tmp_path):
     ]
     for other, message in others:
         with pytest.raises(FolderError, match=message):
-            fit(other, resume=True)
+            fit(other)
     # Settings that only affect the speed do not make another training.
     same = replace(job, settings=replace(job.settings, log_every=7, max_minutes=3.0))
-    assert fit(same, resume=True)["stopped"] is None
+    assert fit(same)["stopped"] is None
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "thesis.tex").write_text("x")
     with pytest.raises(FolderError, match="files of someone else"):
@@ -227,6 +225,6 @@ def test_a_folder_in_use_is_refused(frames, tmp_path):
     with (
         open_folder(job),
         pytest.raises(FolderError, match="another training is writing there"),
-        open_folder(job, resume=True),
+        open_folder(job),
     ):
         pass

@@ -10,9 +10,11 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from modules import same
 
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.frames.image_check import ImageCheck, reduced, shows_something
+from ufmstar_torch.frames.image_evidence import ImageEvidence
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.models import Preprocess, wrap_network
 from ufmstar_torch.steps.fuse import COMPLETE, LEAST, after_view, view_weights
@@ -205,6 +207,22 @@ def test_a_frozen_image_of_a_moving_camera_measures_nothing(caplog):
         out = walk_of([scene()] * 14)
     assert float(out.measured.nanmean()) == 0
     assert [text for text in caplog.messages if "the image was the same in 9 frames of a moving camera" in text]
+
+
+def test_an_image_that_is_refused_is_forgotten_by_all_that_read_it():
+    """The same image at another pose is then no repeated one, and corners continue from the image before."""
+    evidence = ImageEvidence("corners", by_default=True, check_poses=0, rotation_tolerance=0.01)
+    image, source = torch.from_numpy(scene()).permute(2, 0, 1)[None], evidence.landmarks
+    how = {"K": K, "anchors": None, "device": torch.device("cpu"), "search": True, "skip": False}
+    with evidence.next_image(image.roll(9, 3), pose_at(0.0), **how) as (_, informative):
+        assert informative.all()
+    before = source.state()
+    with pytest.raises(OverflowError), evidence.next_image(image, pose_at(0.1), **how):
+        raise OverflowError
+    assert all(same(value, before[name]) for name, value in source.state().items())
+    with evidence.next_image(image, pose_at(0.2), **how) as (_, informative):
+        assert informative.all()
+    assert not all(same(value, before[name]) for name, value in source.state().items())
 
 
 def test_equal_poses_of_moving_images_are_named(caplog):

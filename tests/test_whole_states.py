@@ -119,9 +119,9 @@ DAMAGED = {
     "an image in floats": ("anchored", "landmarks.0.gray", torch.Tensor.double, r"state\['gray'\] must have shape"),
     "a key frame in floats": (
         "dense",
-        "landmarks.0.image0",
+        "landmarks.0.images",
         torch.Tensor.double,
-        r"state\['image0'\] must have shape",
+        r"state\['images'\] must have shape",
     ),
     "depths of infinity": ("dense", "landmarks.0.landmark_sigma", at_end(torch.inf), "landmark_sigma.* must be finite"),
     "a checksum in floats": ("plain", "weights_mark", torch.Tensor.double, "weights_mark must be a whole number"),
@@ -214,5 +214,5 @@ def test_a_few_mutated_states(kind):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_hundreds_of_mutated_states(kind):
-    assert load_mutated(kind, range(100, 400)) > 100
+def test_many_mutated_states(kind):
+    assert load_mutated(kind, range(100, 220)) > 40

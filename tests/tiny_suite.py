@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from layouts import write_generic
 
-from ufmstar_torch.eval.engine.evaluate import Judge, evaluate_sequence
+from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.engine.record import Record
@@ -99,8 +99,7 @@ def rows_of(*names, **setting):
 
 def evaluate(sequence, rows, networks, store=None, *, progress=lambda _: None, stop=lambda: False, **options):
     """Evaluate a sequence on the CPU: {slug of the row: result}."""
-    examples, judge = options.pop("examples", None), Judge(networks, CPU, store, **options)
-    results = evaluate_sequence(sequence, rows, judge, examples=examples, progress=progress, stop=stop)
+    results = evaluate_sequence(sequence, rows, networks, cache=store, progress=progress, stop=stop, **options)
     assert [result.row for result in results] == list(rows)
     return {result.row.slug: result for result in results}
 

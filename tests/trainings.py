@@ -36,8 +36,8 @@ def scenes(count, size=SIZE, noisy=False):
 
 
 def write_frames(root, frames=16, size=SIZE, noise=0.0, seed=0):
-    """A generic sequence of :func:`scenes`. With ``noise`` [m], the stored depth of the red half is too large or too
-    small by that much, at random with ``seed``."""
+    """Images and depth of :func:`scenes`, without poses: a training would check them. With ``noise`` [m], the stored
+    depth of the red half is too large or too small by that much, at random with ``seed``."""
     images, depths, holes, red = scenes(frames, size, noisy=noise > 0)
     sign = np.random.default_rng(seed).choice([-1, 1], depths.shape)
     stored = np.where(holes, 0, depths + np.where(red, noise * sign, 0))
@@ -45,7 +45,6 @@ def write_frames(root, frames=16, size=SIZE, noise=0.0, seed=0):
         write_image(root / "images" / f"{i:03}.png", images[i])
         write_depth_png(root / "depth" / f"{i:03}.png", stored[i], 1000)
     np.savetxt(root / "K.txt", [[30, 0, 15.5], [0, 30, 15.5], [0, 0, 1]])
-    np.savetxt(root / "poses.txt", [np.eye(4).ravel()] * frames)
     return root
 
 

@@ -84,7 +84,7 @@ class SessionOptions:
         devices: Use this many processes or GPUs.
         nodes: Use this many computers.
         trainable: Train only parameters whose names begin with one of these.
-        max_minutes: Stop after this time (0: no limit), with a validation and the weights; --resume continues.
+        max_minutes: Stop after this time (0: no limit), with a validation and the weights.
         no_progress: Show no progress bar.
         no_tensorboard: Write no logs for TensorBoard.
     """
@@ -111,8 +111,7 @@ class TrainOptions:
         list: Print the presets and stop.
         preset: Train what this preset states.
         members: The ensemble or BatchEnsemble has this many members.
-        out: Write all results to this folder.
-        resume: Continue the training in --out.
+        out: Write all results to this folder; a training there with the same settings continues.
         overwrite: Replace the training in --out.
         threads: Use this many CPU threads (default: one for each core).
         epochs: Train for this many epochs instead of the preset's.
@@ -131,7 +130,6 @@ class TrainOptions:
     preset: Text = None
     members: Count = None
     out: Folder = None
-    resume: Flag = False
     overwrite: Flag = False
     threads: Count = None
     epochs: Count = None
@@ -190,8 +188,6 @@ class TrainOptions:
         recipe = None if chosen.backbone is not None else self.recipe()
         if d.data is None or self.out is None:
             raise ValueError(f"--{'data' if d.data is None else 'out'} is missing; ufmstar train --help")
-        if self.resume and self.overwrite:
-            raise ValueError("--resume and --overwrite contradict each other")
         if (d.data == "tour") == bool(d.root):
             raise ValueError(f"--data {d.data} {'takes no' if d.root else 'needs'} --root")
         augmentation = None if d.no_augmentation else AugmentationConfig(**self.changes["augment"])
@@ -267,9 +263,9 @@ def main(options: _Command) -> int:
         print(f"ufmstar train: {remark}", file=sys.stderr)
     try:
         command = ["ufmstar", "train", *options.words]
-        summary = fit(job, resume=options.resume, overwrite=options.overwrite, command=command)
+        summary = fit(job, overwrite=options.overwrite, command=command)
     except KeyboardInterrupt:
-        print("ufmstar train: interrupted; --resume goes on with the last whole epoch", file=sys.stderr)
+        print("ufmstar train: interrupted; the same command goes on with the last whole epoch", file=sys.stderr)
         return 130
     except FrameError as error:
         raise ValueError(f"{error} (--set data.on_bad_file=skip leaves such files out)") from error
@@ -279,5 +275,5 @@ def main(options: _Command) -> int:
     print(f"{job.settings.out}: trained.safetensors, summary.json, member_*/, tensorboard/")
     if summary["stopped"] is None:
         return 0
-    print(f"ufmstar train: {summary['stopped']}; --resume goes on", file=sys.stderr)
+    print(f"ufmstar train: {summary['stopped']}; the same command goes on", file=sys.stderr)
     return 130

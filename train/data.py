@@ -76,7 +76,7 @@ class DepthDataModule(LightningDataModule):
         rank, world, epoch = 0, 1, 0
         if self.trainer is not None:
             rank, world = self.trainer.global_rank, self.trainer.world_size
-            # Workers prefetch before Lightning sets the epoch, which is not 0 in a resumed training.
+            # Workers prefetch before Lightning sets the epoch, which is not 0 in a continued training.
             progress: Any = self.trainer.fit_loop.epoch_progress.current
             epoch = progress.processed
         # The order of an epoch is drawn with the sum of seed and epoch: no two trainings share one.

@@ -31,12 +31,12 @@ from ufmstar_torch.train.presets import text_table
 from ufmstar_torch.train.settings import Job
 
 
-def fit(job: Job, *, resume: bool = False, overwrite: bool = False, command: Sequence[str] = ()) -> dict[str, Any]:
+def fit(job: Job, *, overwrite: bool = False, command: Sequence[str] = ()) -> dict[str, Any]:
     """Train all members that are not finished, and write OUT/trained.safetensors and OUT/summary.json.
 
     Args:
         job: recipe, data and settings.
-        resume, overwrite: treatment of an earlier training in the folder; see ``folder.open_folder``.
+        overwrite: True to replace an earlier training in the folder, which otherwise continues.
         command: the command line, for the summary.
 
     Returns:
@@ -44,7 +44,7 @@ def fit(job: Job, *, resume: bool = False, overwrite: bool = False, command: Seq
         processes except the first return an empty one.
 
     Raises:
-        FolderError: the folder cannot be used with these options.
+        FolderError: the folder cannot be used.
         NonFiniteLossError: a training has diverged.
         ResumeError: a checkpoint cannot be read.
         KeyboardInterrupt: Ctrl-C or SIGTERM. After this and after other errors, the weights of the checkpoints are
@@ -55,11 +55,11 @@ def fit(job: Job, *, resume: bool = False, overwrite: bool = False, command: Seq
     with quiet_lightning():
         trainer = make_trainer(job, 0)
     first = trainer.is_global_zero
-    folder = open_folder(job, resume=resume, overwrite=overwrite) if first else nullcontext()
+    folder = open_folder(job, overwrite=overwrite) if first else nullcontext()
     with folder, torch.random.fork_rng(devices=range(torch.cuda.device_count())):
         try:
             _meet(trainer, job.settings.out)
-            stopped = train_members(job, began)
+            train_members(job, began)
         except BaseException as error:
             if first:
                 stopped = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
@@ -68,7 +68,7 @@ def fit(job: Job, *, resume: bool = False, overwrite: bool = False, command: Seq
                 except (OSError, ValueError) as unwritten:  # the reason of the stop matters more
                     LOGGER.warning("the weights so far cannot be written: %s", unwritten)
             raise
-        return _conclude(job, stopped, time.monotonic() - began, command) if first else {}
+        return _conclude(job, None, time.monotonic() - began, command) if first else {}
 
 
 def _meet(trainer: pl.Trainer, out: Path) -> None:
@@ -83,18 +83,15 @@ def _meet(trainer: pl.Trainer, out: Path) -> None:
         raise FolderError(f"--out {out} does not exist: all machines must see the folder of the first process")
 
 
-def train_members(job: Job, began: float) -> str | None:
+def train_members(job: Job, began: float) -> None:
     """Train the unfinished members. The time that remains of ``max_minutes`` since ``began``, in
-    ``time.monotonic()``'s seconds, is divided evenly among them. Returns the reason of a stop, or None if all are
-    finished."""
+    ``time.monotonic()``'s seconds, is divided evenly among them."""
     members = [member for member in range(job.recipe.members) if not _result(job, member).get("finished")]
     most = 60 * job.settings.max_minutes
     for index, member in enumerate(members):
         remaining = (began + most - time.monotonic()) / (len(members) - index)
         # Timer takes whole microseconds, at least one.
         train_member(job, member, seconds=max(1e-6, remaining) if most else None)
-    finished = all(_result(job, member).get("finished") for member in members)
-    return None if finished else "time budget spent"
 
 
 def _result(job: Job, member: int) -> dict[str, Any]:
@@ -103,10 +100,13 @@ def _result(job: Job, member: int) -> dict[str, Any]:
 
 
 def _conclude(job: Job, stopped: str | None, seconds: float, command: Sequence[str]) -> dict[str, Any]:
-    """Write all members that have weights to one file, and the summary."""
+    """Write all members that have weights to one file, and the summary. ``stopped`` is the reason of a stop; None: the
+    time budget, if members are unfinished."""
     r, out = job.recipe, job.settings.out
     stored = {m: content for m in range(r.members) if (content := read_checkpoint(job, m)) is not None}
     results = [result_of(job, m, content) for m, content in stored.items()]
+    if stopped is None and (len(results) < r.members or not all(result["finished"] for result in results)):
+        stopped = "time budget spent"
     gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
     summary = {
         "program": "ufmstar train",

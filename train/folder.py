@@ -36,15 +36,15 @@ def identity(job: Job) -> dict[str, Any]:
 
 
 @contextmanager
-def open_folder(job: Job, *, resume: bool = False, overwrite: bool = False) -> Iterator[None]:
+def open_folder(job: Job, *, overwrite: bool = False) -> Iterator[None]:
     """Prepare and lock the folder ``job.settings.out``; see ``output_folder``."""
     content = {"identity": identity(job)}
-    with output_folder(job.settings.out, TRAINING, content, resume=resume, overwrite=overwrite):
+    with output_folder(job.settings.out, TRAINING, content, overwrite=overwrite):
         yield
 
 
 def _fixed(manifest: Mapping[str, Any], _: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The identity without the number of members, which may increase when a training is resumed."""
+    """The identity without the number of members, which may increase when a training continues."""
     stored = manifest["identity"]
     return {**stored, "recipe": {name: value for name, value in stored["recipe"].items() if name != "members"}}
 

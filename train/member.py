@@ -69,9 +69,9 @@ def read_checkpoint(job: Job, member: int) -> dict[str, Any] | None:
         with path.open("rb") as file:
             stored = read_tensors(file, "it")
     except (OSError, ValueError) as error:
-        raise ResumeError(f"--resume: {path} cannot be read ({error}); --overwrite starts again") from error
+        raise ResumeError(f"{path} cannot be read ({error}); --overwrite starts again") from error
     if not isinstance(stored, dict) or OF_MEMBER not in stored:
-        raise ResumeError(f"--resume: {path} is no checkpoint of this program; --overwrite starts again")
+        raise ResumeError(f"{path} is no checkpoint of this program; --overwrite starts again")
     return stored
 
 

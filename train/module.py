@@ -39,7 +39,7 @@ class TrainingModule(pl.LightningModule):
     """Trains one network.
 
     The random numbers of an epoch (augmentation, dropout) depend only on (seed, process, epoch), so that a training
-    that is resumed after an epoch gives the same weights as an uninterrupted one.
+    that continues after an epoch gives the same weights as an uninterrupted one.
 
     Args:
         network: an ``UncertaintyNetwork``, ``MonteCarloDropout`` or ``BatchEnsemble``, with ``.distribution(image)``.

@@ -28,7 +28,7 @@ def convert_labelled(
 ) -> dict[str, int]:
     """Convert ``nyu_depth_v2_labeled.mat`` (MATLAB 7.3, which is HDF5) to FastDepth's layout.
 
-    Files are written atomically; existing files are not replaced, so that an interrupted conversion can be resumed.
+    Files are written atomically; existing files are not replaced; an interrupted conversion continues.
 
     Args:
         mat: the labelled dataset: ``images`` [N, 3, W, H], ``depths`` and ``rawDepths`` [N, W, H] [m]

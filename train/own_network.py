@@ -35,7 +35,6 @@ def train_module(
     data: DataConfig,
     out: str | Path,
     *,
-    resume: bool = False,
     overwrite: bool = False,
     settings: Mapping[str, Any] | None = None,
     **options: Any,
@@ -46,7 +45,7 @@ def train_module(
     Args:
         backbone, head, data, options: see :func:`own_job`.
         out: folder for all results.
-        resume, overwrite: see ``fit``.
+        overwrite: see ``fit``.
         settings: other fields of ``FitSettings``.
 
     Returns:
@@ -59,7 +58,7 @@ def train_module(
     from ufmstar_torch.train.folder import WEIGHTS
 
     job = own_job(backbone, head, data, FitSettings(out=Path(out), **(settings or {})), **options)
-    fit(job, resume=resume, overwrite=overwrite)
+    fit(job, overwrite=overwrite)
     return load_ensemble(Path(out) / WEIGHTS, job.backbone).eval()
 
 

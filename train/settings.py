@@ -30,8 +30,7 @@ class FitSettings(Checked):
             scripts ("ddp", not "ddp_spawn").
         precision: 32-true, bf16-mixed or 16-mixed; the loss is in float32 always.
         log_every: steps between rows of metrics.csv.
-        max_minutes: after which this session stops, all members together, with a validation; --resume goes on. 0 =
-            never.
+        max_minutes: after which this session stops, all members together, with a validation. 0 = never.
         sync_batchnorm: whether batch norm uses the batches of all processes (GPUs only).
         tensorboard: whether to write logs for TensorBoard.
         progress: whether to show a progress bar.

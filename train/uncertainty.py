@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from ufmstar_torch.anchors.sources import DENSE
-from ufmstar_torch.eval.engine.evaluate import Judge, evaluate_sequence
+from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.engine.record import METRICS
 from ufmstar_torch.eval.methods.method import UFM_STAR, Method
@@ -66,10 +66,11 @@ def judge_network(
     where, totals = torch.device(device), dict[str, SequenceMetrics]()
     with in_eval_mode(depth):
         source = NetworkSource(NetworksInTurn([depth], preprocess=depth.preprocess), where, {})
-        judge = Judge({_BASE: source}, where, limit=slice(frames))
+        how: dict[str, Any] = {"device": where, "frames": slice(frames)}
         for sequence in sequences:
             opened = sequence if isinstance(sequence, FrameSequence) else open_sequence(sequence)
-            for name, result in zip(rows, evaluate_sequence(opened, [ROWS[n] for n in rows], judge), strict=True):
+            results = evaluate_sequence(opened, [ROWS[n] for n in rows], {_BASE: source}, **how)
+            for name, result in zip(rows, results, strict=True):
                 metrics = SequenceMetrics(with_variance="nll" in result.figures)
                 metrics.load_state_dict(result.sums[METRICS])
                 totals.setdefault(name, SequenceMetrics(with_variance=metrics.with_variance)).merge_state(metrics)

@@ -29,7 +29,6 @@ from ufmstar_torch.frames.clock import require_stamp
 from ufmstar_torch.frames.frame import FRAME_FAULTS, NOT_FINITE
 from ufmstar_torch.frames.image_queue import CLOSED, ImageQueue, QueuedImage
 from ufmstar_torch.frames.output import UncertaintyOutput
-from ufmstar_torch.kernels.cpu.check import pose_fault
 from ufmstar_torch.uncertain_depth import UncertainDepth
 
 
@@ -116,7 +115,7 @@ class LiveDepth:
         if not callable(on_result):
             raise TypeError(f"on_result must be callable, got {type(on_result).__name__}")
         self._intrinsics = None if intrinsics is None else as_intrinsics(intrinsics)
-        self._state = None if state is None else StateFile(as_path("state", state), model)
+        self._state = None if state is None else StateFile(as_path("state", state), model.load_stream_state)
         self.model, self._on_result = model, on_result
         self._save_every = save_every
         self._changed = Condition()  # guards everything below
@@ -229,17 +228,21 @@ class LiveDepth:
             self._worker.join()
 
     def _run(self) -> None:
-        with ExitStack() as stack:
+        with ExitStack() as stack:  # in reverse order, whatever fails
+            stack.callback(self._finish)
+            stack.push(self._keep_error)
+            if self._state is not None:
+                stack.callback(self._state.release)
             stack.push(self._keep_error)
             self._work()
-        if self._state is not None:
-            self._state.release()
+
+    def _finish(self) -> None:
         with self._changed:
             self._busy, self._ended = False, True
             self._changed.notify_all()
 
     def _keep_error(self, _: object, error: BaseException | None, __: object) -> bool:
-        self._error = error
+        self._error = self._error or error
         return True
 
     def _work(self) -> None:
@@ -284,7 +287,7 @@ class LiveDepth:
 
     def _save(self) -> None:
         if self._state is not None:
-            self._state.save(self.model)
+            self._state.save(self.model.stream_state())
             with self._changed:
                 self._counts["saved"] += 1
 
@@ -295,7 +298,9 @@ def _pose(T: CameraLike, tolerance: float) -> np.ndarray:
     if pose.dim() != 2:
         raise ValueError(f"T must be one pose, [4, 4] or [3, 4], got {tuple(pose.shape)}")
     rigid = np.array(pose.numpy())
-    fault = pose_fault(rigid.tolist(), tolerance)
+    from ufmstar_torch.kernels.cpu.check import camera_faults  # kernels compile when they are first needed
+
+    [fault] = camera_faults(rigid[None], np.eye(3)[None], (1, 1), tolerance)
     if fault == NOT_FINITE:
         return np.full((4, 4), np.nan)
     if fault:

@@ -120,24 +120,13 @@ class UfMStar(StatefulModule):
                 confidence that the config does not use.
         """
         depth = as_tensor("depth", depth)
-        a, e = (None if v is None else as_tensor(n, v) for n, v in (("aleatoric", aleatoric), ("epistemic", epistemic)))
+        a = None if aleatoric is None else as_tensor("aleatoric", aleatoric)
+        e = None if epistemic is None else as_tensor("epistemic", epistemic)
         frame = self._checked(
             depth, pose, intrinsics, a, e, valid, features, member=member, informative=informative, anchors=anchors,
             confidence=confidence,
         )  # fmt: skip
-        out = self._observe(frame)
-        network = {} if self.config.variances_in_h else {"aleatoric": a, "epistemic": e}
-        maps = {**out.maps, **network, "network_depth": depth, "confidence": frame.confidence}
-
-        def shaped(value: Tensor) -> Tensor:  # the argument may be [B, 1, H, W]
-            return value if value.shape == depth.shape else value.reshape(depth.shape)
-
-        named = {name: shaped(value) for name, value in maps.items() if name != "features" and value is not None}
-        if self.config.features:
-            named["features"] = out.features[..., : self.config.features]
-        best = depth if self.config.posterior is None else shaped(out.depth)
-        variance, valid = shaped(out.variance), shaped(out.valid)
-        return replace(out, depth=best, variance=variance, valid=valid, maps=named)
+        return self._observe(frame, network={"network_depth": depth, "aleatoric": a, "epistemic": e})
 
     if TYPE_CHECKING:
         __call__ = forward
@@ -278,11 +267,14 @@ class UfMStar(StatefulModule):
         self._doubts.judge(anchors, checked, frame.size)
         return replace(frame, anchors=checked)
 
-    def _observe(self, frame: FrameInput, pixels: Tensor | None = None, *, average: bool = True) -> UncertaintyOutput:
-        """Run the step and the corrections by anchors, and store the new state. The maps are [B, H, W], or [B, n] at
-        ``pixels``, indices into the flattened image."""
+    def _observe(
+        self, frame: FrameInput, pixels: Tensor | None = None, *, average: bool = True,
+        network: Mapping[str, Tensor | None] | None = None,
+    ) -> UncertaintyOutput:  # fmt: skip
+        """Run the step and the corrections by anchors, and store the new state. The maps are [B, n] at ``pixels``,
+        indices into the flattened image; without these, ``network`` has the caller's maps, whose shape they get."""
         # Outside the caller's inference mode, since the state must outlive it.
-        with outliving(), torch.no_grad(), full_precision(frame.depth.device):
+        with outliving(), torch.set_grad_enabled(False), full_precision(frame.depth.device):
             state = self._stored().for_frame(frame, self.config)
             if self.config.on_bad_frame == "raise":
                 raise_faults(frame)
@@ -293,13 +285,34 @@ class UfMStar(StatefulModule):
             merging = kernels.merge
             state, out, factor = variance.corrected(state, frame, out, self.config, self.recalibration, pixels, merging)
         # With gradients to A and E.
-        network = variance.network_maps(frame, out.features, self.config, pixels)
-        V = variance.total_variance(out.variance, network, frame, self.config, self.recalibration, pixels, factor)
-        maps = {"depth": out.depth, "variance": V, "ufm_variance": V, **network, **out.maps}
-        out = replace(out, depth=maps.pop("depth"), variance=maps.pop("variance"), maps=maps)
+        features = out.maps["features"]
+        added = variance.network_maps(frame, features, self.config, pixels)
+        V = variance.total_variance(out.variance, added, frame, self.config, self.recalibration, pixels, factor)
+        maps = {"depth": out.depth, "variance": V, "ufm_variance": V, "valid": out.valid, **added, **out.maps}
+        if network is not None:
+            maps = self._shaped(maps, network, frame.confidence)
+        depth, V, valid = maps.pop("depth"), maps.pop("variance"), maps.pop("valid")
+        out = replace(out, depth=depth, variance=V, valid=valid, maps=maps)
         self._store(state.tensors())  # last, so that an earlier error changes nothing
         self._warnings.after_frame(frame, out.statistics, state.frames, self.config)
         return out
+
+    def _shaped(
+        self, maps: dict[str, Tensor], network: Mapping[str, Tensor | None], confidence: Tensor | None
+    ) -> dict[str, Tensor]:
+        """The maps [B, H, W] in the shape of the caller's depth, which may be [B, 1, H, W], with those of the network
+        as the caller passed them."""
+        features, depth = maps.pop("features"), network["network_depth"]
+        assert depth is not None
+        if self.config.posterior is None:
+            maps["depth"] = depth
+        passed = {"network_depth": depth} if self.config.variances_in_h else network
+        maps |= {name: value for name, value in {**passed, "confidence": confidence}.items() if value is not None}
+        if depth.dim() == 4:
+            maps = {name: value.reshape(depth.shape) for name, value in maps.items()}
+        if self.config.features:
+            maps["features"] = features[..., : self.config.features]
+        return maps
 
     def _stored(self) -> UfMStarState:
         return self._empty.with_tensors(cast("dict[str, Tensor]", self._buffers))  # avoids ``__getattr__``

@@ -21,7 +21,6 @@ from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, 
 from ufmstar_torch.eval.bench.parts import ANCHORS, MULTIVIEW, SAMPLE, Part, TimedParts, inference_of, time_parts
 from ufmstar_torch.eval.bench.timing import CLOCKS, most_threads, paired_ratio, pinned_threads, spread
 from ufmstar_torch.eval.engine.files import write_json_atomic
-from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.stream import require_camera
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
@@ -158,35 +157,27 @@ def _metered(units: Mapping[str, str], part: str, meter: EnergyMeter) -> bool:
 def measure_job(job: EvalJob, plan: Plan | None = None) -> None:
     """Measure time, energy and memory of the rows, and write their means to OUT/efficiency.json.
 
-    All selected frames of an evaluation's sequences are processed a second time, after the metrics. The means of the
-    job's further architectures are under "further". UfM and UfM* run on the CPU, as in the paper. The energy windows
-    are divided among the sequences.
+    All selected frames of an evaluation's sequences are processed a second time, after the metrics. UfM and UfM* run on
+    the CPU, as in the paper. The energy windows are divided among the sequences.
 
     Raises:
         ValueError: no sequence can be opened, none has a usable frame, or no row can be measured.
         OSError: the file cannot be written.
     """
     plan = plan or Plan()
-    plan = replace(plan, windows=-(-plan.windows // max(1, len(job.items))))
-    first, *further = (_over_items(job, plan, choices) for choices in (job.networks, *job.further))
-    write_json_atomic(job.out / EFFICIENCY, first | ({"further": further} if further else {}))
-
-
-def _over_items(job: EvalJob, plan: Plan, choices: Mapping[str, NetworkChoice]) -> dict[str, Any]:
-    """The means of one architecture over the sequences; errors as :func:`measure_job`."""
-    device = device_of(job.device, 0)
-    networks = timed_networks(job.load(torch.device(device), choices), job.suite.rows)
+    device, windows = device_of(job.device, 0), -(-plan.windows // max(1, len(job.items)))
+    how: dict[str, Any] = {"device": device, "plan": replace(plan, windows=windows), "selected": job.frames}
+    networks = timed_networks(job.load(torch.device(device)), job.suite.rows)
     measured: dict[tuple[str, str], dict[str, Any]] = {}
     failed = []
     for item in job.items:
         try:
-            how: dict[str, Any] = {"device": device, "plan": plan, "selected": job.frames}
             measured[item.dataset, item.sequence] = measure(job.suite.rows, networks, item.open(), **how)
         except (OSError, ValueError) as error:
             failed.append(f"{item.label}: {error}")
     if not measured:
         raise ValueError(f"no sequence can be measured: {'; '.join(failed[:3])}")
-    return over_sequences(measured)
+    write_json_atomic(job.out / EFFICIENCY, over_sequences(measured))
 
 
 def over_sequences(measured: Mapping[tuple[str, str], Mapping[str, Any]]) -> dict[str, Any]:

@@ -74,5 +74,5 @@ def _words(options: DemoOptions, weights: Path) -> list[str]:
     return [
         *("--suite", "demo", "--root", *roots, "--frames", f":{options.frames}", "--network", *networks),
         *("--out", str(options.out), "--device", options.device, *threads),
-        "--overwrite" if options.overwrite else "--resume",
+        *(["--overwrite"] if options.overwrite else []),
     ]

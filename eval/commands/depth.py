@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from ufmstar_torch.config import SPGFConfig, UfMStarConfig
 from ufmstar_torch.eval.commands.options import (
     Count,
+    File,
     Flag,
     MachineOptions,
     Number,
@@ -170,7 +170,7 @@ class UfMOptions:
             (dense), corners tracked in the images (corners), landmarks from a FILE with a line x y z sigma [m] each,
             or the recording's own depth (sensor, sensor:stereo, sensor:tof).
         scale_from: Poses of COLMAP without a scale get the network's; anchors then show shape only.
-        recalibration: Use this file of `ufmstar recalibrate`, or none (default: WEIGHTS.recalibration.json).
+        recalibration: Map the variance by this file of `ufmstar recalibrate`.
     """
 
     preset: Annotated[
@@ -181,7 +181,7 @@ class UfMOptions:
     set: Repeated = ()
     anchors: Text = None
     scale_from: Annotated[Literal["network"] | None, one_of("network")] = None
-    recalibration: Text = None
+    recalibration: File = None
 
     def __post_init__(self) -> None:
         self.config()  # checks the settings
@@ -203,32 +203,22 @@ class UfMOptions:
         start = start if self.preset is None else start.replace(segment=SPGFConfig.preset(self.preset))
         return start.with_values(first | values)
 
-    def load_recalibration(
-        self, config: UfMStarConfig, weights: tuple[str, ...], source: DepthSource
-    ) -> Recalibration | None:
-        """Read the recalibration of the option; by default that next to the weights, if it exists. A warning states if
-        that one was fitted to UfM* alone, and is left out because ``config`` has anchors.
+    def load_recalibration(self, config: UfMStarConfig, source: DepthSource) -> Recalibration | None:
+        """Read the recalibration of the option.
 
         Raises:
-            FileNotFoundError: the named file does not exist.
+            FileNotFoundError: the file does not exist.
             ValueError: the file is no recalibration, or was fitted with other settings or to another network.
         """
-        from ufmstar_torch.frames.warnings import LOGGER
-        from ufmstar_torch.posterior.recalibrate import Recalibration, recalibration_path
+        from ufmstar_torch.posterior.recalibrate import Recalibration
 
-        name = self.recalibration
-        if name == "none" or (name is None and not (weights and recalibration_path(weights[0]).is_file())):
+        if self.recalibration is None:
             return None
-        file = recalibration_path(weights[0]) if name is None else Path(name)
         try:
-            recalibration = Recalibration.from_json(file)
-            of_plain = bool(recalibration.ufm) and not recalibration.ufm.get("anchors")
-            if name is None and of_plain and config.anchors is not None:
-                LOGGER.warning("%s is not used: it was fitted to UfM* alone, which --plain runs", file)
-                return None
+            recalibration = Recalibration.from_json(self.recalibration)
             recalibration.require(config, ", ".join(one["name"] for one in source.identity.get("files", ())))
         except ValueError as error:
-            raise ValueError(f"{file}: {error}; --recalibration none runs without it") from error
+            raise ValueError(f"--recalibration {self.recalibration}: {error}") from error
         return recalibration
 
 

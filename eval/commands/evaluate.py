@@ -52,10 +52,7 @@ class SuiteOptions:
         base: A figure or ablation is about this network instead of the paper's: depth_only, ...
         ufm_preset: All rows of UfM* start from the paper's settings (UfMStarConfig.paper) or ours, not the suite's.
         network: Name a network for every base as BASE=MODEL:FILE[,FILE...]; rows without one are left out; repeatable.
-            A FILE.json is its spec, --spec that of all others. With paper-table-1, -2 and -4 a base may have a second
-            one, whose time, energy and memory are measured as well.
-        recalibration: Judge the row of this file of `ufmstar recalibrate` also under it, as a row of its own, on
-            sequences other than those that it was fitted to; repeatable.
+            A FILE.json is its spec, --spec that of all others.
         list: Show the suites and stop.
     """
 
@@ -63,7 +60,6 @@ class SuiteOptions:
     base: Text = None
     ufm_preset: Annotated[Literal["paper", "default"] | None, one_of("paper", "default")] = None
     network: Words = ()
-    recalibration: Words = ()
     list: Flag = False
 
 
@@ -95,8 +91,8 @@ class EvalOutputOptions:
     """Output.
 
     Attributes:
-        out: Write everything to this folder.
-        resume: Continue the evaluation in --out: compute what is missing, also rows and sequences added since.
+        out: Write everything to this folder; of an evaluation there, compute what is missing, also rows and sequences
+            added since.
         overwrite: Replace the evaluation in --out, but for the predictions in its cache.
         cache: Keep the networks' predictions in this folder (default: OUT/cache).
         examples: Keep some frames of this many sequences of each data set for pictures.
@@ -105,7 +101,6 @@ class EvalOutputOptions:
     """
 
     out: Text = None
-    resume: Flag = False
     overwrite: Flag = False
     cache: Text = None
     examples: int = 3
@@ -120,8 +115,8 @@ class EvalOutputOptions:
 class EvalOptions(MachineOptions):
     """The rows of a table or figure of the paper, on sequences of your own.
 
-    A sequence's rows are written when its last frame is done: whatever ends the program, --resume computes what is
-    missing. The sequences can be divided: --processes on one computer, --scheduler on a Dask cluster.
+    A sequence's rows are written when its last frame is done: whatever ends the program, the same command computes
+    what is missing. The sequences can be divided: --processes on one computer, --scheduler on a Dask cluster.
 
     Attributes:
         device: Run on cpu or cuda; each of several --processes takes the next GPU in turn.
@@ -153,8 +148,6 @@ class EvalOptions(MachineOptions):
             if not values[name]:
                 raise ValueError(f"--{name} is missing; ufmstar eval --help, and --list for the suites")
         parse_slice(self.data.frames)
-        if self.output.resume and self.output.overwrite:
-            raise ValueError("--resume and --overwrite contradict each other")
         if self.scheduler is not None and self.processes > 1:
             raise ValueError("--processes are of this computer, --scheduler has its own: give one of them")
 
@@ -178,22 +171,18 @@ def job_from(options: EvalOptions) -> EvalJob:
     """The job of the options. Opens no sequence. Raises FileNotFoundError, ValueError: a file does not exist, options
     contradict each other, a base is named twice, no row has a network, or there is no sequence."""
     from ufmstar_torch.eval.engine.load import NetworkChoice
-    from ufmstar_torch.eval.suite.job import EvalJob, require_methods, with_recalibrations
+    from ufmstar_torch.eval.suite.job import EvalJob, require_methods
     from ufmstar_torch.eval.suite.work_items import find_work, read_names
 
     what, data, output, values = options.what, options.data, options.output, as_dict(options)
-    suite = with_recalibrations(suite_named(str(what.suite), what.base, what.ufm_preset), joined(what.recalibration))
+    suite = suite_named(str(what.suite), what.base, what.ufm_preset)
     require_methods(suite, options.opening.plugin)
-    architectures: list[dict[str, NetworkChoice]] = [{}]
-    for text in joined(what.network):  # a base's n-th network belongs to the n-th architecture
+    networks: dict[str, NetworkChoice] = {}
+    for text in joined(what.network):
         choice = replace(NetworkChoice.parse(text).with_spec(values["spec"]), trust_code=values["trust_code"])
-        number = sum(choice.base in architecture for architecture in architectures)
-        architectures += [{}] if number == len(architectures) else []
-        architectures[number][choice.base] = choice
-    networks, *further = architectures
-    if further and not suite.efficiency:
-        bases = ", ".join(text.partition("=")[0] for text in joined(what.network))
-        raise ValueError(f"--network: every base once, but in a suite that measures time and energy, got {bases}")
+        if choice.base in networks:
+            raise ValueError(f"--network: every base once, got {choice.base} twice: evaluate each into its own --out")
+        networks[choice.base] = choice
     only = None if data.sequence_list is None else read_names(Path(data.sequence_list))
     items = find_work(
         joined(data.root), sample=data.sequences, seed=data.seed, only=only, opening=options.opening.of_reader
@@ -201,7 +190,6 @@ def job_from(options: EvalOptions) -> EvalJob:
     return EvalJob(
         suite=suite.with_bases(networks) if networks else suite,
         networks=networks,
-        further=tuple(further),
         items=tuple(items),
         out=Path(str(output.out)),
         missing_bases=tuple(base for base in suite.bases if base not in networks),
@@ -216,7 +204,7 @@ def _evaluate(options: EvalOptions) -> int:
     from ufmstar_torch.eval.engine.progress import warm_up_command
     from ufmstar_torch.eval.suite.tasks import evaluate_suite, executor_of
 
-    how: dict[str, Any] = {"resume": options.output.resume, "overwrite": options.output.overwrite}
+    how: dict[str, Any] = {"overwrite": options.output.overwrite}
     with Bars() as bars, stop_signals(bars.say) as stop:
         job = job_from(options)
         for base in job.unused:
@@ -257,10 +245,13 @@ def _report(job: EvalJob, outcome: EvalOutcome, options: EvalOptions) -> int:
     for label, reason in outcome.failed.items():
         print(f"ufmstar eval: {label} failed: {reason}", file=sys.stderr)
     if outcome.stopped:
-        print(f"ufmstar eval: stopped; finished rows are in {job.out / 'records'}; --resume continues", file=sys.stderr)
+        print(
+            f"ufmstar eval: stopped; finished rows are in {job.out / 'records'}; the same command continues",
+            file=sys.stderr,
+        )
         return 130
     if outcome.failed or not outcome.finished:
-        print("ufmstar eval: not all sequences are complete; --resume tries the rest again", file=sys.stderr)
+        print("ufmstar eval: not all sequences are complete; the same command tries the rest again", file=sys.stderr)
         return 1
     return 0
 

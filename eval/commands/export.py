@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,14 +56,14 @@ read = reader(ExportOptions, "ufmstar export")
 
 def main(options: ExportOptions) -> int:
     """Export, and print what was written; the exit code."""
-    from ufmstar_torch.eval.run.export import GateCount, gated_frames, with_images
+    from ufmstar_torch.eval.run.export import gated_frames, with_images
     from ufmstar_torch.eval.run.summary import read_summary
     from ufmstar_torch.eval.sequences.open import open_sequence
 
     out, to = options.out, options.to
     with usage_errors(FileNotFoundError, ValueError):
-        counts = GateCount()
-        frames = counts.of(gated_frames(out, options.max_sigma, options.max_relative_sigma))
+        pixels = Counter[str]()
+        frames = gated_frames(out, options.max_sigma, options.max_relative_sigma, pixels)
         summary = read_summary(out)
         if to not in ("depth", "tum") and options.sequence is not None:
             frames = with_images(frames, open_sequence(options.sequence, **options.opening.changed()))
@@ -72,7 +73,8 @@ def main(options: ExportOptions) -> int:
         how = {"voxel": options.voxel} if to == "cloud" else {}
         print(_exporter(to)(frames, out, **how))
         if min(options.max_sigma, options.max_relative_sigma) < math.inf and to != "tum":
-            print(f"the limits of sigma keep {counts.share:.1%} of the pixels with a depth")
+            share = pixels["kept"] / pixels["all"] if pixels["all"] else math.nan
+            print(f"the limits of sigma keep {share:.1%} of the pixels with a depth")
             if reason := _unsupported(summary):
                 remedy = "`ufmstar run` without --plain makes a sigma that anchors test (docs/thresholds.md)"
                 print(f"warning: nothing supports this sigma, {reason}: the pixels that are left may be bad; {remedy}")

@@ -134,7 +134,7 @@ def main(options: LiveOptions) -> int:
     with ExitStack() as stack:
         with usage_errors(ImportError, OSError, ValueError):
             if options.out is not None:
-                kind.earlier(options.out, resume=False, overwrite=options.overwrite)
+                kind.earlier(options.out, overwrite=options.overwrite)
             K = None if (intrinsics := options.opening.of_reader.intrinsics) is None else read_intrinsics(intrinsics)
             events = _events(options, K)
             model = _model(options)
@@ -244,7 +244,7 @@ def _model(options: LiveOptions) -> UncertainDepth:
         posterior=options.uncertainty.posterior,
         samples=source.passes if len(source.networks) == 1 and chosen.mode == "full" else None,
         anchors=None if anchors is None else landmarks_of(anchors, None),
-        recalibration=options.uncertainty.load_recalibration(config, chosen.weights, source),
+        recalibration=options.uncertainty.load_recalibration(config, source),
         check_poses=0 if options.recorded else 40,  # those of a recording are compared before
         multiview_device="cpu",  # for one camera faster than a GPU
     ).to(options.device)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import re
-import tomllib
 from argparse import ArgumentError, ArgumentParser
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import redirect_stderr, suppress
@@ -26,14 +25,15 @@ from tyro.conf import Positional as Positional
 from tyro.conf import UseAppendAction
 from tyro.conf import arg as arg
 
+from ufmstar_torch.files.limits import read_settings
 from ufmstar_torch.runtime.checked import flat
 
-_CONFIG_BYTES = 1_000_000  # the settings of all commands together have some kilobytes
 # Options that allow code to run: a configuration file, which may come from elsewhere, must not set them.
 CODE = ("trust_code", "plugin")
 _SETTINGS = "set"  # the option with NAME=VALUE, a table in a file
 _COMMON = "--config FILE takes options from a TOML or JSON file, --debug shows the traceback of an error."
-_POSITIONAL = get_args(Positional[str])[1]  # the mark that tyro's Positional adds to a type
+# The marks that tyro adds to a type.
+_POSITIONAL, _APPENDED = (get_args(kind)[1] for kind in (Positional[str], UseAppendAction[str]))
 T = TypeVar("T")
 # Types of options, with short names in the help and without the defaults False, None and ().
 _plain: dict[str, Any] = {"help_behavior_hint": ""}
@@ -87,7 +87,7 @@ def parse(options: type[T], words: Sequence[str], prog: str) -> T:
         raise ValueError(error) from error
     if chosen.config is not None:
         settings, named = _from_file(chosen.config, options)
-        typed = {word.partition("=")[0].replace("_", "-") for word in rest if word.startswith("--")}
+        typed = {word.partition("=")[0][2:].replace("-", "_") for word in rest if word.startswith("--")}
         rest = [*settings, *rest, *(word for name, value in named.items() if name not in typed for word in value)]
     usage = getattr(options, "USAGE", "")
     description = "\n\n".join(text for text in (_description(options), usage, _COMMON) if text)
@@ -168,59 +168,57 @@ def _from_file(file: Path, options: type) -> tuple[list[str], dict[str, list[str
     """The words of a configuration file: those of settings, and those of every other option by its name.
 
     Raises:
-        ValueError: the file is too large, no TOML or JSON with a table, has an unknown name, or sets an option that
-            allows code to run.
+        ValueError: the file is too large, no TOML or JSON with a table, has an unknown name or a value of the wrong
+            kind, or sets an option that allows code to run.
     """
-    name = f"--config {file}"
-    with file.open("rb") as opened:
-        content = opened.read(_CONFIG_BYTES + 1)
-    if len(content) > _CONFIG_BYTES:
-        raise ValueError(f"{name} is larger than {_CONFIG_BYTES:,} bytes, which no configuration needs")
     try:
-        text = content.decode()
-        values = tomllib.loads(text) if file.suffix == ".toml" else json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{name} is neither TOML (*.toml) nor JSON: {error}") from error
-    if not isinstance(values, dict):
-        raise ValueError(f"{name} must hold a table of options, got {type(values).__name__}")
-    values = {key.replace("-", "_"): value for key, value in values.items()}
-    if code := [key for key in CODE if values.get(key)]:
-        raise ValueError(
-            f"--{code[0].replace('_', '-')} allows code to run: type it on the command line, not in a file"
-        )
-    if unknown := sorted(values.keys() - set(_names(options))):
-        raise ValueError(f"{name}: no option is called {', '.join(unknown)}")
-    settings = values.pop(_SETTINGS, {})
-    if not isinstance(settings, Mapping):
-        raise ValueError(f"{name}: {_SETTINGS} must be a table of settings, got {settings!r:.60}")
-    of_settings = [f"--{_SETTINGS}={key}={_word(value)}" for key, value in flat(settings).items()]
-    named = {f"--{key.replace('_', '-')}": value for key, value in values.items() if value not in (None, False, [])}
-    return of_settings, {key: _words(key, value) for key, value in named.items()}
+        values = read_settings(file)
+        if not isinstance(values, dict):
+            raise ValueError(f"it must hold a table of options, got {type(values).__name__}")
+        values, kinds = {key.replace("-", "_"): value for key, value in values.items()}, dict(_kinds(options))
+        if code := [key for key in CODE if values.get(key)]:
+            raise ValueError(f"{code[0]} allows code to run: type it on the command line, not in a file")
+        if unknown := sorted(values.keys() - kinds.keys()):
+            raise ValueError(f"no option is called {', '.join(unknown)}")
+        settings = values.pop(_SETTINGS, {})
+        if not isinstance(settings, Mapping):
+            raise ValueError(f"{_SETTINGS} must be a table of settings, got {settings!r:.60}")
+        of_settings = [f"--{_SETTINGS}={key}={_word(value)}" for key, value in flat(settings).items()]
+        words = {key: _words(key, value, *kinds[key]) for key, value in values.items() if value not in (None, [])}
+        return of_settings, {key: value for key, value in words.items() if value}
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"--config {file}: {error}") from error
 
 
-def _words(name: str, value: Any) -> list[str]:
-    """The words of an option with a value of a file. Raises ValueError: a text in a list would be read as an option."""
-    if value is True:
-        return [name]
-    if not isinstance(value, list):
-        return [f"{name}={_word(value)}"]
-    if wrong := [part for part in value if isinstance(part, str) and part.startswith("-")]:
+def _words(name: str, value: Any, flag: bool, repeated: bool) -> list[str]:
+    """The words of an option with a value of a file. Raises ValueError: it has another kind, or a text in a list would
+    be read as an option."""
+    option, words = f"--{name.replace('_', '-')}", value if isinstance(value, list) else [value]
+    if flag and isinstance(value, bool):
+        return [option] if value else []
+    if flag or not all(type(word) in (str, int, float) for word in words):
+        kind = "true or false" if flag else "a text, a number, or a list of them"
+        raise ValueError(f"{name} must be {kind}, got {value!r:.60}")
+    if repeated or not isinstance(value, list):
+        return [f"{option}={_word(word)}" for word in words]
+    if wrong := [word for word in words if isinstance(word, str) and word.startswith("-")]:
         raise ValueError(f"{name}: no text in a list may begin with -, got {wrong[0]!r}")
-    return [name, *map(_word, value)]
+    return [option, *map(_word, words)]
 
 
 def _word(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _names(options: type) -> Iterator[str]:
-    """The names of a dataclass's options with a name, those of its groups included."""
+def _kinds(options: type) -> Iterator[tuple[str, tuple[bool, bool]]]:
+    """The names of a dataclass's options with a name, those of its groups included; whether they have no value, and
+    whether they are given once for each value."""
     hints, named = get_type_hints(options), get_type_hints(options, include_extras=True)
     for f in fields(options):
         if is_dataclass(hints[f.name]):
-            yield from _names(hints[f.name])
+            yield from _kinds(hints[f.name])
         elif _POSITIONAL not in get_args(named[f.name]):
-            yield f.name
+            yield f.name, (hints[f.name] is bool, _APPENDED in get_args(named[f.name]))
 
 
 def _description(options: type) -> str:
@@ -235,7 +233,7 @@ def _rarer(text: str, options: type) -> str:
 
     unknown = re.match(r"Unrecognized options: --([\w-]+)", text)
     name = unknown[1].replace("-", "_") if unknown else ""
-    rarer = "reader" in _names(options) and name in (f.name for f in fields(Options))
+    rarer = "reader" in dict(_kinds(options)) and name in (f.name for f in fields(Options))
     return f"; it is a rarer option of readers: --reader {name}=VALUE" if rarer else ""
 
 
@@ -247,4 +245,6 @@ def _first_lines(message: str) -> str:
     rules = [number for number, line in enumerate(lines) if line and not line.strip("─-")]
     first = 0 if boxed or not rules else rules.pop(0) + 1
     text = " ".join(" ".join(lines[first : rules[0] if rules else None]).split())
-    return re.sub(r"^Error parsing (?!--)\S+: ", "", text)
+    text = re.sub(r"^Error parsing (?!--)\S+: ", "", text)
+    names = "(?<=Expected one of \\()'.*'(?=\\))"  # in a random order, and with the default None
+    return re.sub(names, lambda found: ", ".join(sorted({*found[0].split(", ")} - {"'None'"})), text)

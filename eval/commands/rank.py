@@ -80,7 +80,7 @@ def main(options: RankOptions) -> int:
         share_threads()
     kind = FolderKind("ufmstar rank", "ranking", SETTINGS, (SCORES, SHEET))
     with usage_errors(FolderError):
-        kind.earlier(Path(options.out), resume=False, overwrite=options.overwrite)
+        kind.earlier(Path(options.out), overwrite=options.overwrite)
         scores = _scores(options)
         with output_folder(Path(options.out), kind, {}, overwrite=options.overwrite):
             return _write(options, scores)

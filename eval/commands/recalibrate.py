@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 class RecalibrateOptions:
     """A monotone map of the variance, fitted to frames with ground truth.
 
-    Fits the map to the sequences of an evaluation (`ufmstar eval`) and writes it to a file, which `ufmstar run` uses
-    where it lies beside the weights, and `ufmstar eval --recalibration FILE` on other sequences. The printed figures
-    are of each sequence under the map that was fitted to the others.
+    Fits the map to the sequences of an evaluation (`ufmstar eval`) and writes it to a file, which
+    `ufmstar run` and `live` apply with --recalibration FILE. The printed figures are of each sequence under the map
+    that was fitted to the others.
 
     Attributes:
         out: The folder of `ufmstar eval`.
         row: Fit to this row, as the table names it: UfM*-DepthOnly, say.
-        to: Write the map to this file; `ufmstar run` finds WEIGHTS.recalibration.json beside the weights.
+        to: Write the map to this file.
         covariate: Map the variance, or the network's confidence to a factor of the variance.
     """
 
@@ -51,7 +51,7 @@ def main(options: RecalibrateOptions) -> int:
 
     with usage_errors(ValueError):
         results = load_results(options.out, with_sums=False)
-        rows = [row for row in results.rows if row.method.fusion == UFM_STAR and not row.setting.recalibration]
+        rows = [row for row in results.rows if row.method.fusion == UFM_STAR]
         row = next((row for row in rows if row.label == options.row), None)
         if row is None:
             labels = ", ".join(row.label for row in rows) or "(none: no row of UfM*)"

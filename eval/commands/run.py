@@ -145,7 +145,7 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
         indices=indices,
         source=source,
         config=config.within(source.max_depth, source.states_confidence),
-        recalibration=ufm.load_recalibration(config, options.network.weights, source),
+        recalibration=ufm.load_recalibration(config, source),
         device=torch.device(options.device),
         settings=options.settings(),
         every=options.network.mode == "full",

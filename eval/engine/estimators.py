@@ -68,12 +68,8 @@ def make_estimator(
         row, device: of the estimator.
         source: of depth, with its largest depth and whether it has a confidence; None = unknown.
         plugins: the user's methods (``sequences.plugins``), by name.
-
-    Raises:
-        ValueError: a recalibration was fitted with other settings.
-        FileNotFoundError: the setting's recalibration does not exist.
     """
-    method, setting, uses = row.method, row.setting, row.method.uses_aleatoric
+    method, uses = row.method, row.method.uses_aleatoric
     if method.fusion == ALONE:
         return Alone(uses_variances=uses)
     if method.fusion == UFM:
@@ -83,10 +79,9 @@ def make_estimator(
     if method.fusion != UFM_STAR:
         estimator: Estimator = plugins[method.fusion](row, device)
         return estimator
-    recalibration = Recalibration.from_json(setting.recalibration) if setting.recalibration else None
     config = ufm_star_config(row)
     config = config if source is None else config.within(source.max_depth, source.states_confidence)
-    return Gaussians(config, device, uses_variances=uses, recalibration=recalibration)
+    return Gaussians(config, device, uses_variances=uses)
 
 
 def ufm_star_config(row: Row) -> UfMStarConfig:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -30,25 +30,19 @@ from ufmstar_torch.eval.sequences.plugins import Plugins
 
 # Errors of a sequence that cannot be used. Any other error is a bug and ends the program.
 BROKEN = (SequenceError, FrameError, RuntimeError, ValueError)
-
-
-@dataclass(frozen=True, eq=False)
-class Judge:
-    """The networks and metrics that evaluate sequences."""
-
-    networks: Mapping[str, DepthSource]  # by base
-    device: torch.device  # where UfM and UfM* run
-    store: PredictionCache | None = None  # of predictions; None = compute all
-    limit: slice = field(default_factory=lambda: slice(None))  # selects frames, before a setting's skip
-    bins: str = "ours"  # of the calibration errors: "ours" or "authors", see ``SequenceMetrics``
-    plugins: Plugins = field(default_factory=Plugins)  # the user's methods and metrics
+_CPU, _ALL, _NO_PLUGINS = torch.device("cpu"), slice(None), Plugins()
 
 
 def evaluate_sequence(
     sequence: FrameSequence,
     rows: Sequence[Row],
-    judge: Judge,
+    networks: Mapping[str, DepthSource],
     *,
+    device: torch.device = _CPU,
+    cache: PredictionCache | None = None,
+    frames: slice = _ALL,
+    bins: str = "ours",
+    plugins: Plugins = _NO_PLUGINS,
     examples: Path | None = None,
     progress: Callable[[Progress], object] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
@@ -59,7 +53,12 @@ def evaluate_sequence(
     Args:
         sequence: with poses and ground truth.
         rows: to evaluate.
-        judge: networks and metrics.
+        networks: by base.
+        device: of UfM and UfM*.
+        cache: of predictions; None = compute all.
+        frames: selects frames, before a setting's skip.
+        bins: of the calibration errors: "ours" or "authors", see ``SequenceMetrics``.
+        plugins: the user's methods and metrics.
         examples: folder for maps of a few frames (``ExampleWriter``); None = none.
         progress: called at the start and after every frame.
         stop: called before every frame.
@@ -69,22 +68,22 @@ def evaluate_sequence(
         FrameError, RuntimeError, ValueError: rows cannot be evaluated, or errors of readers and networks.
         Stopped: ``stop`` returned True.
     """
-    indices = range(len(sequence))[judge.limit]
+    indices = range(len(sequence))[frames]
     _check(sequence, rows, indices)
     expected = dict.fromkeys((row.method.base, row.setting.preprocess) for row in rows)
-    sources = {(base, how): judge.networks[base].prepared(how) for base, how in expected}
+    sources = {(base, how): networks[base].prepared(how) for base, how in expected}
     anchors = anchor_sources(rows, sequence.folder, sequence.pose_scale)
     runners, judges = [], []
     for row in rows:
         source = sources[row.method.base, row.setting.preprocess]
-        estimator = make_estimator(row, judge.device, source, judge.plugins.methods)
+        estimator = make_estimator(row, device, source, plugins.methods)
         every, setting = row.method.every_member, row.setting
         runners.append(RowRunner(row.slug, source, estimator, every=every, setting=setting, anchors=anchors.get(row)))
         named = {other.slug: other.method.name for other in references(row, rows)}
-        judges.append(RowJudge(row, runners[-1], named, judge.bins, judge.plugins.metrics))
+        judges.append(RowJudge(row, runners[-1], named, bins, plugins.metrics))
     shown = frame_progress(progress, len(indices))
     writer = None if examples is None else ExampleWriter(examples, len(indices))
-    stream = frame_results(sequence, indices, runners, cache=judge.store, device=judge.device, stop=stop)
+    stream = frame_results(sequence, indices, runners, cache=cache, device=device, stop=stop)
     with closing(stream) as results:
         for result in results:
             for one in judges:

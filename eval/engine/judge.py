@@ -57,31 +57,21 @@ def add_to(
         metrics[name].update(*maps, torch.from_numpy(row.truth), mask, mixture, level)
 
 
-class RunMetrics:
-    """The figures of a run's row, ``UFM``, of its network ``ALONE``, and of its ``POSTERIOR``, on the row's valid
-    pixels, and as "ufm.moving", "ufm.still", ... on its ``RowResult.parts``."""
-
-    def __init__(self, plugins: PluginMetrics = NO_PLUGINS) -> None:
-        self._plugins = plugins
-        self._metrics: dict[str, SequenceMetrics] = {}
-
-    def figures(self) -> dict[str, dict[str, float]]:
-        """delta1, nll, ece_delta, ece_q, spearman, ... by name; {} without ground truth."""
-        return {name: metrics.compute() for name, metrics in self._metrics.items()}
-
-    def add(self, row: RowResult) -> None:
-        """Add a frame; ignored without ground truth."""
-        if row.truth is None:
-            return
-        depth = row.prediction.depth[0]
-        maps: dict[str, tuple[Tensor, Tensor | None]] = {UFM: (depth, row.map("ufm_variance"))}
-        maps |= {} if row.network_variance is None else {ALONE: (depth, row.network_variance)}
-        if row.corrected:
-            maps[POSTERIOR] = row.depth, row.variance
-        corrected = POSTERIOR if row.corrected else UFM
-        for name, stated in maps.items():
-            mixture, level = row.mixture if name == POSTERIOR else None, row.level if name == corrected else None
-            add_to(self._metrics, name, row, stated, row.valid, mixture, level, plugins=self._plugins)
+def judge_run(metrics: dict[str, SequenceMetrics], row: RowResult, plugins: PluginMetrics = NO_PLUGINS) -> None:
+    """Add a frame of a run to the metrics of its row, ``UFM``, of its network ``ALONE``, and of its ``POSTERIOR``, on
+    the row's valid pixels, and as "ufm.moving", "ufm.still", ... on its ``RowResult.parts``. A frame without ground
+    truth is ignored."""
+    if row.truth is None:
+        return
+    depth = row.prediction.depth[0]
+    maps: dict[str, tuple[Tensor, Tensor | None]] = {UFM: (depth, row.map("ufm_variance"))}
+    maps |= {} if row.network_variance is None else {ALONE: (depth, row.network_variance)}
+    if row.corrected:
+        maps[POSTERIOR] = row.depth, row.variance
+    corrected = POSTERIOR if row.corrected else UFM
+    for name, stated in maps.items():
+        mixture, level = row.mixture if name == POSTERIOR else None, row.level if name == corrected else None
+        add_to(metrics, name, row, stated, row.valid, mixture, level, plugins=plugins)
 
 
 class RowJudge:

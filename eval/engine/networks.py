@@ -34,7 +34,7 @@ class NetworkSource(DepthSource):
     single precision.
 
     Sample n of frame i (decoder dropout) is seeded by i and n, so it does not depend on earlier frames, the number of
-    processes or a resume.
+    processes.
     """
 
     needs_image = True

@@ -147,12 +147,17 @@ class RowRunner:
         self.anchors = anchors
         self._tracks = None if anchors is None else anchors.tracks
         self.images = 0
-        self._drift = Drift(setting) if setting.rotation_drift or setting.translation_drift else None
+        self._drift = Drift(setting) if setting.pose_noise else None
+
+    def selects(self, number: int) -> bool:
+        """True if the row uses image ``number`` of the stream, from 0; it skips ``setting.skip`` after each of them."""
+        return number % (self.setting.skip + 1) == 0
 
     def update(self, frame: Frame, prediction: DepthPrediction, truth: NDArray[np.float32] | None) -> RowResult:
         """Process the next frame. Ground truth [h, w] is used for anchors alone."""
-        drifted = frame.T_world_cam if self._drift is None else self._drift.of(frame.T_world_cam, frame.index)
-        T = perturbed(drifted, self.setting, frame.index)
+        T = frame.T_world_cam
+        if self._drift is not None:
+            T = perturbed(self._drift.of(T, frame.index), self.setting, frame.index)
         landmarks, anchors, tracking_ms = (
             (None, None, None) if self.anchors is None else self.anchors.of(frame, T, prediction, truth)
         )

@@ -21,12 +21,10 @@ from ufmstar_torch.eval.engine.predictions import FramePredictions, PredictionCa
 from ufmstar_torch.eval.engine.progress import Progress, timed
 from ufmstar_torch.eval.engine.rows import RowResult, RowRunner
 from ufmstar_torch.eval.engine.threads import read_ahead
-from ufmstar_torch.eval.methods.perturb import selects
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.frames.frame import FRAME_FAULTS
 from ufmstar_torch.frames.prediction import DepthPrediction
-from ufmstar_torch.kernels.cpu.check import intrinsics_fault, pose_fault
 
 _CPU = torch.device("cpu")
 
@@ -82,13 +80,13 @@ def frame_results(
                 predictions.prepare(row.source)
         return predictions
 
-    selected = [index for n, index in enumerate(indices) if any(selects(row.setting, n) for row in rows)]
+    selected = [index for n, index in enumerate(indices) if any(row.selects(n) for row in rows)]
     last = perf_counter()
     with closing(read_ahead(read, selected)) as reading:
         for number, index in enumerate(indices):
             if stop():
                 raise Stopped
-            active, ms = [row for row in rows if selects(row.setting, number)], dict[str, float]()
+            active, ms = [row for row in rows if row.selects(number)], dict[str, float]()
             results, skipped, frame = dict[str, RowResult](), dict[str, str](), None
             try:
                 if active:
@@ -144,8 +142,10 @@ def _truths(frame: Frame, predictions: Mapping[str, DepthPrediction]) -> dict[st
 
 def require_camera(frame: Frame, K: NDArray[np.float64], size: Size) -> None:
     """Raises FrameError: UfM* cannot use the frame's pose, or intrinsics K [3, 3] [px] of images of ``size`` (h, w)."""
-    pose, tolerance = frame.T_world_cam.tolist(), UfMStarConfig.rotation_tolerance
-    if fault := pose_fault(pose, tolerance) or intrinsics_fault(K.tolist(), *size):
+    from ufmstar_torch.kernels.cpu.check import camera_faults  # kernels compile when they are first needed
+
+    [fault] = camera_faults(frame.T_world_cam[None], K[None], size, UfMStarConfig.rotation_tolerance)
+    if fault:
         raise FrameError(frame.name, FRAME_FAULTS[fault])
 
 

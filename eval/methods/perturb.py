@@ -1,4 +1,4 @@
-"""Ablations of the input: skipped frames, noise and drift of the poses."""
+"""Ablations of the input: noise and drift of the poses."""
 
 from __future__ import annotations
 
@@ -11,11 +11,6 @@ from ufmstar_torch.eval.methods.setting import Setting
 
 # Third number of the seed of drift. Anchors use 1 and 2; the seed of noise has two numbers.
 _DRIFT = 3
-
-
-def selects(setting: Setting, number: int) -> bool:
-    """True if image ``number``, from 0, is used: ``skip`` images are skipped after each used one."""
-    return number % (setting.skip + 1) == 0
 
 
 def perturbed(T_world_cam: NDArray[np.float64], setting: Setting, index: int) -> NDArray[np.float64]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.methods.method import ALONE, NETWORKS, UFM_STAR, Method
@@ -41,8 +40,6 @@ class Row:
             parts.append("OpenCV")
         elif setting.anchors not in ("", TRUTH):
             parts.append(f"{setting.anchors} in each sequence")
-        if setting.recalibration:
-            parts.append(setting.recalibration)
         return ", ".join([*parts, "ground truth"])
 
     @property
@@ -59,8 +56,6 @@ class Row:
     def label_without(self, *settings: str) -> str:
         """The displayed name without some settings."""
         values = {name: value for name, value in self.setting.to_dict().items() if name not in settings}
-        if self.setting.recalibration:  # without the folder
-            values["recalibration"] = Path(self.setting.recalibration).name
         changed = ", ".join(name if value is True else f"{name} {value}" for name, value in values.items())
         return f"{self.method.name} ({changed})" if changed else self.method.name
 

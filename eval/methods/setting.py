@@ -48,7 +48,6 @@ class Setting(Checked):
             truth.
         track_noise: standard deviation of noise on tracked positions [px of the image]; see ``engine.anchors``.
         posterior: True to evaluate the posterior's depth and variance (``UfMStarConfig.posterior`` follows).
-        recalibration: file of a map of the variance (``ufmstar recalibrate``); "" = none.
 
     Raises:
         ValueError: a value is out of range, or values contradict each other.
@@ -67,7 +66,6 @@ class Setting(Checked):
     anchor_count: int | None = number(None, "", "1", 0)
     track_noise: float = number(0.0, "", "px", 0.0, open_high=True)
     posterior: bool = False
-    recalibration: str = ""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -112,7 +110,7 @@ class Setting(Checked):
     @property
     def of_ufm_star(self) -> tuple[str, ...]:
         """Names of the changed values that apply to UfM* alone."""
-        names = ("ufm_preset", "anchors", "recalibration")
+        names = ("ufm_preset", "anchors")
         return (*self.overrides, *(name for name in names if getattr(self, name) != getattr(DEFAULT, name)))
 
     @property

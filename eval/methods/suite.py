@@ -6,7 +6,7 @@ base = "ensemble"                          # the suite's network, unless --base 
 bases = ["ensemble", "aleatoric"]          # several: the rows of each in turn
 efficiency = true                          # also measure time, energy and memory
 separate = true                            # no means over data sets, which differ on purpose
-include = ["ablation-eta"]                 # also the rows of other suites
+include = ["ablation-eta"]                 # also the rows of other suites of the package
 
 [[rows]]
 methods = ["{alone}", "UfM*-{behind}"]     # the paper's names: "Ensemble", "UfM*-Ensemble"; or by the base
@@ -30,13 +30,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from importlib.resources.abc import Traversable
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 from ufmstar_torch.eval.methods.method import BASES, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import setting_from
-from ufmstar_torch.files.limits import read_text
+from ufmstar_torch.files.limits import read_settings
 
 _NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 _SHIPPED = files("ufmstar_torch.eval.methods") / "suites"
@@ -45,6 +45,7 @@ _KEYS = {
     "separate": bool,
 }  # fmt: skip
 _WORDS = ("bases", "include", "methods")
+_MOST_ROWS = 1000  # each takes minutes
 _ROW_KEYS = {"methods": list, "bases": list, "setting": dict, "each": dict, "label": str}
 
 
@@ -124,13 +125,16 @@ def suite_named(name: str, base: str | None = None, preset: str | None = None) -
         values = _read(name)
         if base is not None and "base" not in values:
             raise ValueError("--base goes with figures and ablations of one network, the suite names its own")
-        rows = tuple(dict.fromkeys(_rows_of(values, base or values.get("base"), preset)))
+        every = itertools.islice(_rows_of(values, base or values.get("base"), preset), _MOST_ROWS + 1)
+        if len(rows := tuple(every)) > _MOST_ROWS:
+            raise ValueError(f"the suite has more than {_MOST_ROWS} rows")
+        rows = tuple(dict.fromkeys(rows))
         stem = Path(name).stem
         if base is not None and not rows:
             raise ValueError(f"the suite has no rows of {base}")
         flags = {name: values.get(name, False) for name in ("efficiency", "separate")}
         return Suite(values.get("name", stem), values.get("title", stem), rows, **flags)
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
 
 
@@ -146,7 +150,7 @@ def _file(name: str) -> Traversable:
 def _read(name: str) -> dict[str, Any]:
     """The content of a suite's file. Raises ValueError: unknown keys or bases."""
     file = _file(name)
-    values = tomllib.loads(read_text(file) if isinstance(file, Path) else file.read_text(encoding="utf-8"))
+    values = read_settings(file) if isinstance(file, Path) else tomllib.loads(file.read_text(encoding="utf-8"))
     _check(values, _KEYS, "the suite")
     for base in (*values.get("bases", []), values.get("base", "ensemble")):
         _require_base(base)
@@ -162,7 +166,9 @@ def _rows_of(values: Mapping[str, Any], base: str | None, preset: str | None) ->
                 yield from _expanded(part, network, preset)
             except ValueError as error:
                 raise ValueError(f"rows {n + 1}: {error}") from error
-    for name in values.get("include", []):
+    for name in dict.fromkeys(values.get("include", [])):
+        if name not in names():
+            raise ValueError(f"include: no suite of the package is called {name!r}")
         yield from _rows_of(_read(name), base, preset)
 
 
@@ -185,6 +191,10 @@ def _expanded(part: Any, base: str | None, preset: str | None) -> Iterator[Row]:
         raise ValueError(f"label {label!r} names one row: of several methods, write {{method}} in it; not with each")
     for point in itertools.product(*ranges.values()):
         setting = {**part.get("setting", {}), **dict(zip(ranges, point, strict=True))}
+        if "recalibration" in setting:
+            raise ValueError("recalibration is no setting of a suite's file: --recalibration FILE adds its rows")
+        if ".." in (path := PurePath(str(setting.get("anchors", "")))).parts or path.is_absolute():
+            raise ValueError(f"anchors must be a file in the folder of each sequence, got {str(path)!r}")
         for method in map(Method.parse, methods):
             started = {"ufm_preset": preset} if preset is not None and method.fusion == UFM_STAR else {}
             yield Row(method, setting_from(setting | started), label.replace("{method}", method.name))

@@ -37,15 +37,10 @@ _SMALLEST = 0.01  # less prints as "<0.01"
 def efficiency_tables(measured: Mapping[str, Any]) -> list[Table]:
     """One table per architecture of ``efficiency.json``, then the paper's table 2 of the same networks, or of all its
     networks if none is the same."""
-    tables = {row["network"]: run for run in architectures(measured) for row in run["rows"]}
+    labels = list(dict.fromkeys(row["network"] for row in measured["rows"]))
     quoted = [table for table in paper_tables() if table.number == 2]
-    measured_tables = [table for table in quoted if any(table.network.lower() in label.lower() for label in tables)]
-    return [*(_table(run, label) for label, run in tables.items()), *map(_paper_table, measured_tables or quoted)]
-
-
-def architectures(measured: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """The measurements of ``efficiency.json``: of the evaluated networks, and of further architectures."""
-    return [measured, *measured.get("further", ())]
+    measured_tables = [table for table in quoted if any(table.network.lower() in label.lower() for label in labels)]
+    return [*(_table(measured, label) for label in labels), *map(_paper_table, measured_tables or quoted)]
 
 
 def _table(run: Mapping[str, Any], label: str) -> Table:
@@ -184,8 +179,8 @@ STAGES = {
 def draw_stages(results: Results) -> Any | None:
     """The paper's figure of the stages' shares in a step of UfM*, with numbers in wide bars and the sum at the right;
     None unless ``efficiency.json`` has stages."""
-    measured = [] if results.efficiency is None else architectures(results.efficiency)
-    staged = [row for run in measured for row in run["rows"] if row.get("stages")]
+    measured = [] if results.efficiency is None else results.efficiency["rows"]
+    staged = [row for row in measured if row.get("stages")]
     if not staged:
         return None
     figure = style.new_figure(8.6, 1.5 + 0.5 * len(staged), "Where the time of UfM* goes")

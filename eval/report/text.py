@@ -42,7 +42,7 @@ def summary(results: Results) -> str:
     if results.missing:
         counts = Counter((dataset, sequence) for dataset, sequence, _ in results.missing)
         lines = [f"  {dataset}, {sequence}: {rows} row(s)" for (dataset, sequence), rows in counts.items()]
-        title = f"not evaluated yet: {count(len(lines), 'sequence')} (`ufmstar eval ... --resume` goes on):"
+        title = f"not evaluated yet: {count(len(lines), 'sequence')} (the same command goes on):"
         parts.append("\n".join([title, *lines[:10]]))
     parts += [f"note: {note}" for note in results.notes]
     return "\n".join(parts)

@@ -6,6 +6,7 @@ valid, or whose sigma exceeds a limit, are left out.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -45,7 +46,6 @@ class RunFrame:
     figures: Mapping[str, Any] = field(default_factory=dict)  # by name, as in frames.jsonl
     image: NDArray[np.uint8] | None = None  # [H, W, 3] RGB of the recording
     image_intrinsics: NDArray[np.float64] | None = None  # [3, 3] of the image [px]
-    left_out: int = 0  # number of pixels with a depth that exceed a limit of sigma
 
     def at_image(self) -> RunFrame:
         """The frame with maps at the pixels of its image, NaN outside the maps; unchanged without an image."""
@@ -62,52 +62,35 @@ class RunFrame:
         return points_of(u, v, self.depth[v, u], self.intrinsics), (v, u)
 
 
-def gated_frames(out: Path, max_sigma: float, max_relative_sigma: float) -> Iterator[RunFrame]:
+def gated_frames(
+    out: Path, max_sigma: float, max_relative_sigma: float, pixels: Counter[str] | None = None
+) -> Iterator[RunFrame]:
     """The finished frames of a run, without pixels whose sigma exceeds ``max_sigma`` [m], or ``max_relative_sigma`` as
-    a share of the depth. Raises ValueError: ``out`` is no run's folder, or has no finished frame."""
+    a share of the depth; adds the numbers of pixels with a depth, "all" and "kept", to ``pixels``. Raises ValueError:
+    ``out`` is no run's folder, or has no finished frame."""
+    pixels = Counter() if pixels is None else pixels
     if not (out / RECORDS).is_file():
         raise ValueError(f"{out} is no output of `ufmstar run`: it has no {RECORDS}")
     records = read_records((out / RECORDS).read_bytes(), out / RECORDS)
     done = [record for record in records if record["state"] == "done"]
     if not done:
         raise ValueError(f"{out} has no finished frame")
-    return (_gated(out, record, max_sigma, max_relative_sigma) for record in done)
+    return (_gated(out, record, max_sigma, max_relative_sigma, pixels) for record in done)
 
 
-def _gated(out: Path, record: Mapping[str, Any], max_sigma: float, max_relative_sigma: float) -> RunFrame:
+def _gated(
+    out: Path, record: Mapping[str, Any], max_sigma: float, max_relative_sigma: float, pixels: Counter[str]
+) -> RunFrame:
     maps = read_frame(frame_file(out, record["name"]))
     depth, variance = maps["depth"], maps["variance"]
     with np.errstate(invalid="ignore"):
         sigma = np.sqrt(variance)
         has_depth = maps["valid"] & (depth > 0) & np.isfinite(depth)
         mask = has_depth & (sigma <= max_sigma) & (sigma <= max_relative_sigma * depth)
-    left_out = int(np.count_nonzero(has_depth & ~mask))
+    pixels.update(all=int(has_depth.sum()), kept=int(mask.sum()))
     about = (record["name"], record["index"], record.get("timestamp"), maps["T_world_cam"], maps["intrinsics"])
     shown = known_where(mask, depth), known_where(mask, sigma)
-    return RunFrame(*about, *shown, maps.get("anchors"), record, left_out=left_out)
-
-
-class GateCount:
-    """Counts the pixels of the frames that pass through :meth:`of`.
-
-    Attributes:
-        used, left_out: number of pixels with a depth, within and beyond the limits of sigma.
-    """
-
-    def __init__(self) -> None:
-        self.used = self.left_out = 0
-
-    def of(self, frames: Iterator[RunFrame]) -> Iterator[RunFrame]:
-        """The frames, unchanged."""
-        for frame in frames:
-            self.used += int(np.count_nonzero(np.isfinite(frame.depth)))
-            self.left_out += frame.left_out
-            yield frame
-
-    @property
-    def share(self) -> float:
-        """Share of the pixels with a depth that are within the limits; NaN without one."""
-        return self.used / total if (total := self.used + self.left_out) else float("nan")
+    return RunFrame(*about, *shown, maps.get("anchors"), record)
 
 
 def with_images(frames: Iterator[RunFrame], sequence: FrameSequence) -> Iterator[RunFrame]:

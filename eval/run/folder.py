@@ -38,10 +38,9 @@ class FolderKind:
     files: tuple[str, ...]  # glob patterns of the files of earlier work, without the manifest
     # By pattern, a function that recognises the program's files by their content where a user may have others.
     recognise: Mapping[str, Callable[[Path], bool]] = field(default_factory=dict)
-    # Format of the manifest and the other files; None = work cannot be resumed, and a summary replaces the manifest at
-    # the end.
+    # Format of the manifest and the other files; None = work cannot be continued, and a summary replaces the manifest
+    # at the end.
     format: int | None = None
-    repeats: bool = False  # True if work with equal values replaces earlier work without ``overwrite``
     lock: str | None = None  # path of the lock file below the folder; None = no lock
     allowed: tuple[str, ...] = ()  # entries that may exist in a folder before its manifest does
     # Glob patterns below the folder of temporary files of a killed process.
@@ -63,9 +62,9 @@ class FolderKind:
             article = "an" if self.noun[0] in "aeiou" else "a"
             raise FolderError(f"{path} is not {article} {self.noun}'s ({error}); --overwrite starts again") from error
 
-    def earlier(self, out: Path, *, resume: bool, overwrite: bool) -> bool:
+    def earlier(self, out: Path, *, overwrite: bool) -> bool:
         """True if the folder contains earlier work of the program. Raises FolderError: ``out`` is a file, or contains
-        files of other programs, or earlier work while neither option is set."""
+        files of other programs, or finished work that cannot be continued and shall not be replaced."""
         if out.exists() and not out.is_dir():
             raise FolderError(f"--out {out} is a file, expected a folder")
         ours, state = (out / self.manifest).is_file(), ""
@@ -80,9 +79,8 @@ class FolderKind:
             if out.is_dir() and any(self._foreign(out)):
                 raise FolderError(f"--out {out} holds files of someone else: choose an empty or a new folder")
             return False
-        if not (resume or overwrite or self.repeats or state == _UNFINISHED):
-            choices = "" if self.format is None else "--resume goes on with it, "
-            raise FolderError(f"--out {out} holds an earlier {self.noun}: {choices}--overwrite replaces it")
+        if self.format is None and not overwrite and state != _UNFINISHED:
+            raise FolderError(f"--out {out} holds an earlier {self.noun}: --overwrite replaces it")
         return True
 
     def clear(self, out: Path) -> None:
@@ -120,25 +118,21 @@ class FolderKind:
 
 
 @contextmanager
-def output_folder(
-    out: Path, kind: FolderKind, content: Manifest, *, resume: bool = False, overwrite: bool = False
-) -> Iterator[bool]:
-    """Prepare a folder for new work, or to ``resume`` or ``overwrite`` earlier work, and hold its lock.
+def output_folder(out: Path, kind: FolderKind, content: Manifest, *, overwrite: bool = False) -> Iterator[None]:
+    """Prepare a folder for new work, and hold its lock. Earlier work with the same values continues: its files stay.
+    ``overwrite`` removes them.
 
     Args:
         out: created if missing.
         kind: of the folder.
         content: of the manifest, without program and format.
 
-    Yields:
-        True if the folder contains earlier work to continue.
-
     Raises:
         FolderError: as :meth:`FolderKind.earlier`; or the earlier work has other values (the message names them), or
             another process holds the folder's lock, or a link is in the way.
         OSError: the folder cannot be made or locked.
     """
-    kind.earlier(out, resume=resume, overwrite=overwrite)
+    kind.earlier(out, overwrite=overwrite)
     kind.require_no_links(out)
     (out / kind.manifest).parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as locks:
@@ -148,7 +142,7 @@ def output_folder(
                 raise FolderError(f"--out {out}: another {kind.noun} is writing there now")
             locks.callback(lock.release)
         # Check again, because another process may have created the folder while this one waited.
-        continued = kind.earlier(out, resume=resume, overwrite=overwrite) and not overwrite and kind.format is not None
+        continued = kind.earlier(out, overwrite=overwrite) and not overwrite and kind.format is not None
         for pattern in kind.temporary:
             remove_temporaries(out.glob(pattern))
         started = {"state": _UNFINISHED} if kind.format is None else {"format": kind.format}
@@ -163,11 +157,11 @@ def output_folder(
                 text = f"the {kind.noun} in {out} was started with other input: {changed}"
                 raise FolderError(f"{text}; --overwrite replaces it")
             manifest = dict(kind.merge(earlier, manifest))
-        if not (continued and resume):
+        if not continued:
             kind.clear(out)
         if not continued or manifest != earlier:
             write_json_atomic(out / kind.manifest, manifest)
-        yield continued and resume
+        yield
 
 
 def differences(old: Manifest, new: Manifest) -> str:

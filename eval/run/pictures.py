@@ -1,7 +1,6 @@
 """Pictures of a run: contact sheet and preview video.
 
-A run's pictures are drawn from its finished frames on disk. Their scales therefore fit the whole run, and a resumed run
-has the same pictures.
+A run's pictures are drawn from its finished frames on disk. Their scales therefore fit the whole run.
 """
 
 from __future__ import annotations

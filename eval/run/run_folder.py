@@ -15,7 +15,7 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from torch import Tensor
 
 from ufmstar_torch.eval.check.image_fit import DepthFit, depth_at_pixels, depth_fit
 from ufmstar_torch.eval.engine.files import to_json, write_bytes_atomic
-from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
+from ufmstar_torch.eval.engine.judge import UFM, judge_run
 from ufmstar_torch.eval.engine.rows import RowResult
 from ufmstar_torch.eval.engine.stream import FrameResult
 from ufmstar_torch.eval.run.folder import FolderKind
@@ -44,6 +44,9 @@ from ufmstar_torch.eval.sequences.own_output import RECORDS
 from ufmstar_torch.eval.sequences.plugins import load_plugins
 from ufmstar_torch.frames.output import EVERY_FRAME
 
+if TYPE_CHECKING:  # a sequence without ground truth does not need torchmetrics, whose import takes a while
+    from ufmstar_torch.eval.metrics import SequenceMetrics
+
 CACHE = "cache"
 NEAR_ZERO = 1e-3  # [m] no depth network is more accurate than this sigma
 # Outputs that are made from the finished frames.
@@ -54,7 +57,6 @@ RUN = FolderKind(
     manifest="run.json",
     format=7,
     lock="run.lock",
-    repeats=True,
     files=(f"{FRAMES}/*.npz", *(f"{f}/*.png" for f in PNGS), "summary.json", RECORDS, *_MADE_AT_END),
     recognise={f"{FRAMES}/*.npz": is_frame, **{f"{folder}/*.png": is_length_png for folder in PNGS}},
     allowed=(CACHE,),
@@ -67,7 +69,7 @@ class RunFolder:
 
     Attributes:
         records: the lines of frames.jsonl so far.
-        metrics: of these frames.
+        metrics: of these frames, by the names of ``judge_run``; {} without ground truth.
         seconds: time from the beginning to the last of these frames.
         outputs: by file that is made from all frames None, or why it was not made.
         first_maps: of ``keep_first_map``.
@@ -77,9 +79,11 @@ class RunFolder:
         self.job, self.path, self.seconds = job, path, 0.0
         self.records: list[dict[str, Any]] = []
         self.outputs: dict[str, str | None] = {}
-        self.metrics = RunMetrics(load_plugins(job.settings.get("plugin", ())).metrics)
+        self.metrics: dict[str, SequenceMetrics] = {}
+        self._plugins = load_plugins(job.settings.get("plugin", ())).metrics
         self.first_maps: FirstMaps = {}
         self._unit: float | None = None  # of the depth PNGs [m per count]
+        RUN.clear(path)  # of an earlier run with the same values
         (path / FRAMES).mkdir(exist_ok=True)
         write_bytes_atomic(path / RECORDS, b"")
 
@@ -87,7 +91,7 @@ class RunFolder:
         """Judge, write and record a frame. Raises OSError."""
         started, judged = perf_counter(), 0.0
         if (row := result.rows.get(UFM)) is not None:
-            self.metrics.add(row)
+            judge_run(self.metrics, row, self._plugins)
             judged = perf_counter() - started
             arrays = frame_arrays(result.frame, row)
             write_frame(frame_file(self.path, result.name), arrays)

@@ -71,7 +71,7 @@ def network_scale(
             f"--scale-from network: {len(medians)} frames see {_FEWEST_LANDMARKS} landmarks of the model, at least "
             f"{_FEWEST_FRAMES} are needed"
         )
-    metres = float(f"{np.median(medians):.4g}")  # rounded, to be equal in a resumed run despite a network's last bits
+    metres = float(f"{np.median(medians):.4g}")  # rounded, to be equal in a repeated run despite a network's last bits
     low, high = np.percentile(medians, [16, 84])
     return NetworkScale(metres, float(high - low) / 2 / metres, len(medians))
 

@@ -38,7 +38,7 @@ def write_summary(folder: RunFolder, mixture: GaussianMixture, state: str, reaso
     the summary cannot be written."""
     job, records = folder.job, folder.records
     done = [record for record in records if record["state"] == "done"]
-    figures = folder.metrics.figures()
+    figures = {name: metrics.compute() for name, metrics in folder.metrics.items()}
     result = UFM if job.config.posterior is None else POSTERIOR
     no_truth = "no ground truth" if job.sensor is None else "the recording's depth serves as anchors"
     alone_reason = "the depth comes without a variance of its own"
@@ -157,7 +157,7 @@ def _posterior(done: Records, figures: Mapping[str, float] | None) -> dict[str, 
 
 
 def _parts(figures: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
-    """The metrics on what moves and on what stands still, by the names of ``RunMetrics``; {} without masks."""
+    """The metrics on what moves and on what stands still, by the names of ``judge_run``; {} without masks."""
     parts = {name: values for name, values in figures.items() if "." in name}
     return {"parts": parts} if parts else {}
 

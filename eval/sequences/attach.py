@@ -16,9 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from ufmstar_torch.eval.sequences.frame import Entry, Loader, Skipped
-from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, list_files, read_color
+from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, is_hidden, list_files, read_color
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import read_pose
+from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.gaussians.trajectory import Trajectory, interpolate_pose
 
 # Integer timestamps as file names: EuRoC and ROS write nanoseconds, some cameras microseconds [units/s].
@@ -186,8 +187,11 @@ def pair_by_name(names: Sequence[str], files: Iterable[Path]) -> dict[str, Path]
 
 
 def pair_depth(names: Sequence[str], folder: Path) -> dict[str, Path]:
-    """The depth maps of a folder by frame name. Raises ValueError: no map has a partner."""
+    """The depth maps of a folder by frame name; one with other files alone is logged. Raises ValueError: no map has a
+    partner."""
     files = list_files(folder, DEPTH_SUFFIXES)
+    if not files and (other := next((path.name for path in folder.iterdir() if not is_hidden(path)), None)):
+        LOGGER.warning("%s holds no depth map (%s), but %s: it is left out", folder, ", ".join(DEPTH_SUFFIXES), other)
     pairs = pair_by_name(names, files)
     if files and not pairs:
         raise ValueError(f"{folder}: no depth map ({files[0].name}, ...) is named like an image ({names[0]}, ...)")

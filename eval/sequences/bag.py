@@ -23,7 +23,7 @@ from ufmstar_torch.eval.sequences import ros_messages as ros
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import UNKNOWN
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Skipped
-from ufmstar_torch.eval.sequences.images import is_sidecar, natural_key
+from ufmstar_torch.eval.sequences.images import is_hidden, natural_key
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import associate
@@ -163,7 +163,7 @@ def _bag_files(path: Path) -> list[Path]:
     """The files of one recording in the order of their numbers, or its folder with metadata; [] for other paths."""
     if path.is_file():
         return [path] if path.suffix in _SUFFIXES else []
-    files = [p for p in path.glob("*") if any(end in p.suffixes for end in _SUFFIXES) and not is_sidecar(p)]
+    files = [p for p in path.glob("*") if any(end in p.suffixes for end in _SUFFIXES) and not is_hidden(p)]
     if files and (path / _METADATA).is_file():
         return [path]
     if len(files) > 1:

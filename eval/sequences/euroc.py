@@ -65,7 +65,7 @@ def _trajectory(camera: Path) -> Trajectory:
     truth = next((camera.parent / name for name in _TRUTHS if (camera.parent / name / "data.csv").is_file()), None)
     if truth is None:
         raise ValueError(f"{camera.parent}: none of {', '.join(_TRUTHS)} holds poses; pass trajectory")
-    table = read_matrix(truth / "data.csv", commas=True)
+    table = read_matrix(truth / "data.csv")
     if table.ndim != 2 or table.shape[1] < 8:
         raise ValueError(f"{truth / 'data.csv'}: expected a time [ns], x y z [m] and qw qx qy qz; pass trajectory")
     table = table[np.isfinite(table[:, :8]).all(axis=1) & (np.linalg.norm(table[:, 4:8], axis=1) > 0.5)]

@@ -39,8 +39,6 @@ _MILLIMETRE = 1e-3
 _FULL_SCALES = (255, 1023, 4095, 16383, 65535)
 _DEEP = ";16"  # in Pillow's name of the stored pixels of an image with 16 bits
 _SCALE_SAMPLES = 8  # images of a folder that determine its scale
-# On a disk with another system's format, macOS stores the attributes of NAME in a file ._NAME in the same folder.
-_SIDECAR = "._"
 # Names of a depth channel of an EXR file, best first; Blender prefixes its layer ("ViewLayer.Depth.Z").
 _DEPTH_NAMES = ("Z", "depth", "V", "Y", "R")
 
@@ -179,13 +177,14 @@ def first_depth_size(frames: Iterable[Entry | Skipped]) -> Size | None:
 def list_files(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:
     """The folder's files with one of the suffixes, numbers in names sorted by value (2 before 10). Broken links are
     included, so that their frames are skipped and counted."""
-    named = (path for path in folder.iterdir() if path.suffix.lower() in suffixes and not is_sidecar(path))
+    named = (path for path in folder.iterdir() if path.suffix.lower() in suffixes and not is_hidden(path))
     return sorted((p for p in named if p.is_file() or (p.is_symlink() and not p.exists())), key=natural_key)
 
 
-def is_sidecar(path: Path) -> bool:
-    """True if the file holds the attributes that macOS stores of another file: it has the suffix of that file."""
-    return path.name.startswith(_SIDECAR)
+def is_hidden(path: Path) -> bool:
+    """True if the name begins with a dot, as that of an unfinished download, and ._NAME, in which macOS stores the
+    attributes of NAME."""
+    return path.name.startswith(".")
 
 
 def listed_path(text: str) -> Path:

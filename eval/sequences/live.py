@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.eval.sequences.attach import stem_times
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
-from ufmstar_torch.eval.sequences.images import IMAGE_SUFFIXES, is_sidecar, listed_path, read_color
+from ufmstar_torch.eval.sequences.images import IMAGE_SUFFIXES, is_hidden, listed_path, read_color
 from ufmstar_torch.eval.sequences.poses import in_metres, parse_pose, poses_from_columns
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.gaussians.conventions import CONVENTIONS, OURS
@@ -145,7 +145,7 @@ def growing_folder(
     while clock() - last <= idle:
         yield from poses.new()
         for path in sorted(folder.iterdir()):
-            if path.suffix.lower() not in IMAGE_SUFFIXES or is_sidecar(path):
+            if path.suffix.lower() not in IMAGE_SUFFIXES or is_hidden(path):
                 continue
             changed = _changed(path)
             if seen.get(path.name) == changed:

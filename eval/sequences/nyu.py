@@ -13,7 +13,7 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence
-from ufmstar_torch.eval.sequences.images import first_depth_size, is_sidecar, natural_key, positive
+from ufmstar_torch.eval.sequences.images import first_depth_size, is_hidden, natural_key, positive
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.files.limits import require_bytes
@@ -39,7 +39,7 @@ def parts(path: Path) -> list[Path]:
 
 def part_files(folder: Path) -> list[Path]:
     """The h5 files of a part, in the order of scenes and numbers."""
-    files = (path for path in folder.glob("*/*.h5") if not is_sidecar(path))
+    files = (path for path in folder.glob("*/*.h5") if not is_hidden(path))
     return sorted(files, key=lambda path: (path.parent.name, natural_key(path)))
 
 
@@ -65,7 +65,7 @@ def _files(path: Path) -> list[Path]:
     if path.resolve().name in PARTS:
         return part_files(path)
     if path.is_dir() and path.resolve().parent.name in PARTS:
-        return sorted((file for file in path.resolve().glob("*.h5") if not is_sidecar(file)), key=natural_key)
+        return sorted((file for file in path.resolve().glob("*.h5") if not is_hidden(file)), key=natural_key)
     return []
 
 

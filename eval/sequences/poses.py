@@ -1,6 +1,7 @@
 """Poses: reading of trajectories in the common text formats, association by timestamp.
 
-All poses are camera-to-world. The number of columns of a line defines the format:
+All poses are camera-to-world; numbers have a decimal point, with spaces, commas or semicolons between them. The number
+of columns of a line defines the format:
 
 ====  ==========================================================
 7     ``tx ty tz qx qy qz qw`` (TartanAir)
@@ -52,7 +53,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
         if len(row) not in (7, 8, 12, 13, 16, 17):
             raise ValueError(
                 f"{where}: expected a pose of 7 or 8 (tx ty tz qx qy qz qw), 12 or 13 (3x4), 16 or 17 (4x4) "
-                f"numbers separated by spaces, got {len(row)}"
+                f"numbers, got {len(row)}"
             )
         if len(row) != len(rows[0]):
             raise ValueError(f"{where}: expected {len(rows[0])} numbers as in the first pose, got {len(row)}")
@@ -104,10 +105,10 @@ def associate(first: np.ndarray, second: np.ndarray, max_difference: float) -> d
     return pairs
 
 
-def read_matrix(path: str | Path, *, commas: bool = False) -> np.ndarray:
+def read_matrix(path: str | Path) -> np.ndarray:
     """The numbers of a small text file, one row per line, [R, C] float64, non-finite ones included. Raises ValueError:
-    a line has something other than numbers (with ``commas`` between them), or lines differ in length."""
-    rows, lines = _numbers(path, commas)
+    a line has something other than numbers, or lines differ in length."""
+    rows, lines = _numbers(path)
     for row, where in zip(rows, lines, strict=True):
         if len(row) != len(rows[0]):
             raise ValueError(f"{where}: expected {len(rows[0])} numbers as in the first line, got {len(row)}")
@@ -212,12 +213,12 @@ def _require_consistent(T_world_cam: np.ndarray, first: np.ndarray, same: np.nda
         raise ValueError(f"{lines[i]}: the pose has the timestamp of line {other}, but lies {far} {many}")
 
 
-def _numbers(path: str | Path, commas: bool = False) -> tuple[list[list[float]], list[str]]:
+def _numbers(path: str | Path) -> tuple[list[list[float]], list[str]]:
     """The numbers of each non-empty line, and its FILE:LINE; a ``#`` inside a token (Windows' 1.#IND) starts no
     comment."""
     rows, lines = [], []
     for line, text in numbered_lines(path):
-        tokens, where = _tokens(re.sub("[,;]", " ", text) if commas else text), f"{path}:{line}"
+        tokens, where = _tokens(text), f"{path}:{line}"
         if tokens:
             rows.append([number(token, where) for token in tokens])
             lines.append(where)
@@ -225,8 +226,11 @@ def _numbers(path: str | Path, commas: bool = False) -> tuple[list[list[float]],
 
 
 def _tokens(text: str) -> list[str]:
-    """The words of a line before its comment."""
-    return re.split(r"(?:^|\s)#", text, maxsplit=1)[0].split()
+    """The words of a line before its comment. A comma beside other separators is part of a word, as in "0,5 1,5"."""
+    words = re.split(r"(?:^|\s)#", text, maxsplit=1)[0].split()
+    separator = ";" if any(";" in word for word in words) else ","
+    words = [word.strip(separator) for word in words]
+    return words[0].split(separator) if len(words) == 1 else [word for word in words if word]
 
 
 def number(word: str, where: str) -> float:
@@ -236,4 +240,5 @@ def number(word: str, where: str) -> float:
     try:
         return float(word)
     except ValueError:
-        raise ValueError(f"{where}: expected a number, got {word[:60]!r}") from None
+        point = " with a decimal point" if "," in word else ""
+        raise ValueError(f"{where}: expected a number{point}, got {word[:60]!r}") from None

@@ -40,7 +40,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     if missing := [name for name in _COLUMNS if name not in names]:
         found = ", ".join(names)[:99]
         raise ValueError(f"{path / _ODOMETRY}: the first line must name the column {missing[0]!r}, got {found!r}")
-    video, K, expected = Video(path / _VIDEO), read_matrix(path / _CAMERA, commas=True), "expected 3 lines of 3 numbers"
+    video, K, expected = Video(path / _VIDEO), read_matrix(path / _CAMERA), "expected 3 lines of 3 numbers"
     if K.shape != (3, 3) or not np.isfinite(K).all():
         raise ValueError(f"{path / _CAMERA}: {expected}")
     frames: list[Entry | Skipped] = []

@@ -25,7 +25,7 @@ from ufmstar_torch.eval.sequences.images import (
     IMAGE_SUFFIXES,
     depth_loader,
     image_size,
-    is_sidecar,
+    is_hidden,
     listed_file,
     listed_path,
     read_color,
@@ -49,7 +49,7 @@ _MODELS = (*_FISHEYES, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "")
 
 def detect(path: Path) -> bool:
     """True if the path is a file of this layout, or a folder with one."""
-    return _file(path).is_file() and _file(path).suffix.lower() == ".json" and not is_sidecar(path)
+    return _file(path).is_file() and _file(path).suffix.lower() == ".json" and not is_hidden(path)
 
 
 def _file(path: Path) -> Path:

@@ -30,13 +30,11 @@ _REPORT = ("efficiency.json", "results.csv", "report.html", "tables/*.tex", "fig
 _OF_SEQUENCE = ("*.json", "*.pt", "examples/*.npz")
 
 
-def evaluation_folder(
-    out: Path, about: Mapping[str, Any], *, resume: bool = False, overwrite: bool = False
-) -> AbstractContextManager[bool]:
-    """Create or resume the folder, and lock it; see ``output_folder``. A resume adds rows, sequences and networks of
-    ``about`` (eval.json) to the earlier evaluation; suite, settings and the networks of the same base must be equal.
-    The cache of predictions is never removed."""
-    return output_folder(out, EVALUATION, about, resume=resume, overwrite=overwrite)
+def evaluation_folder(out: Path, about: Mapping[str, Any], *, overwrite: bool = False) -> AbstractContextManager[None]:
+    """Create the folder, or continue the evaluation in it, and lock it; see ``output_folder``. Rows, sequences and
+    networks of ``about`` (eval.json) are added to the earlier evaluation; suite, settings and the networks of the same
+    base must be equal. The cache of predictions is never removed."""
+    return output_folder(out, EVALUATION, about, overwrite=overwrite)
 
 
 @dataclass(frozen=True)
@@ -81,13 +79,13 @@ class EvalFolder:
         for slug, record in self.records(item).items():
             if slug in landmarks and record.provenance.get("landmarks") != landmarks[slug]:
                 raise FolderError(
-                    f"--resume: {item.label} has other landmarks in {record.setting['anchors']} than when "
+                    f"{item.label} has other landmarks in {record.setting['anchors']} than when "
                     f"{record.method} was computed there; --overwrite starts again"
                 )
             then = record.provenance.get("sequence")
             if then != digest:
                 raise FolderError(
-                    f"--resume: {item.label} has other frames, cameras or poses than when {record.method} was "
+                    f"{item.label} has other frames, cameras or poses than when {record.method} was "
                     f"computed there (digest was {str(then)[:16]}, now {digest[:16]}); --overwrite starts again"
                 )
 

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from ufmstar_torch.eval.engine.evaluate import Judge
 from ufmstar_torch.eval.engine.load import NetworkChoice
-from ufmstar_torch.eval.engine.predictions import DepthSource, PredictionCache
+from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.method import FUSIONS
 from ufmstar_torch.eval.methods.suite import Suite
 from ufmstar_torch.eval.run.machine import hardware, versions
 from ufmstar_torch.eval.sequences.plugins import load_plugins
-from ufmstar_torch.eval.suite.folder import CACHE, EvalFolder
+from ufmstar_torch.eval.suite.folder import EvalFolder
 from ufmstar_torch.eval.suite.work_items import WorkItem
 from ufmstar_torch.models.inference import Inference
-from ufmstar_torch.posterior.recalibrate import Recalibration
 
 
 @dataclass(frozen=True)
@@ -31,8 +29,6 @@ class EvalJob:
     items: tuple[WorkItem, ...]  # the sequences
     out: Path  # output folder
     missing_bases: tuple[str, ...] = ()  # bases of omitted rows, which have no network
-    # Networks of other architectures, by base, whose time, energy and memory are also measured.
-    further: tuple[Mapping[str, NetworkChoice], ...] = ()
     frames: slice = field(default_factory=lambda: slice(None))  # selects frames of each sequence
     cache: Path | None = None  # folder of predictions; None = in ``out``
     device: str = "cpu"  # "cpu", "cuda", "cuda:1"
@@ -54,18 +50,12 @@ class EvalJob:
         """Bases with a network that no row of the suite has."""
         return tuple(base for base in self.networks if base not in self.suite.bases)
 
-    def load(self, device: torch.device, networks: Mapping[str, NetworkChoice] | None = None) -> dict[str, DepthSource]:
-        """Load the networks that the rows need from ``networks`` (None = the evaluated ones). Raises
-        FileNotFoundError, ValueError, ImportError, see ``NetworkChoice.load``."""
-        networks = self.networks if networks is None else networks
-        needed = [networks[base] for base in self.suite.bases if base in networks]
+    def load(self, device: torch.device) -> dict[str, DepthSource]:
+        """Load the networks that the rows need. Raises FileNotFoundError, ValueError, ImportError, see
+        ``NetworkChoice.load``."""
+        needed = [self.networks[base] for base in self.suite.bases if base in self.networks]
         inference = Inference(self.runtime, self.precision)
         return {choice.base: choice.load(device, samples=self.samples, inference=inference) for choice in needed}
-
-    def judge(self, networks: Mapping[str, DepthSource], device: torch.device) -> Judge:
-        """The judge with the loaded networks. Raises CacheError: the folder of predictions cannot be written."""
-        store = PredictionCache(self.cache or self.out / CACHE)
-        return Judge(networks, device, store, self.frames, self.bins, load_plugins(self.plugin))
 
     def about(self, networks: Mapping[str, DepthSource]) -> dict[str, Any]:
         """The content of eval.json."""
@@ -102,21 +92,3 @@ def require_methods(suite: Suite, plugin: Sequence[str]) -> None:
             remedy = f"there are {', '.join(methods)}" if methods else "--plugin FILE.py adds yours"
             why = "the cost of a method of one's own is not measured" if fusion in methods else remedy
             raise ValueError(f"suite {suite.name}: row {row.method.name}: {why}")
-
-
-def with_recalibrations(suite: Suite, files: Sequence[str]) -> Suite:
-    """The suite with a row for each recalibration, after the row to which it was fitted.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: a file is no recalibration, or was fitted to a row outside the suite.
-    """
-    for file in files:
-        fitted = Recalibration.from_json(file).row
-        row = next((row for row in suite.rows if row.label == fitted), None)
-        if row is None:
-            raise ValueError(f"--recalibration {file} was fitted to the row {fitted!r}, which the suite does not have")
-        recalibrated = replace(row, setting=replace(row.setting, recalibration=file))
-        position = suite.rows.index(row) + 1
-        suite = replace(suite, rows=(*suite.rows[:position], recalibrated, *suite.rows[position:]))
-    return suite

@@ -1,7 +1,7 @@
 """The tasks of an evaluation, one for each sequence, on an executor: processes of this computer, or a Dask cluster.
 
 A task writes its sequence's records into the output folder, which all processes share. Finished records are not
-computed again, so an evaluation that was killed, or that lost its cluster, continues with ``resume``.
+computed again, so an evaluation that was killed, or that lost its cluster, continues with the same command.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import Any
 
 import torch
 
-from ufmstar_torch.eval.engine.evaluate import Judge
+from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.engine.stream import Stopped
 from ufmstar_torch.eval.run.machine import available_cores, device_of
@@ -55,7 +55,6 @@ def evaluate_suite(
     executor: Executor | None = None,
     *,
     threads: int | None = None,
-    resume: bool = False,
     overwrite: bool = False,
     stop: Stop = lambda: False,
     report: Report = lambda _: None,
@@ -69,7 +68,7 @@ def evaluate_suite(
             processes need this package, and all files and the working folder under the paths that they have here.
             Each evaluates one sequence at a time, whatever its number of threads.
         threads: CPU threads of each process of the executor; None = its own choice.
-        resume, overwrite: see ``evaluation_folder``.
+        overwrite: see ``evaluation_folder``.
         stop: called before every frame; True ends the work.
         report: receives a line for every finished sequence.
         progress: called after every frame, with the sequence's label as the stage; with an executor, after every
@@ -82,20 +81,22 @@ def evaluate_suite(
     """
     device = torch.device(device_of(job.device, 0) if executor is None else "cpu")
     networks, folder = job.load(device), job.folder
-    with evaluation_folder(job.out, job.about(networks), resume=resume, overwrite=overwrite), warned_once():
+    with evaluation_folder(job.out, job.about(networks), overwrite=overwrite), warned_once():
         if executor is None:
-            finished = _one_by_one(job, job.judge(networks, device), stop, report, progress)
+            finished = _one_by_one(job, networks, device, stop, report, progress)
         else:
             finished = _on_executor(executor, job, threads, stop, report, progress)
     failed, labels = folder.failures(), {(item.dataset, item.sequence): item.label for item in job.items}
     return EvalOutcome(finished, stop(), {labels[where]: failed[where] for where in labels.keys() & failed})
 
 
-def _one_by_one(job: EvalJob, judge: Judge, stop: Stop, report: Report, progress: Shown) -> bool:
+def _one_by_one(
+    job: EvalJob, networks: Mapping[str, DepthSource], device: torch.device, stop: Stop, report: Report, progress: Shown
+) -> bool:
     """Evaluate the sequences in this process. Returns False if it was stopped."""
     with suppress(Stopped):
         for item in job.items:
-            if line := evaluate_item(job, item, judge, stop=stop, progress=progress):
+            if line := evaluate_item(job, item, networks, device, stop=stop, progress=progress):
                 report(line)
         return True
     return False
@@ -214,20 +215,21 @@ def evaluate_task(content: bytes, item: WorkItem) -> str:
         raise Stopped
     if threads is not None:
         torch.set_num_threads(threads)
-    judge, lock = _judge(content)
+    networks, device, lock = _loaded(content)
     with lock:
         os.chdir(folder)
-        return evaluate_item(job, item, judge, stop=stop_file.exists)
+        return evaluate_item(job, item, networks, device, stop=stop_file.exists)
 
 
 @lru_cache(maxsize=1)
-def _judge(content: bytes) -> tuple[Judge, Lock]:
-    """The judge of a pickled job, loaded once in every process, and the lock of the thread that uses it."""
+def _loaded(content: bytes) -> tuple[dict[str, DepthSource], torch.device, Lock]:
+    """The networks of a pickled job, loaded once in every process, their device, and the lock of the thread that uses
+    them."""
     job, _, folder = pickle.loads(content)
     os.chdir(folder)
     logging.getLogger("ufmstar_torch").addFilter(_once())
     device = torch.device(job.device)
-    return job.judge(job.load(device), device), Lock()
+    return job.load(device), device, Lock()
 
 
 def _once() -> Callable[[logging.LogRecord], bool]:

@@ -138,7 +138,8 @@ class AnchorDoubts:
     def __init__(self) -> None:
         self._calls = 0
         self._logged = set[tuple[int, str]]()
-        # By stream, successive frames: with depths of another scale, by more than _UNIT, and in the opposite order.
+        # By stream: successive frames with depths of another scale, and by more than _UNIT; frames with depths in the
+        # opposite order minus the others, since a network that misjudges one view repeats this in the next frames.
         self._off, self._far_off, self._inverse = Counter[int](), Counter[int](), Counter[int]()
 
     def judge(self, anchors: Anchors, checked: Anchors, size: tuple[int, int]) -> None:
@@ -191,7 +192,7 @@ class AnchorDoubts:
                 yield b, "scale", text + "the variance is increased. Are depth, poses and anchors in metres?"
 
     def _inverted(self, b: int, checked: Anchors) -> str:
-        """Count a frame where predicted depths have the anchors' opposite order; returns a warning after some."""
+        """Count whether predicted depths have the anchors' opposite order; returns a warning if most frames do."""
         used = np.flatnonzero(array(checked.mask[b]))
         used = used[:: -(-len(used) // _COMPARED) or 1]
         anchors, predicted = np.log(array(checked.depth[b])[used]), array(checked.predicted[b])[used]
@@ -199,7 +200,7 @@ class AnchorDoubts:
             return ""
         ranks = [values.argsort().argsort() - (len(used) - 1) / 2 for values in (anchors, predicted)]
         order = float(ranks[0] @ ranks[1] / (ranks[0] @ ranks[0]))
-        self._inverse[b] = self._inverse[b] + 1 if order < _INVERSE else 0
+        self._inverse[b] += 1 if order < _INVERSE else -1
         if self._inverse[b] != _SUCCESSIVE:
             return ""
         return f"far is near in the depth (rank correlation {order:.2f} with the anchors): is it inverse depth?"

@@ -24,33 +24,26 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.dense_keyframes import Keyframes, halved
 from ufmstar_torch.anchors.dense_memory import Memory
-from ufmstar_torch.anchors.dense_poses import Fit, PoseErrors
-from ufmstar_torch.anchors.epipolar import median
+from ufmstar_torch.anchors.dense_poses import PoseErrors
 from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, OtherCameraError, checked, opencv
 from ufmstar_torch.anchors.motion import LANDMARK, LINE, OFF_LINE, SEARCH, MotionTests, Tested, located, moves
 from ufmstar_torch.anchors.saved_state import POSITIVE, SavedState
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
-from ufmstar_torch.gaussians.camera import inverse_intrinsics
 from ufmstar_torch.runtime.checked import Checked, number
 
 if TYPE_CHECKING:
     from ufmstar_torch.anchors.kernels.dense import Search, Views
 
 # Baselines of the keyframes with which a frame is compared, as shares of the median depth.
-_BASELINES = (0.04, 0.1, 0.22, 0.45)
+_BASELINES = np.array([0.04, 0.1, 0.22, 0.45])
 # Range of the first search of inverse depth, over 1/median depth.
 _NEAREST, _FARTHEST = 6.0, -0.03
 # Least number of anchors for an update of the running estimates.
 _ENOUGH = 10
 # Successive frames contradicting their poses after which keyframes and landmarks are deleted: the poses have jumped.
 _JUMPED = 3
-# Standard deviation of an inverse depth, as a share of it, by the scale of the poses, which no image determines.
-_SCALE = 0.005
 # Variance of a match of the wide windows over that computed from its residual; 2 to 4 on tours.
 _COARSE_NOISE = 4.0
-# Mapping of pixels to those of an image of half the size, and back.
-_HALVED = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
-_DOUBLED = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1]])
 _CORNERS = "corners_"  # prefix of the names of the tracker's state
 
 
@@ -108,20 +101,6 @@ class Depths(NamedTuple):
     pixel: NDArray[np.float64]
     rho: NDArray[np.float64]
     variance: NDArray[np.float64]
-
-
-class Compared(NamedTuple):
-    """V keyframes that a frame is compared with.
-
-    Attributes:
-        views: with the mapping of the frame's pixels to theirs.
-        shares: [V] indices of their baselines.
-        half: [V, H // 2, W // 2] their images at half the size.
-    """
-
-    views: Views
-    shares: NDArray[np.int64]
-    half: NDArray[np.uint8]
 
 
 class DenseEvidence(SavedState):
@@ -220,10 +199,11 @@ class DenseEvidence(SavedState):
         self._keyframes.correct(number, poses)
         if self._tracker.jumped:
             self._forget()
-        result = self._measured(small, scale, T, scale @ K, corners)
+        half = halved(small)
+        result = self._measured(small, half, scale, T, scale @ K, corners)
         if self._contradicted >= _JUMPED:
             self._forget()
-        self._keyframes.add(small, T, self._depth, int(number.max()))
+        self._keyframes.add(small, half, T, self._depth, int(number.max()))
         return result
 
     def _forget(self) -> None:
@@ -233,9 +213,16 @@ class DenseEvidence(SavedState):
         self._memory.forget()
 
     def _measured(
-        self, small: NDArray[np.uint8], scale: NDArray, T: NDArray, K: NDArray, corners: Landmarks
+        self,
+        small: NDArray[np.uint8],
+        half: NDArray[np.uint8],
+        scale: NDArray,
+        T: NDArray,
+        K: NDArray,
+        corners: Landmarks,
     ) -> Landmarks:
-        """Measure the depths in a reduced image, and add corners where there are none."""
+        """Measure the depths in a reduced image, and add corners where there are none. ``half`` is the image at half
+        the size."""
         from ufmstar_torch.anchors.kernels.check import check_anchors  # kernels compile when they are first needed
 
         cell, K = _cell(small.shape[1]), self._errors.camera(K)
@@ -245,7 +232,7 @@ class DenseEvidence(SavedState):
         found, searched, trusted, tested, disagree = self._in_cells(small, T, K, cell, compared, trusted)
         self._contradicted = 0 if trusted else self._contradicted + 1
         if compared is not None and trusted:
-            coarse = self._coarse(small, found.pixel, compared, cell)
+            coarse = self._coarse(small, half, found.pixel, compared[1], cell)
             found = Depths(*(np.concatenate(pair) for pair in zip(found, coarse, strict=True)))
         ratios = self._motion.log_ratios(tested, small.shape, cell) if trusted else None
         moving = np.zeros(len(found.pixel), np.bool_) if ratios is None else moves(ratios, found.pixel, cell)
@@ -272,7 +259,7 @@ class DenseEvidence(SavedState):
         T: NDArray,
         K: NDArray,
         cell: int,
-        compared: Compared | None,
+        compared: tuple[Views, Views] | None,
         trusted: bool,
     ) -> tuple[Depths, int, bool, Tested, int]:
         """Measure visible landmarks again where the camera has moved, and new pixels in the cells without a landmark.
@@ -283,64 +270,38 @@ class DenseEvidence(SavedState):
             The depths; the number of searched pixels; False if the views contradict each other; tests of whether
             surfaces stand still; the number of pixels where views, or old and new measurements, disagree.
         """
-        sighted = self._memory.sighted(small, T, K, cell)
-        n = len(sighted.slot)
-        pixel = np.concatenate([sighted.pixel, _pixels(small, cell, sighted.pixel)])
-        rho, variance = np.zeros(len(pixel)), np.ones(len(pixel))
-        measured, storable = np.zeros((2, len(pixel)), np.bool_)
-        searched = np.concatenate([np.flatnonzero(sighted.due), np.arange(n, len(pixel))])
-        tests, disagree = [(sighted.compared, LANDMARK, sighted.hidden)], 0
-        if compared is not None:
-            found, fit, precise, trusted, seen, disagree = self._searched(small, pixel[searched], compared, K, cell)
-            unmatched = np.ones(len(searched), np.bool_)
-            unmatched[found] = False
-            tests.append((pixel[searched][seen], SEARCH, unmatched[seen]))
-            on_line = np.isfinite(fit.off_line)
-            tests.append((pixel[searched][found][on_line], LINE, fit.off_line[on_line] > OFF_LINE))
-            index = searched[found]
-            storable[index] = precise
-            measured[index], rho[index], variance[index] = True, fit.rho, fit.variance + np.square(_SCALE * fit.rho)
-        measured &= (rho > np.sqrt(variance)) & trusted
-        merged, consistent = self._memory.compare(sighted, rho[:n], variance[:n], measured[:n])
-        updated, new = np.flatnonzero(measured[:n] & consistent), np.flatnonzero(measured[n:]) + n
-        values = merged.pixel[updated], merged.rho[updated], merged.variance[updated]
-        self._memory.write(merged.slot[updated], small, *values, T, K)
-        stored = new[storable[new]]
-        self._memory.write(None, small, pixel[stored], rho[stored], variance[stored], T, K)
-        rho[:n], variance[:n] = merged.rho, merged.variance
-        valid = np.concatenate([np.flatnonzero(consistent), new]) if trusted else new
-        if len(valid) >= _ENOUGH:
-            self._depth *= float(np.exp((1 - self.config.memory) * np.log(median(1 / rho[valid]) / self._depth)))
-        count = n + (0 if compared is None else len(searched))
-        disagree += int((measured[:n] & ~consistent).sum())
-        return Depths(pixel[valid], rho[valid], variance[valid]), count, trusted, Tested.of(*tests), disagree
-
-    def _searched(
-        self, small: NDArray[np.uint8], pixel: NDArray, compared: Compared, K: NDArray, cell: int
-    ) -> tuple[NDArray[np.int64], Fit, NDArray[np.bool_], bool, NDArray[np.bool_], int]:
-        """Match pixels [N, 2] with the keyframes.
-
-        Returns:
-            Indices [n] of the measured pixels; their depths, corrected for errors of the poses; [n] True for depths to
-            store (not an uncertain match of a single view, which the next images measure better); False if the views
-            contradict each other; [N] True where two views show the line; the number of pixels with depths that
-            disagree.
-        """
-        from ufmstar_torch.anchors.kernels.check import CERTAIN, confirmed
+        from ufmstar_torch.anchors.kernels.check import confirmed
         from ufmstar_torch.anchors.kernels.dense import measure
 
-        views, shares, _ = compared
-        self._baseline = float(np.linalg.norm(inverse_intrinsics(K) @ views.b[-1]))
-        matches = measure(small, pixel, views, self._search())
-        accepted = confirmed(pixel, matches, cell)
-        agreeing = accepted[matches.agreed + matches.contradicted > 1]
-        trusted = len(agreeing) < _ENOUGH or bool(agreeing.mean() >= self.config.min_share)
-        found = np.flatnonzero(accepted)
-        fit = self._errors.corrected(pixel, found, matches, shares, views, K, self._depth, trusted)
-        storable = (matches.agreed[found] > 1) | (fit.variance < np.square(CERTAIN * fit.rho))
-        return found, fit, storable, trusted, matches.shown > 1, int((matches.contradicted > 0).sum())
+        sighted = self._memory.sighted(small, T, K, cell)
+        count, searched = len(sighted.slot), len(sighted.searched)
+        tests = [(sighted.compared, LANDMARK, sighted.hidden)]
+        if compared is None:
+            measured = np.zeros(searched, np.int64), np.zeros(searched, np.bool_), *np.zeros((2, searched))
+            searched = disagree = 0
+        else:
+            pixel = sighted.pixel[sighted.searched]
+            matches = measure(small, pixel, compared[0], self._search())
+            accepted, (several, reliable, disagree) = confirmed(pixel, matches, cell)
+            trusted = several < _ENOUGH or reliable >= self.config.min_share * several
+            arguments = matches, compared[0], K, self._depth, trusted
+            rho, variance, off_line = self._errors.corrected(pixel, accepted, *arguments)
+            measured = matches.agreed, accepted, rho, variance
+            seen, on_line = matches.shown > 1, np.isfinite(off_line)
+            tests.append((pixel[seen], SEARCH, ~accepted[seen]))
+            tests.append((pixel[on_line], LINE, off_line[on_line] > OFF_LINE))
+        found, refuted, self._depth = self._memory.settle(sighted, small, T, K, self._depth, measured, trusted)
+        depths = Depths(sighted.pixel[:found], sighted.rho[:found], sighted.variance[:found])
+        return depths, count + searched, trusted, Tested.of(*tests), disagree + refuted
 
-    def _coarse(self, small: NDArray[np.uint8], occupied: NDArray[np.float64], compared: Compared, cell: int) -> Depths:
+    def _coarse(
+        self,
+        small: NDArray[np.uint8],
+        half: NDArray[np.uint8],
+        occupied: NDArray[np.float64],
+        views: Views,
+        cell: int,
+    ) -> Depths:
         """Search the cells without a pixel of ``occupied`` [N, 2] with windows of twice the width, in images of half
         the size.
 
@@ -348,18 +309,14 @@ class DenseEvidence(SavedState):
         matched.
         """
         from ufmstar_torch.anchors.kernels.check import confirmed
-        from ufmstar_torch.anchors.kernels.dense import Views, measure
+        from ufmstar_torch.anchors.kernels.dense import free_pixels, measure
+        from ufmstar_torch.anchors.kernels.landmarks import SCALE
         from ufmstar_torch.anchors.kernels.windows import MARGIN
 
-        half, (views, _, images) = halved(small), compared
-        H, b = _HALVED @ views.H @ _DOUBLED, views.b @ _HALVED.T
-        reduced = Views(images, np.ascontiguousarray(H), np.ascontiguousarray(b), views.noise / 4)
-        occupied = (occupied - 0.5) / 2
-        inside = ((occupied >= 0) & (occupied < half.shape[::-1])).all(1)
-        pixel = _pixels(half, cell // 2, occupied[inside])
-        found = measure(half, pixel, reduced, self._search())
-        variance = _COARSE_NOISE * found.variance + np.square(_SCALE * found.rho)
-        fine = confirmed(pixel, found, cell // 2) & (found.rho > np.sqrt(variance))
+        pixel = free_pixels(half, cell // 2, (occupied - 0.5) / 2)
+        found = measure(half, pixel, views, self._search())
+        variance = _COARSE_NOISE * found.variance + np.square(SCALE * found.rho)
+        fine = confirmed(pixel, found, cell // 2)[0] & (found.rho > np.sqrt(variance))
         matched = 2 * (pixel[fine] + found.centre[fine]) + 0.5
         matched = matched.clip(MARGIN, np.array(small.shape[::-1]) - 1.0 - MARGIN)
         return Depths(matched, found.rho[fine], variance[fine])
@@ -381,21 +338,16 @@ class DenseEvidence(SavedState):
         accepted = config.sigmas, config.least_score, config.rival, config.match_noise
         return Search(rho, _FARTHEST * rho, _NEAREST * rho, *accepted)
 
-    def _compared(self, T: NDArray, K: NDArray, width: int) -> Compared | None:
-        """Choose keyframes to compare with a camera T [4, 4]; None if there is no suitable one."""
-        from ufmstar_torch.anchors.kernels.dense import Views
-
-        chosen = self._keyframes.choose(T, K, self._depth, _BASELINES)
-        if not chosen:
+    def _compared(self, T: NDArray, K: NDArray, width: int) -> tuple[Views, Views] | None:
+        """Choose keyframes to compare with a camera T [4, 4]: at the full and at half the size; None if there is no
+        suitable one."""
+        views, half, longest = self._keyframes.compared(T, K, self._depth, _BASELINES)
+        if not len(views.slot):
             return None
-        shares, keyframes = (np.array(column) for column in zip(*chosen, strict=True))
-        image, pose = self._keyframes.images(keyframes), self._keyframes.poses(keyframes)
-        R_keyframe_world = pose[:, :3, :3].transpose(0, 2, 1)
-        H = K @ R_keyframe_world @ T[:3, :3] @ inverse_intrinsics(K)
-        b = ((T[:3, 3] - pose[:, :3, 3])[:, None] @ pose[:, :3, :3])[:, 0] @ K.T
-        noise = self._errors.positions(K, width, self._depth)[shares]
-        views = Views(image, np.ascontiguousarray(H), np.ascontiguousarray(b), noise)
-        return Compared(views, shares, self._keyframes.halves(keyframes))
+        self._baseline = longest
+        views.noise[:] = self._errors.positions(K, width, self._depth)[views.share]
+        half.noise[:] = views.noise / 4
+        return views, half
 
 
 def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
@@ -413,15 +365,3 @@ def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], ND
 def _cell(width: int) -> int:
     """Side of a cell [px]: 8 in an image 160 px wide, 10 in one 320 px wide."""
     return max(round(8 * 1.25 ** np.log2(width / 160)), 4)
-
-
-def _pixels(small: NDArray[np.uint8], cell: int, occupied: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[N, 2] the pixel (u, v) of largest gradient in every cell with a gradient and no ``occupied`` pixel [M, 2]."""
-    from ufmstar_torch.anchors.kernels.dense import best_pixels
-
-    shape = (-(-small.shape[0] // cell), -(-small.shape[1] // cell))
-    pixel, strength = np.zeros((*shape, 2)), np.zeros(shape)
-    column, row = (occupied / cell).astype(np.int64).T
-    strength[row, column] = -1
-    best_pixels(small, cell, pixel, strength)
-    return pixel[strength > 0]

@@ -14,8 +14,6 @@ NEAREST = 1e-3
 NEAR, FAR = 1 / 50, 10.0
 # Cells of the image per axis; matches of each cell have the same total weight.
 _CELLS = 6
-# The median of the square of a standard normal variable.
-MEDIAN_SQUARE = 0.4549
 # The standard deviation of most matches is that by the quantile _MOST of their distances, _MOST_QUANTILE of a standard
 # normal one. Farther than _FARTHEST times it from their lines are matches on things that move, which leave their lines
 # as a group.

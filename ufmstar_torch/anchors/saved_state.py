@@ -23,6 +23,15 @@ def saved_image(state: Mapping[str, Tensor], name: str) -> NDArray[np.uint8]:
     return image
 
 
+def saved_images(state: Mapping[str, Tensor], name: str, count: int) -> NDArray[np.uint8]:
+    """Read grey images [count, H, W] from a saved state; ValueError as :func:`saved_image`."""
+    images = _array(state, name)
+    if images.dtype != np.uint8 or images.ndim != 3 or len(images) != count:
+        text = f"must have shape ({count}, H, W) and dtype uint8, got {images.shape} and {images.dtype}"
+        raise ValueError(f"state[{name!r}] {text}")
+    return images
+
+
 def _array(state: Mapping[str, Tensor], name: str) -> NDArray[Any]:
     """A tensor of a saved state as an array; ValueError: there is none on the CPU."""
     value: object = state.get(name)
@@ -48,6 +57,19 @@ class SavedState:
         """Copy the state, for :meth:`load_state`."""
         return {name: torch.from_numpy(np.array(getattr(self, attribute))) for attribute, name in self.HELD.items()}
 
+    def snapshot(self) -> dict[str, Any]:
+        """A copy of the attributes, for :meth:`restore`. Images are shared, as no method writes to them."""
+        return _copied(vars(self))
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Return to a result of :meth:`snapshot`."""
+        for name, value in _copied(snapshot).items():
+            part = getattr(self, name)
+            if isinstance(part, SavedState):
+                part.restore(value)
+            else:
+                setattr(self, name, value)
+
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Restore a result of :meth:`state`.
 
@@ -69,3 +91,17 @@ class SavedState:
             values[attribute] = value if value.ndim else value.item()
         for attribute, value in values.items():
             setattr(self, attribute, value)
+
+
+def _copied(values: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of what methods modify in place: arrays, lists and dictionaries, also those of parts."""
+    result = dict(values)
+    for name, value in values.items():
+        kind = type(value)
+        if (kind is np.ndarray and value.dtype != np.uint8) or kind is list:
+            result[name] = value.copy()
+        elif kind is dict:
+            result[name] = _copied(value)
+        elif isinstance(value, SavedState):
+            result[name] = value.snapshot()
+    return result

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -15,10 +15,10 @@ from torch import Tensor
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, LandmarkSource, OtherCameraError
+from ufmstar_torch.anchors.saved_state import SavedState
 from ufmstar_torch.anchors.sources import landmark_source
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.frames.frame import FRAME_FAULTS
-from ufmstar_torch.kernels.cpu.check import intrinsics_fault, pose_fault
 
 _LOG = logging.getLogger("ufmstar_torch")
 _CAUSES = (
@@ -67,7 +67,7 @@ class StreamLandmarks:
     def _follow(self, sources: list[LandmarkSource]) -> None:
         """Use these sources from now on."""
         self._sources = sources
-        self._before, self._replaced = self._states(), sources
+        self._before, self._replaced = self._snapshots(), sources
         self._contradicted = [0] * len(sources)  # successive images; -1 = warned
         self._late = [0] * len(sources)  # likewise, images with a time offset
 
@@ -111,8 +111,10 @@ class StreamLandmarks:
         T = pose.detach().double().expand(b, 4, 4).cpu().numpy()
         K = intrinsics.detach().double().expand(b, 3, 3).cpu()
         self._require(b)
-        before, faults = self._states(), [0] * b
+        before, faults = self._snapshots(), [0] * b
         if rotation_tolerance is not None:
+            from ufmstar_torch.kernels.cpu.check import camera_faults  # kernels compile when they are first needed
+
             size = (torch.inf, torch.inf) if images is None else images.shape[1:3]
             faults = camera_faults(T, K.numpy(), size, rotation_tolerance)
         if not skip and (faulty := [f"stream {i}: {FRAME_FAULTS[fault]}" for i, fault in enumerate(faults) if fault]):
@@ -176,7 +178,7 @@ class StreamLandmarks:
 
     def state(self) -> dict[str, Tensor]:
         """State of all sources, by names "STREAM.NAME"."""
-        states = enumerate(self._states())
+        states = enumerate(source.state() for source in self._sources)
         return {f"{i}.{name}": value for i, state in states for name, value in state.items()}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
@@ -188,16 +190,16 @@ class StreamLandmarks:
         replaced = self._sources
         if self._each is not None:
             self._require(len({key.partition(".")[0] for key in state}) or 1)
-        before, parts = self._states(), [dict[str, Tensor]() for _ in self._sources]
+        before, parts = self._snapshots(), [dict[str, Tensor]() for _ in self._sources]
         try:
             for key, value in state.items():
                 stream, _, name = key.partition(".")
                 if not stream.isdigit() or int(stream) >= len(parts):
                     raise ValueError(f"anchors: the state holds {key!r}, but the streams are 0 to {len(parts) - 1}")
                 parts[int(stream)][name] = value
-            for source, source_state, part in zip(self._sources, before, parts, strict=True):
-                if part.keys() != source_state.keys():
-                    names = ", ".join(sorted(part.keys() ^ source_state.keys())[:3])
+            for source, part in zip(self._sources, parts, strict=True):
+                if other := part.keys() ^ source.state().keys():
+                    names = ", ".join(sorted(other)[:3])
                     raise ValueError(f"anchors: the state must hold the values of this source, other: {names}, ...")
                 source.load_state(part)
         except BaseException:
@@ -206,12 +208,14 @@ class StreamLandmarks:
                 self._follow(replaced)
             raise
 
-    def _states(self) -> list[dict[str, Tensor]]:
-        return [source.state() for source in self._sources]
+    def _snapshots(self) -> list[dict[str, Any]]:
+        """The state of each source for :meth:`_restore`. A saved state has tensors, and takes six times as long."""
+        return [source.snapshot() if isinstance(source, SavedState) else source.state() for source in self._sources]
 
-    def _restore(self, states: Sequence[Mapping[str, Tensor]], streams: Sequence[int]) -> None:
+    def _restore(self, snapshots: Sequence[Mapping[str, Any]], streams: Sequence[int]) -> None:
         for i in streams:
-            self._sources[i].load_state(states[i])
+            source = self._sources[i]
+            (source.restore if isinstance(source, SavedState) else source.load_state)(snapshots[i])
 
 
 def _batched(landmarks: Sequence[Landmarks], K: Tensor, device: torch.device) -> Anchors:
@@ -234,14 +238,6 @@ def _padded(motion: Sequence[Tensor | None]) -> Tensor | None:
         if m is not None:
             result[stream, : m.shape[1]] = m[0]
     return result
-
-
-def camera_faults(
-    pose: NDArray[np.float64], K: NDArray[np.float64], size: tuple[float, ...], tolerance: float
-) -> list[int]:
-    """Indices into ``FRAME_FAULTS`` of poses [B, 4, 4] and intrinsics [B, 3, 3] of images of a size (H, W)."""
-    cameras = zip(pose.tolist(), K.tolist(), strict=True)
-    return [pose_fault(T, tolerance) or intrinsics_fault(camera, *size) for T, camera in cameras]
 
 
 def as_bytes(image: Tensor) -> Tensor:

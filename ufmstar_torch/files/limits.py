@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import tomllib
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from math import prod
 from pathlib import Path
 from typing import Any
 
 MOST_BYTES = 2**30  # of one array, of a state, or of a list of frames
+MOST_SETTINGS = 1_000_000  # bytes of a file of settings; those of all commands together have some kilobytes
 MOST_PIXELS = MOST_BYTES // 12  # of an image, which takes 12 bytes a pixel as float32 RGB
 
 
@@ -25,15 +28,21 @@ def require_pixels(what: str, size: tuple[int, int]) -> None:
 
 
 def read_text(path: str | Path) -> str:
-    """The text of a file, in UTF-8 with or without the mark that editors on Windows add. Raises OSError: it cannot be
-    opened; ValueError: it is a device or a pipe, which may have no end, is larger than ``MOST_BYTES``, or is no text.
+    """The text of a file, in UTF-8 or, if it begins with its mark, UTF-16. Raises OSError: it cannot be opened;
+    ValueError: it is a device or a pipe, which may have no end, is larger than ``MOST_BYTES``, or is no text.
     """
     path = Path(path)
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise ValueError(f"{path} must be a file, got a device or a pipe")
     if path.is_file():
         require_bytes(str(path), path.stat().st_size)
-    return path.read_text(encoding="utf-8-sig")
+    return decoded(path.read_bytes())
+
+
+def decoded(content: bytes) -> str:
+    """A text in UTF-8, with or without the mark that editors on Windows add, or in UTF-16 with its mark, as PowerShell
+    writes it. Raises ValueError: it is no text."""
+    return content.decode("utf-16" if content.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else "utf-8-sig")
 
 
 def read_json(path: str | Path) -> Any:
@@ -42,3 +51,17 @@ def read_json(path: str | Path) -> Any:
         return json.loads(read_text(path))
     except RecursionError as error:
         raise ValueError("its values are nested too deep") from error
+
+
+def read_settings(path: str | Path) -> Any:
+    """The value of a file of settings. Raises OSError: it cannot be opened; ValueError: it is larger than
+    ``MOST_SETTINGS`` bytes, or neither TOML nor JSON."""
+    path = Path(path)
+    with path.open("rb") as file:
+        content = file.read(MOST_SETTINGS + 1)
+    if len(content) > MOST_SETTINGS:
+        raise ValueError(f"it is larger than {MOST_SETTINGS:,} bytes, which no settings need")
+    try:
+        return (tomllib if path.suffix.lower() == ".toml" else json).loads(decoded(content))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"it is neither TOML (*.toml) nor JSON: {error}") from error

@@ -212,6 +212,8 @@ def _of_intrinsics(values: Tensor) -> bool:
 
 def _camera(value: object) -> PinholeCamera | None:
     """``value`` if it is kornia's camera, else None; does not import kornia."""
+    if isinstance(value, Tensor | np.ndarray):
+        return None
     is_kornia = any(
         cls.__name__ == "PinholeCamera" and cls.__module__.startswith("kornia.") for cls in type(value).__mro__
     )

@@ -62,6 +62,7 @@ class FrameInput:
             [0, ``LARGEST``], features in +-``LARGEST``, the caller's mask agrees and the stream has no fault.
         beyond: [B] number of pixels of the mask with a finite depth beyond the largest one.
         out_of_range: [B] number of other pixels of the mask with a finite positive depth that are not valid.
+        valid_pixels: [B] number of valid pixels.
         fault: [B] int64 index into ``FRAME_FAULTS``, 0 = fine.
         rotation_deviation: [B] float64 max |R^T R - I| of the original pose.
         host_fault: ``fault`` on the CPU if pose and intrinsics were there, so that reading it does not wait; else None.
@@ -82,6 +83,7 @@ class FrameInput:
     rotation_deviation: Tensor
     beyond: Tensor
     out_of_range: Tensor
+    valid_pixels: Tensor
     host_fault: Tensor | None = None
     member: Tensor | None = None
     informative: Tensor | None = None
@@ -146,7 +148,7 @@ def check_values(
     safe_depth = torch.where(use, depth, torch.zeros_like(depth))
     return FrameInput(
         safe_depth, T_safe, K_safe, aleatoric, epistemic, features, use, fault, _moved(deviation, device),
-        beyond.sum((1, 2)), (near & ~use).sum((1, 2)), host_fault,
+        beyond.sum((1, 2)), (near & ~use).sum((1, 2)), use.sum((1, 2)), host_fault,
     )  # fmt: skip
 
 
@@ -196,11 +198,12 @@ def check_frame(
     plain = _as(_constant(depth), size, dtype)
     shapes = [shape, size]
 
-    def converted(name: str, value: Array | None) -> Tensor | None:
-        return None if value is None else _as(require_float(name, as_tensor(name, value), shapes, depth), size, dtype)
+    def converted(name: str, value: Array) -> Tensor:
+        return _as(require_float(name, as_tensor(name, value), shapes, depth), size, dtype)
 
-    a, e = converted("aleatoric", aleatoric), converted("epistemic", epistemic)
-    extra = _features(features, feature_count, plain)
+    a = None if aleatoric is None else converted("aleatoric", aleatoric)
+    e = None if epistemic is None else converted("epistemic", epistemic)
+    extra = _features(features, feature_count, plain) if feature_count or features is not None else None
     if variances_in_h:
         if a is None and e is None:
             raise ValueError("aleatoric or epistemic must be given with config.variances_in_h, which averages them")
@@ -213,9 +216,10 @@ def check_frame(
         either = [*shapes, (shape[0], 1, *shape[-2:])]
         mask = _as(require_mask("valid", as_tensor("valid", valid), either, depth), size, torch.bool)
     frame = kernel(plain, T, K, a, e, extra, mask, rotation_tolerance=rotation_tolerance, max_depth=max_depth)
-    informative = _of_streams("informative", informative, plain)
-    if informative is not None and informative.is_cpu and bool(informative.all()):
-        informative = None
+    if informative is not None:
+        informative = _of_streams("informative", informative, plain)
+        if informative.is_cpu and bool(informative.all()):
+            informative = None
     if informative is None and isinstance(member, int) and member == 0:
         return frame
     if isinstance(member, Tensor):
@@ -249,12 +253,10 @@ def raise_faults(frame: FrameInput) -> None:
         raise ValueError("; ".join(bad))
 
 
-def _features(features: Array | None, count: int, plain: Tensor) -> Tensor | None:
+def _features(features: Array | None, count: int, plain: Tensor) -> Tensor:
     expected = (plain.shape[0], count, *plain.shape[1:])
     if features is None:
-        if count:
-            raise ValueError(f"features must be given with shape {expected}: config.features is {count}")
-        return None
+        raise ValueError(f"features must be given with shape {expected}: config.features is {count}")
     return _as(
         _constant(require_float("features", as_tensor("features", features), [expected], plain)), expected, plain.dtype
     )
@@ -269,10 +271,8 @@ def _of_depth(name: str, value: Tensor, plain: Tensor) -> Tensor:
     return _constant(value)
 
 
-def _of_streams(name: str, value: Tensor | None, plain: Tensor) -> Tensor | None:
+def _of_streams(name: str, value: Tensor, plain: Tensor) -> Tensor:
     """A checked mask [B] on the depth's device."""
-    if value is None:
-        return None
     if not isinstance(value, Tensor) or value.dtype != torch.bool or value.shape != plain.shape[:1]:
         raise ValueError(f"{name} must be a bool tensor [{len(plain)}], got {value!r}")
     return _moved(value, plain.device)

@@ -51,6 +51,9 @@ CENTRE_RANGE = (0.2, 0.8)
 _ROWS = 8
 # On an accelerator, reading the counts synchronises: only every so many frames, and not while a graph is recorded.
 EVERY = 64
+# Counts of a frame that are read for these checks, and their type.
+_READ = ("segments", "valid_pixels", "beyond", "out_of_range", "components", "fault", "single_view")
+_Counts = dict[str, list[int]]
 LOGGER = logging.getLogger("ufmstar_torch")
 _ONE_VIDEO = (
     "the {} streams of a batch look like successive frames of one video{}. Views are compared within a stream only: "
@@ -79,13 +82,13 @@ class _Track:
     T: list[list[float]]  # last pose
     focal: tuple[float, float]  # last fx / W and fy / H
     total: float  # sum of the last depth map's rows
-    anchored_at: list[float]  # camera position in the last of the ``moving`` frames
+    anchored_at: tuple[float, float, float]  # camera position in the last of the ``moving`` frames
     moving: int = 0  # frames with anchors in which the camera had moved
     used: int = 0  # anchors used in these frames
     travelled: float = 0.0  # path, each step over the mean depth
     steps: int = 0  # changes of the pose
     largest: float = 0.0  # longest step [m]
-    before: list[float] | None = None  # position before the last one
+    before: tuple[float, float, float] | None = None  # position before the last one
     alternating: int = 0  # successive frames that returned to the position before the last
     same: int = 0  # successive changes of the pose with an unchanged depth map
     still: int = 0  # successive frames with an unchanged pose
@@ -99,8 +102,9 @@ class _Track:
         self, T: list[list[float]], focal: tuple[float, float], depth: Depth, total: float, mean: float, member: float
     ) -> Iterator[tuple[str, str]]:
         """Update the statistics with a frame of a ``mean`` depth [m]; yields kinds and texts of warnings."""
-        step = math.dist(_position(T), _position(self.T))
-        if max(max(new / old, old / new) for new, old in zip(focal, self.focal, strict=True)) > _ZOOM:
+        position, last = _position(T), _position(self.T)
+        step, (fx, fy), (old_fx, old_fy) = math.dist(position, last), focal, self.focal
+        if max(fx / old_fx, old_fx / fx, fy / old_fy, old_fy / fy) > _ZOOM:
             each = " and ".join(f"{fx:.2f} of the width, {fy:.2f} of the height" for fx, fy in (self.focal, focal))
             text = f"the focal length changed from frame to frame ({each}): every camera is a stream of its own, and "
             yield "camera", text + "another recording begins with reset()"
@@ -110,8 +114,16 @@ class _Track:
             self.still, self.same = 0, self.same + 1 if total == self.total else 0
             if self.same == _FRAMES:
                 yield "depth", f"the depth map was the same in {_FRAMES + 1} frames of a moving camera: is it updated?"
-            yield from self._alternate(T, step)
-            yield from self._saturate(depth)
+            returned = self.before is not None and _NEARER * math.dist(position, self.before) < step
+            self.alternating = self.alternating + 1 if returned else 0
+            if self.alternating == _ALTERNATING:
+                text = "the poses go back and forth between two places: every camera is a stream of its own (a batch)"
+                yield "alternating", text
+            largest = float(depth.max())
+            self.saturated = self.saturated + 1 if largest == self.farthest > 0 else 0
+            self.farthest = largest
+            if self.saturated == _FRAMES:
+                yield from self._saturate(depth)
             sudden = self.steps >= _FRAMES and step > _JUMP * self.largest
             if sudden and step > _AWAY * mean:
                 text = f"the camera jumped by {step:.3g} m, after steps of at most {self.largest:.3g} m. Another "
@@ -121,25 +133,14 @@ class _Track:
                 yield "again", text + "with reset()"
             self.steps, self.largest = self.steps + 1, max(self.largest, step)
             self.travelled += step / mean
-        self.before = _position(self.T)
+        self.before = last
         self.T, self.focal, self.total = T, focal, total
 
-    def _alternate(self, T: list[list[float]], step: float) -> Iterator[tuple[str, str]]:
-        returned = self.before is not None and _NEARER * math.dist(_position(T), self.before) < step
-        self.alternating = self.alternating + 1 if returned else 0
-        if self.alternating == _ALTERNATING:
-            text = "the poses go back and forth between two places: every camera is a stream of its own (a batch)"
-            yield "alternating", text
-
     def _saturate(self, depth: Depth) -> Iterator[tuple[str, str]]:
-        largest = float(depth.max())
-        self.saturated = self.saturated + 1 if largest == self.farthest > 0 else 0
-        self.farthest = largest
-        if self.saturated == _FRAMES:
-            share = np.count_nonzero(depth == largest) / np.count_nonzero(depth)
-            if share > _SATURATED:
-                text = f"the depth of {share:.0%} of the pixels is {largest:g} m in every frame: if the network cannot "
-                yield "saturated", text + "predict more, as in the sky, set valid to False there"
+        share = np.count_nonzero(depth == self.farthest) / np.count_nonzero(depth)
+        if share > _SATURATED:
+            text = f"the depth of {share:.0%} of the pixels is {self.farthest:g} m in every frame: if the network "
+            yield "saturated", text + "cannot predict more, as in the sky, set valid to False there"
 
     def _stay(self, depth: Depth, member: float) -> Iterator[tuple[str, str]]:
         self.still += 1
@@ -174,8 +175,8 @@ def _mean(depth: Depth, total: float) -> float:
     return total / count if (count := np.count_nonzero(depth)) else math.inf
 
 
-def _position(T: list[list[float]]) -> list[float]:
-    return [row[3] for row in T[:3]]
+def _position(T: list[list[float]]) -> tuple[float, float, float]:
+    return T[0][3], T[1][3], T[2][3]
 
 
 def one_path(pose: Tensor, depth: float) -> bool:
@@ -220,50 +221,54 @@ class StreamWarnings:
         self._calls += 1
         if device == "meta" or (device != "cpu" and (self._calls % EVERY or torch.cuda.is_current_stream_capturing())):
             return
+        counts = {name: statistics.counts[name].tolist() for name in _READ}
+        used = statistics.counts.get("anchors_used")
+        seen = frames.tolist()
         findings = (
-            _left_out(frame, statistics, frames, config),
+            _left_out(frame, counts, seen, config),
             _spreads(frame) if self._calls % EVERY in (0, 1) else (),
-            self._tracked(frame, statistics),
-            self._alone(statistics, frames),
+            self._tracked(frame, counts, None if used is None else used.tolist()),
+            self._alone(counts, seen),
         )
         log_once(self._logged, chain.from_iterable(findings))
 
-    def _tracked(self, frame: FrameInput, statistics: FrameStatistics) -> Iterator[tuple[int, str, str]]:
+    def _tracked(self, frame: FrameInput, counts: _Counts, used: list[int] | None) -> Iterator[tuple[int, str, str]]:
         rows = frame.depth[:, ::_ROWS].numpy(force=True)
-        sums, pixels = rows.sum((1, 2)).tolist(), statistics.valid_pixels.tolist()
+        totals, pixels, faults = rows.sum((1, 2)).tolist(), counts["valid_pixels"], counts["fault"]
         poses, cameras = frame.T_world_cam.tolist(), frame.intrinsics.tolist()
-        used = None if statistics.anchors_used is None else statistics.anchors_used.tolist()
         members = [0.0] * len(poses) if frame.member is None else frame.member.tolist()
         height, width = frame.size
-        yield from self._one_video(poses)
-        first = not self._tracks and len(poses) >= _CLIP and not any(statistics.fault.tolist())
-        if first and one_path(frame.T_world_cam, _mean(rows, float(sum(sums)))):
+        if len(poses) >= _BATCH:
+            yield from self._one_video(poses)
+        first = not self._tracks and len(poses) >= _CLIP and not any(faults)
+        if first and one_path(frame.T_world_cam, _mean(rows, sum(totals))):
             yield 0, "batch", _ONE_VIDEO.format(len(poses), ": their poses form one path")
-        for b, fault in enumerate(statistics.fault.tolist()):
+        for b, fault in enumerate(faults):
             if fault or not pixels[b]:
                 continue
             T, focal = poses[b], (cameras[b][0][0] / width, cameras[b][1][1] / height)
-            mean = _mean(rows[b], sums[b])
+            every = pixels[b] == height * width
+            mean = totals[b] / rows[b].size if every else _mean(rows[b], totals[b])
             if text := doubtful_centre(cameras[b], frame.size):
                 yield b, "centre", text
             if (track := self._tracks.get(b)) is None:
-                self._tracks[b] = track = _Track(T, T, focal, sums[b], _position(T))
+                self._tracks[b] = track = _Track(T, T, focal, totals[b], _position(T))
             else:
-                yield from ((b, *warning) for warning in track.follow(T, focal, rows[b], sums[b], mean, members[b]))
+                for kind, text in track.follow(T, focal, rows[b], totals[b], mean, members[b]):
+                    yield b, kind, text
             if used is not None and (text := track.anchored(used[b], mean)):
                 yield b, "anchors", text
 
-    def _alone(self, statistics: FrameStatistics, frames: Tensor) -> Iterator[tuple[int, str, str]]:
+    def _alone(self, counts: _Counts, seen: list[int]) -> Iterator[tuple[int, str, str]]:
         """A warning if nearly all components were seen in one view although the camera has moved far enough."""
-        counts = (value.tolist() for value in (statistics.single_view, statistics.components, frames))
-        for b, (alone, components, seen) in enumerate(zip(*counts, strict=True)):
+        for b, each in enumerate(zip(counts["single_view"], counts["components"], seen, strict=True)):
             track = self._tracks.get(b)
-            if track is not None and (text := hardly_compared(alone, components, seen, track.travelled)):
+            if track is not None and (text := hardly_compared(*each, track.travelled)):
                 yield b, "views", text
 
     def _one_video(self, poses: list[list[list[float]]]) -> Iterator[tuple[int, str, str]]:
         """A warning if the first stream of each batch continues the last stream of the previous batch."""
-        if len(poses) < _BATCH or len(self._tracks) < len(poses):
+        if len(self._tracks) < len(poses):
             return
         before = [_position(self._tracks[b].T) for b in range(len(poses))]
         path = [before[-1], *(_position(T) for T in poses)]
@@ -275,12 +280,10 @@ class StreamWarnings:
 
 
 def _left_out(
-    frame: FrameInput, statistics: FrameStatistics, frames: Tensor, config: UfMStarConfig
+    frame: FrameInput, counts: _Counts, frames: list[int], config: UfMStarConfig
 ) -> Iterator[tuple[int, str, str]]:
-    parts = (statistics.segments, statistics.valid_pixels, frame.beyond, frame.out_of_range)
-    counts = (*parts, statistics.components, statistics.fault, frames)
-    for b, each in enumerate(zip(*(count.tolist() for count in counts), strict=True)):
-        segments, valid, beyond, outside, components, fault, seen = each
+    for b, each in enumerate(zip(*counts.values(), frames, strict=True)):
+        segments, valid, beyond, outside, components, fault, _, seen = each
         positive = valid + beyond + outside
         unstated = 0 if config.segment.max_depth is not None else beyond
         parted = f"of {positive} pixels {beyond} lie beyond segment.max_depth = {config.segment.depth_limit} m and "

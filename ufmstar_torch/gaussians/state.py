@@ -92,11 +92,11 @@ class UfMStarState:
         Raises:
             ValueError: the frame has another number of streams, or lies on another device.
         """
-        streams, device = len(frame.depth), frame.depth.device
-        if len(self.mean) == 0:
+        streams, device, before = frame.depth.shape[0], frame.depth.device, self.mean.shape[0]
+        if before == 0:
             return UfMStarState.initial(streams, config, self.mean.dtype, device)
-        if len(self.mean) != streams:
-            raise ValueError(f"depth has {streams} streams but the state holds {len(self.mean)}: call reset() first")
+        if before != streams:
+            raise ValueError(f"depth has {streams} streams but the state holds {before}: call reset() first")
         if self.mean.device != device:
             raise ValueError(f"depth lies on {device} but the state on {self.mean.device}: move one with .to()")
         return self
@@ -170,16 +170,16 @@ class UfMStarState:
 
     def tensors(self) -> dict[str, Tensor]:
         """The tensors by name, without copying."""
-        return {**{name: getattr(self, name) for name in NAMES}, **self.by_component, **self.by_stream}
+        tensors = {**vars(self), **self.by_component, **self.by_stream}
+        del tensors["by_component"], tensors["by_stream"]
+        return tensors
 
     def with_tensors(self, changed: Mapping[str, Tensor]) -> UfMStarState:
         """A copy with some tensors replaced, by name."""
-        tensors = {**self.tensors(), **changed}
-        return UfMStarState(
-            **{name: tensors[name] for name in NAMES},
-            by_component={name: tensors[name] for name in self.by_component},
-            by_stream={name: tensors[name] for name in self.by_stream},
-        )
+        named = {**vars(self), **changed}
+        for group in ("by_component", "by_stream"):
+            named[group] = {name: named.pop(name, value) for name, value in getattr(self, group).items()}
+        return UfMStarState(**named)
 
     def restarted(self, again: Tensor) -> UfMStarState:
         """A copy with the streams of the mask ``again`` [B] set to the state before their first frame."""

@@ -135,8 +135,3 @@ class Recalibration(Checked):
         if len(v) > 1:
             return v, r
         return ((v[0], 2 * v[0]), (r[0], 2 * r[0])) if self.covariate == VARIANCE else ((v[0], v[0] + 1), (r[0], r[0]))
-
-
-def recalibration_path(weights: str | Path) -> Path:
-    """Path of the recalibration in the weights' folder: fastdepth.onnx -> fastdepth.recalibration.json."""
-    return Path(weights).with_suffix(".recalibration.json")

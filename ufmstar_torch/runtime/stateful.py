@@ -23,7 +23,7 @@ class OneCaller:
     """The thread that is inside a method of its object, if any. Copies and pickles begin unused."""
 
     def __init__(self) -> None:
-        self._lock, self._owner, self._depth, self._inside = threading.Lock(), 0, 0, ""
+        self._lock, self._owner, self._depth, self._method = threading.Lock(), 0, 0, ""
 
     def __reduce__(self) -> tuple[type[OneCaller], tuple[()]]:
         return OneCaller, ()
@@ -34,10 +34,10 @@ class OneCaller:
         if self._owner != me:
             if not self._lock.acquire(blocking=False):
                 raise RuntimeError(
-                    f"{method} was called by {_this_thread()} while {self._inside}: the state takes one thread at a "
-                    "time; create a module for each thread, or hold a lock around the calls"
+                    f"{method} was called by {_thread(me)} while {_thread(self._owner)} is in {self._method}: the "
+                    "state takes one thread at a time; create a module for each thread, or hold a lock around the calls"
                 )
-            self._owner, self._inside = me, f"{_this_thread()} is in {method}"
+            self._owner, self._method = me, method
         self._depth += 1
 
     def leave(self) -> None:
@@ -64,9 +64,11 @@ def one_caller(*names: str) -> Callable[[type[Class]], type[Class]]:
 
 
 def _guarded(method: Callable[..., Any]) -> Callable[..., Any]:
+    name = method.__qualname__
+
     @wraps(method)
     def called(self: Any, *args: Any, **kwargs: Any) -> Any:
-        self._caller.enter(f"{type(self).__name__}.{method.__name__}")
+        self._caller.enter(name)
         try:
             return method(self, *args, **kwargs)
         finally:
@@ -82,8 +84,9 @@ def _guarded(method: Callable[..., Any]) -> Callable[..., Any]:
     return guarded
 
 
-def _this_thread() -> str:
-    return f"thread {threading.current_thread().name!r}"
+def _thread(ident: int) -> str:
+    names = [thread.name for thread in threading.enumerate() if thread.ident == ident]
+    return f"thread {names[0]!r}" if names else "another thread"
 
 
 @one_caller("_save_to_state_dict", "_load_from_state_dict", "_apply")

@@ -64,7 +64,7 @@ def after_frame(
     state: UfMStarState, frame: FrameInput, config: UfMStarConfig, kernels: MergeKernels | None = None
 ) -> tuple[UfMStarState, dict[str, Tensor]]:
     """Merge the streams that are due after a frame, and count the components."""
-    after = merged(state, frame.fault == 0, config, kernels, frame)
+    after = merged(state, frame.fault, config, kernels, frame)
     if after is state:
         return state, {}
     mixture = after.mixture
@@ -72,14 +72,14 @@ def after_frame(
 
 
 def merged(
-    state: UfMStarState, fine: Tensor, config: UfMStarConfig, kernels: MergeKernels | None = None,
+    state: UfMStarState, fault: Tensor, config: UfMStarConfig, kernels: MergeKernels | None = None,
     frame: FrameInput | None = None,
 ) -> UfMStarState:  # fmt: skip
     """The state after a frame, with the streams merged whose frame count is a multiple of ``merge.every``.
 
     Args:
         state: of B streams, after the step.
-        fine: [B] True where the frame was used.
+        fault: [B] 0 where the frame was used (``frame.FRAME_FAULTS``).
         config: with ``merge``.
         kernels: as :func:`merge`.
         frame: components beyond ``_NEAR`` times its largest depth from the camera are left as they are, so that a
@@ -90,8 +90,8 @@ def merged(
     assert config.merge is not None
     if state.mean.device.type == "meta":
         return state
-    frames, every = zip(fine.tolist(), state.frames.tolist(), strict=True), config.merge.every
-    if not any(due := [used and number % every == 0 for used, number in frames]):
+    frames, every = zip(fault.tolist(), state.frames.tolist(), strict=True), config.merge.every
+    if True not in (due := [code == 0 and number % every == 0 for code, number in frames]):
         return state
     sums = torch.cat([state.mean.new_zeros(*state.weight.shape, 0), *state.by_component.values()], -1)
     near = None

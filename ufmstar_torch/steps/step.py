@@ -160,7 +160,6 @@ def step(
         "pairs": pairs.match.sum((1, 2)),
         "new": new.sum(1) - without_slot,
         "dropped": gone + without_slot + (current_cam.valid & ~far_enough).sum(1),
-        "valid_pixels": frame.valid.sum((1, 2)),
         "unmeasured": (maps["measured"] < regress.HALF).flatten(1).sum(1),
         "single_view": (mixture.valid & (mixture.views == 0)).sum(1),
     }
@@ -199,7 +198,10 @@ def step_output(
         maps["bias"], excess = residual.unbind(-1)
         contradiction = None if frame.anchors is None else frame.anchors.contradiction
         maps["anchored"], variance = anchors.anchored_term(depth, excess, variance, contradiction)
-    checked = {name: getattr(frame, name) for name in ("beyond", "out_of_range", "fault", "rotation_deviation")}
+    checked = {
+        "valid_pixels": frame.valid_pixels, "beyond": frame.beyond, "out_of_range": frame.out_of_range,
+        "fault": frame.fault, "rotation_deviation": frame.rotation_deviation,
+    }  # fmt: skip
     of_anchors = {} if learnt is None else anchors.counts(frame.anchors, learnt.used)
     statistics = FrameStatistics({**counts, **checked, **of_anchors})
     valid = regress.at_pixels(frame.valid, pixels)

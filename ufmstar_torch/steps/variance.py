@@ -102,25 +102,26 @@ def corrected(
         at the pixels (``anchors.confidence``), None = 1.
     """
     M, factor, quantiles = out.maps["disagreement"], None, None
-    network = network_maps(frame, out.maps["features"], config, pixels)
-    maps, counts = dict(out.maps), dict[str, Tensor]()
+    maps, counts = dict[str, Tensor](), dict[str, Tensor]()
     if config.confidence is not None and frame.confidence is not None:
-        V = total_variance(out.variance, network, frame, config, mapped, pixels) if pixels is None else None
+        V = None
+        if pixels is None:
+            network = network_maps(frame, out.maps["features"], config, pixels)
+            V = total_variance(out.variance, network, frame, config, mapped, pixels)
         before = state.by_stream["confidence"]
         after, factor, counts["confidence"] = learn_confidence(before, frame, V, config.confidence)
         factor, state = at_pixels(factor, pixels), state.with_tensors({"confidence": after})
     if config.posterior is not None and pixels is None:
+        network = network_maps(frame, out.maps["features"], config, pixels)
         claimed = total_variance(M, network, frame, config, mapped, pixels, factor).detach()
-        learnt, posterior, of_posterior = correct(state.by_stream, frame, claimed, config)
-        quantiles, state = posterior.pop("quantiles"), state.with_tensors(learnt)
-        maps, counts = maps | posterior, counts | of_posterior
+        learnt, maps, of_posterior = correct(state.by_stream, frame, claimed, config)
+        quantiles, state, counts = maps.pop("quantiles"), state.with_tensors(learnt), counts | of_posterior
     if config.merges_on(frame.depth.device.type):
         state, merged = merge.after_frame(state, frame, config, merging)
         counts |= merged
     if isinstance(mapped, Recalibration):
         quantiles = normal_where_missing(quantiles, M)
-    return (
-        state,
-        replace(out, maps=maps, quantiles=quantiles, statistics=FrameStatistics({**out.statistics.counts, **counts})),
-        factor,
-    )
+    if counts or quantiles is not None:
+        statistics = FrameStatistics({**out.statistics.counts, **counts})
+        out = replace(out, maps={**out.maps, **maps}, quantiles=quantiles, statistics=statistics)
+    return state, out, factor

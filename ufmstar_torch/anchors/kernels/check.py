@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.anchors.kernels.dense import Measured
-from ufmstar_torch.kernels.compile_cpu import reordered
+from ufmstar_torch.kernels.compile_cpu import empty, reordered
 
 # Two anchors agree within so many standard deviations of their difference, or within this share of the inverse depth.
 _SIGMAS, _SHARE = 3.0, 0.05
@@ -53,7 +53,9 @@ def check_anchors(
     return moved, squared_error
 
 
-def confirmed(pixel: NDArray[np.float64], measured: Measured, cell: int) -> NDArray[np.bool_]:
+def confirmed(
+    pixel: NDArray[np.float64], measured: Measured, cell: int
+) -> tuple[NDArray[np.bool_], tuple[int, int, int]]:
     """The mask of reliable measurements: two views agree, or nearly all neighbours agree with a single view, or a
     single view states a large error. A single match may be wrong, but neighbouring wrong matches have different depths,
     and with little parallax no match is far off. Without the last kind, the first views of a scene would measure only
@@ -63,12 +65,14 @@ def confirmed(pixel: NDArray[np.float64], measured: Measured, cell: int) -> NDAr
         pixel: [N, 2] (u, v).
         measured: N pixels.
         cell: side of a cell [px]; in a cell with two, only the second is a neighbour of others.
+
+    Returns:
+        [N]; the numbers of pixels with two or more matches, of the reliable ones of these, and of those that a view
+        contradicts.
     """
     reliable = np.zeros(len(pixel), np.bool_)
-    in_cell = np.full((pixel.max(0, initial=0) // cell + 1).astype(np.int64)[::-1], -1)
     views = measured.agreed, measured.contradicted
-    _confirm(pixel, measured.rho, measured.variance, *views, cell, in_cell, reliable)
-    return reliable
+    return reliable, _confirm(pixel, measured.rho, measured.variance, *views, cell, reliable)
 
 
 def farther(pixel: NDArray[np.float64], occupied: NDArray[np.float64], distance: float) -> NDArray[np.bool_]:
@@ -89,7 +93,12 @@ def _farther(pixel, occupied, square, far):
 
 
 @reordered
-def _confirm(pixel, rho, variance, agreed, contradicted, cell, in_cell, reliable):
+def _confirm(pixel, rho, variance, agreed, contradicted, cell, reliable):
+    rows = columns = 0
+    for n in range(len(pixel)):
+        rows, columns = max(rows, int(pixel[n, 1]) // cell + 1), max(columns, int(pixel[n, 0]) // cell + 1)
+    in_cell = empty((rows, columns), np.int64)
+    in_cell[:] = -1
     for n in range(len(pixel)):
         if agreed[n] > 0 and contradicted[n] == 0:
             in_cell[int(pixel[n, 1]) // cell, int(pixel[n, 0]) // cell] = n
@@ -110,6 +119,12 @@ def _confirm(pixel, rho, variance, agreed, contradicted, cell, in_cell, reliable
                     agreeing += 1
         reliable[n] = agreeing >= _LEAST and agreeing >= _MOST * count
         reliable[n] |= variance[n] >= (CERTAIN * rho[n]) ** 2
+    several = fine = disagree = 0
+    for n in range(len(pixel)):
+        several += agreed[n] + contradicted[n] > 1
+        fine += agreed[n] + contradicted[n] > 1 and reliable[n]
+        disagree += contradicted[n] > 0
+    return several, fine, disagree
 
 
 @reordered

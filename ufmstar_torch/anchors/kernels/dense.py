@@ -8,7 +8,6 @@ position of the best window (``windows``). ``tests/oracle_dense.py`` is the same
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -41,23 +40,33 @@ _BORDER = 3.0
 LEAST_MATCH = 0.03**2
 # [px] A match measures the poses across the line where its noise there is below this.
 SHOWS = 0.25
+# Columns of :attr:`Measured.each`.
+VALUE, NOISE, ALONG, SPEED, SLOPE, ACROSS, ACROSS_NOISE = 0, 1, 2, 4, 5, 6, 7
 
 
-@dataclass(frozen=True, eq=False)
-class Views:
-    """Keyframes to search, the shortest baseline first.
+class Views(NamedTuple):
+    """V keyframes to search, the shortest baseline first.
 
     Attributes:
-        image: [V, H, W] uint8.
+        image: [R, H, W] uint8, of more keyframes.
+        slot: [V] indices of their images.
+        share: [V] indices of their baselines among the requested ones.
         H: [V, 3, 3] of a pixel at infinity into the view.
         b: [V, 3] [px m].
         noise: [V] variance of a position from errors of the poses [px^2].
     """
 
     image: NDArray[np.uint8]
+    slot: NDArray[np.int64]
+    share: NDArray[np.int64]
     H: NDArray[np.float64]
     b: NDArray[np.float64]
     noise: NDArray[np.float64]
+
+    def first(self, count: int) -> Views:
+        """The first ``count`` keyframes."""
+        slot, share, H, b, noise = (column[:count] for column in self[1:])
+        return Views(self.image, slot, share, H, b, noise)
 
 
 class Search(NamedTuple):
@@ -81,8 +90,7 @@ class Search(NamedTuple):
     match: float
 
 
-@dataclass(frozen=True, eq=False)
-class Measured:
+class Measured(NamedTuple):
     """Inverse depths of N pixels.
 
     Attributes:
@@ -92,13 +100,12 @@ class Measured:
         agreed: [N] number of agreeing views; 0 = not measured.
         contradicted: [N] number of views that disagree.
         shown: [N] number of views that show the line from infinity to ``WHOLE`` times the starting inverse depth.
-        value: [N, V] inverse depth in each agreeing view [1/m]; NaN in other views, here and below.
-        noise: [N, V] variance of the position along the line from the match alone [px^2].
-        along: [N, V, 2] unit direction (u, v) in which the point moves along the line.
-        speed: [N, V] derivative of the position along the line by the inverse depth [px m].
-        slope: [N, V] shift of the match along the line per unit of error across it.
-        across: [N, V] position across the line [px], NaN where the patch does not determine it.
-        across_noise: [N, V] variance of ``across`` from the match alone [px^2].
+        each: [N, V, 8] of the agreeing views, NaN of others, by column: ``VALUE`` inverse depth [1/m]; ``NOISE``
+            variance of the position along the line from the match alone [px^2]; ``ALONG``, two columns, unit direction
+            (u, v) in which the point moves along the line; ``SPEED`` derivative of the position along the line by the
+            inverse depth [px m]; ``SLOPE`` shift of the match along the line per unit of error across it; ``ACROSS``
+            position across the line [px], NaN where the patch does not determine it; ``ACROSS_NOISE`` variance of that
+            from the match alone [px^2].
         centre: [N, 2] (u, v) from the pixel to the mean position of the texture that determines the match: the squared
             gradients along the line. On a blank surface beside an edge, the match measures the edge.
     """
@@ -108,13 +115,7 @@ class Measured:
     agreed: NDArray[np.int64]
     contradicted: NDArray[np.int64]
     shown: NDArray[np.int64]
-    value: NDArray[np.float64]
-    noise: NDArray[np.float64]
-    along: NDArray[np.float64]
-    speed: NDArray[np.float64]
-    slope: NDArray[np.float64]
-    across: NDArray[np.float64]
-    across_noise: NDArray[np.float64]
+    each: NDArray[np.float64]
     centre: NDArray[np.float64]
 
 
@@ -127,39 +128,58 @@ def measure(image: NDArray[np.uint8], pixel: NDArray[np.float64], views: Views, 
         views: in the same pixels.
         search: settings.
     """
-    n, v = len(pixel), len(views.image)
+    n, v = len(pixel), len(views.slot)
     (rho, variance), (agreed, contradicted, shown) = np.zeros((2, n)), np.zeros((3, n), np.int64)
-    each = np.full((n, v, 8), np.nan)
-    centre = np.zeros((n, 2))
-    outputs = rho, variance, agreed, contradicted, shown, each, centre
-    _measure(image, pixel, eights(views.image), views.H, views.b, views.noise, search, *outputs)
-    value, noise, _, _, speed, slope, across, across_noise = np.moveaxis(each, 2, 0)
-    along = each[:, :, 2:4]
-    columns = value, noise, along, speed, slope, across, across_noise, centre
-    return Measured(rho, variance, agreed, contradicted, shown, *columns)
+    result = Measured(rho, variance, agreed, contradicted, shown, np.full((n, v, 8), np.nan), np.zeros((n, 2)))
+    _measure(image, pixel, eights(views.image), views, search, *result)
+    return result
+
+
+def cells(shape: tuple[int, ...], cell: int) -> tuple[int, int]:
+    """Rows and columns of cells in an image of a shape (H, W)."""
+    return -(-shape[0] // cell), -(-shape[1] // cell)
+
+
+def free_pixels(image: NDArray[np.uint8], cell: int, occupied: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The pixel (u, v) of the largest gradient in every cell with a gradient and no ``occupied`` pixel [M, 2]: [N, 2].
+    Cells are ``cell`` px wide; occupied pixels may lie outside of the image."""
+    rows, columns = cells(image.shape, cell)
+    pixel = np.empty((rows * columns, 2))
+    return pixel[: _free_pixels(image, cell, occupied, (rows, columns), pixel)]
 
 
 @reordered
-def best_pixels(image, cell, pixel, strength):
-    """In every cell [C, R] the pixel (u, v) [C, R, 2] of the largest squared gradient, and that gradient [C, R], 0
-    where there is none. Cells are ``cell`` px wide; those of negative ``strength`` are skipped."""
+def _free_pixels(image, cell, occupied, shape, pixel):
+    free, count = empty(shape, np.bool_), 0
+    free[:] = True
+    for m in range(len(occupied)):
+        if 0 <= occupied[m, 0] < image.shape[1] and 0 <= occupied[m, 1] < image.shape[0]:
+            free[int(occupied[m, 1]) // cell, int(occupied[m, 0]) // cell] = False
+    for row in range(shape[0]):
+        for column in range(shape[1]):
+            if free[row, column] and steepest(image, cell, row, column, pixel[count]):
+                count += 1
+    return count
+
+
+@reordered_leaf
+def steepest(image, cell, row, column, pixel):
+    """Write the pixel (u, v) of the largest squared gradient in a cell, ``MARGIN`` from the border or more; False where
+    there is no gradient."""
     height, width = image.shape
-    for j in range(strength.shape[0]):
-        for i in range(strength.shape[1]):
-            if strength[j, i] < 0:
-                continue
-            best, at_u, at_v = np.int32(0), 0, 0
-            for v in range(max(j * cell, MARGIN), min((j + 1) * cell, height - MARGIN)):
-                for u in range(max(i * cell, MARGIN), min((i + 1) * cell, width - MARGIN)):
-                    du = np.int32(image[v, u + 1]) - np.int32(image[v, u - 1])
-                    dv = np.int32(image[v + 1, u]) - np.int32(image[v - 1, u])
-                    if du * du + dv * dv > best:
-                        best, at_u, at_v = du * du + dv * dv, u, v
-            pixel[j, i, 0], pixel[j, i, 1], strength[j, i] = at_u, at_v, best
+    best = np.int32(0)
+    for v in range(max(row * cell, MARGIN), min((row + 1) * cell, height - MARGIN)):
+        for u in range(max(column * cell, MARGIN), min((column + 1) * cell, width - MARGIN)):
+            du = np.int32(image[v, u + 1]) - np.int32(image[v, u - 1])
+            dv = np.int32(image[v + 1, u]) - np.int32(image[v - 1, u])
+            if du * du + dv * dv > best:
+                best, pixel[0], pixel[1] = du * du + dv * dv, u, v
+    return best > 0
 
 
 @reordered
-def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, contradicted, shown, each, centre):
+def _measure(image, pixel, keys, views, search, rho, variance, agreed, contradicted, shown, each, centre):
+    H, b, noise = views.H, views.b, views.noise
     start, first_low, first_high, sigmas, least_score, least_rival, match = search
     height, width = image.shape
     flat = image.reshape(image.size)
@@ -171,8 +191,8 @@ def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, con
     scores, best, out = empty(LONGEST + 1, np.float32), empty(4, np.float64), empty(8, np.float64)
     for n in range(len(pixel)):
         u, v, weight = pixel[n, 0], pixel[n, 1], 0.0
-        for k in range(len(keys)):
-            key = keys[k]
+        for k in range(len(H)):
+            key = keys[views.slot[k]]
             first = agreed[n] == 0
             at = start if first else rho[n]
             x, y = H[k, 0, 0] * u + H[k, 0, 1] * v + H[k, 0, 2], H[k, 1, 0] * u + H[k, 1, 1] * v + H[k, 1, 2]
@@ -211,10 +231,10 @@ def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, con
                 contradicted[n] += 1
                 continue
             agreed[n] += 1
-            each[n, k, 0], each[n, k, 1], each[n, k, 2], each[n, k, 3] = value, along, eu, ev
-            each[n, k, 4], each[n, k, 5] = speed, slope
+            each[n, k, VALUE], each[n, k, NOISE], each[n, k, ALONG], each[n, k, ALONG + 1] = value, along, eu, ev
+            each[n, k, SPEED], each[n, k, SLOPE] = speed, slope
             if schur > 0 and pixel_noise < SHOWS * SHOWS * schur:
-                each[n, k, 6], each[n, k, 7] = -out[4] / schur, pixel_noise / schur
+                each[n, k, ACROSS], each[n, k, ACROSS_NOISE] = -out[4] / schur, pixel_noise / schur
             if first or spread < variance[n]:
                 variance[n] = spread
                 centre[n, 0] = warp[0] * out[6] + warp[1] * out[7]

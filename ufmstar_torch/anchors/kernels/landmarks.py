@@ -7,6 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.anchors.kernels.check import CERTAIN
+from ufmstar_torch.anchors.kernels.dense import cells, steepest
+from ufmstar_torch.anchors.kernels.order import MEDIAN_SQUARE, median
 from ufmstar_torch.anchors.kernels.windows import (
     COUNT,
     FARTHEST,
@@ -19,7 +22,7 @@ from ufmstar_torch.anchors.kernels.windows import (
     zncc,
 )
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
-from ufmstar_torch.kernels.compile_cpu import empty, reordered
+from ufmstar_torch.kernels.compile_cpu import empty, reordered, reordered_leaf
 
 # Least ZNCC of a landmark's patch with an image that shows it.
 SHOWN = 0.8
@@ -30,6 +33,12 @@ SHOWN = 0.8
 _DUE, _LONGEST = 0.04, 4
 # Failures in a row, beyond the number of confirmations, after which a landmark is deleted.
 FAILURES = 3
+# See :func:`settle`.
+_SIGMAS, _SHARE = 3.5, 0.01
+# Standard deviation of an inverse depth, as a share of it, by the scale of the poses, which no image determines.
+SCALE = 0.005
+# Least number of measurements for an update of running estimates; steps of the bisection in :func:`_beyond`.
+_ENOUGH, _STEPS = 10, 8
 
 
 class Columns(NamedTuple):
@@ -56,68 +65,26 @@ class Columns(NamedTuple):
     seen: NDArray[np.int64]
 
 
-def store(
-    landmarks: Columns, slot: NDArray[np.int64], frame: int, image: NDArray[np.uint8], pixel: NDArray[np.float64],
-    rho: NDArray[np.float64], variance: NDArray[np.float64], T_world_cam: NDArray[np.float64], K: NDArray[np.float64],
-) -> None:  # fmt: skip
-    """Write landmarks to the slots [n], as a view measured them.
-
-    Args:
-        landmarks, slot: where to.
-        frame: index of the image.
-        image: [H, W] uint8.
-        pixel: [n, 2] (u, v), ``MARGIN`` from the border or more.
-        rho: [n] > 0 [1/m].
-        variance: [n] of ``rho`` [1/m^2].
-        T_world_cam: [4, 4] [m].
-        K: [3, 3] [px].
-    """
-    _store(landmarks, slot, frame, image, pixel, rho, variance, T_world_cam, inverse_intrinsics(K))
-
-
-@reordered
-def _store(landmarks, slot, frame, image, pixel, rho, variance, T, K_inverse):
-    height, width = image.shape
-    flat, template, patch = image.reshape(image.size), empty(WIDE * WIDE, np.float32), empty(COUNT, np.float32)
-    corner, share = empty(WIDE * WIDE, np.uint32), empty((2, WIDE * WIDE), np.float32)
-    along_u, along_v = empty(COUNT, np.float32), empty(COUNT, np.float32)
-    for k in range(len(slot)):
-        n, u, v = slot[k], pixel[k, 0], pixel[k, 1]
-        x, y = K_inverse[0, 0] * u + K_inverse[0, 1] * v + K_inverse[0, 2], K_inverse[1, 1] * v + K_inverse[1, 2]
-        for i in range(3):
-            landmarks.point[n, i] = (T[i, 0] * x + T[i, 1] * y + T[i, 2]) / rho[k] + T[i, 3]
-        for i in range(4):
-            for j in range(4):
-                landmarks.pose[n, i, j] = T[i, j]
-        shown = sampled(flat, width, height, u, v, 1.0, 0.0, 0.0, 1.0, corner, share, template)
-        if shown:
-            normalised(template, patch, along_u, along_v)
-        for j in range(SIDE):
-            for i in range(SIDE):
-                landmarks.patch[n, j, i] = patch[j * SIDE + i] if shown else np.float32(0)
-        landmarks.sigma[n] = np.sqrt(variance[k]) / rho[k]
-        landmarks.used[n], landmarks.failed[n], landmarks.seen[n] = True, 0, frame
-
-
-class Seen(NamedTuple):
-    """Landmarks in an image; N = all of the memory.
+class Sighted(NamedTuple):
+    """Pixels of an image that are measured, or predicted by landmarks: at most one in a cell.
 
     Attributes:
-        pixel: [N, 2] predicted (u, v).
-        depth: [N] predicted [m].
-        spread: [N] standard deviation of ``depth`` [m].
-        shown: [N] 1 where the image shows the landmark, -1 where it shows something else, 0 outside the image or where
-            the view differs too much for a comparison.
-        slot: [n] the landmark of each cell, by row and column.
-        due: [n] bool, True where it must be measured again.
+        slot: [n] the landmarks in the image, by row and column of their cells.
+        pixel: [N, 2] (u, v) of these landmarks, and then of the largest gradient in every other cell.
+        rho: [N] predicted inverse depth [1/m]; 0 without a landmark.
+        variance: [N] of ``rho`` [1/m^2]; 1 without a landmark.
+        searched: [M] indices of the pixels to measure: landmarks that are due, and all without a landmark.
+        compared: [m, 2] pixels of all landmarks whose patch was compared with the image.
+        hidden: [m] bool, True where the image shows something else there.
     """
 
-    pixel: NDArray[np.float64]
-    depth: NDArray[np.float64]
-    spread: NDArray[np.float64]
-    shown: NDArray[np.int64]
     slot: NDArray[np.int64]
-    due: NDArray[np.bool_]
+    pixel: NDArray[np.float64]
+    rho: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    searched: NDArray[np.int64]
+    compared: NDArray[np.float64]
+    hidden: NDArray[np.bool_]
 
 
 def sight(
@@ -127,8 +94,9 @@ def sight(
     T_world_cam: NDArray[np.float64],
     K: NDArray[np.float64],
     cell: int,
-) -> Seen:
-    """Find the landmarks that an image shows, at most one in a cell, and count failures of those it should show.
+) -> Sighted:
+    """Find the landmarks that an image shows, at most one in a cell, count failures of those it should show, and choose
+    a pixel in every cell without a landmark.
 
     Each cell retains the landmark with the most confirmations; among equals, the one with the least uncertainty.
 
@@ -140,19 +108,68 @@ def sight(
         K: [3, 3] [px].
         cell: side of a cell [px].
     """
-    n, shape = len(landmarks.point), (-(-image.shape[0] // cell), -(-image.shape[1] // cell))
-    pixel, depth, spread, shown = np.zeros((n, 2)), np.zeros(n), np.zeros(n), np.zeros(n, np.int64)
-    best, slot, due = np.full(shape, -1), np.zeros(n, np.int64), np.zeros(n, np.bool_)
-    camera = (np.ascontiguousarray(K @ T_world_cam[:3, :3].T), np.ascontiguousarray(T_world_cam[:3, 3]))
-    _sight(landmarks, image, *camera, inverse_intrinsics(K), pixel, depth, spread, shown)
-    count = _keep(landmarks, frame, camera[1], cell, pixel, depth, spread, shown, best, slot, due)
-    return Seen(pixel, depth, spread, shown, slot[:count], due[:count])
+    count, shape = len(landmarks.point), cells(image.shape, cell)
+    size = shape[0] * shape[1]
+    (rho, variance), (slot, searched) = np.empty((2, size)), np.empty((2, size), np.int64)
+    pixel, compared, hidden = np.empty((size, 2)), np.empty((count, 2)), np.empty(count, np.bool_)
+    result = Sighted(slot, pixel, rho, variance, searched, compared, hidden)
+    camera = T_world_cam, K, inverse_intrinsics(K)
+    n, all_pixels, m, tests = _sight(landmarks, frame, image, *camera, cell, shape, result)
+    columns = slot[:n], pixel[:all_pixels], rho[:all_pixels], variance[:all_pixels], searched[:m]
+    return Sighted(*columns, compared[:tests], hidden[:tests])
 
 
 @reordered
-def _keep(landmarks, frame, centre, cell, pixel, depth, spread, shown, best, slot, due):
-    """Count successes and failures, and write the landmark of each cell; return their number."""
+def _sight(landmarks, frame, image, T, K, K_inverse, cell, shape, out):
+    count = len(landmarks.point)
+    pixel, depth, spread = empty((count, 2), np.float64), empty(count, np.float64), empty(count, np.float64)
+    shown, best = empty(count, np.int64), empty(shape, np.int64)
+    flat, template = image.reshape(image.size), empty(WIDE * WIDE, np.float32)
+    corner, share = empty(WIDE * WIDE, np.uint32), empty((2, WIDE * WIDE), np.float32)
+    window, other = empty(COUNT, np.float32), empty(COUNT, np.float32)
+    vectors, P = empty((2, 3), np.float64), empty((3, 3, 3), np.float64)
+    size = image.shape[1], image.shape[0]
+    _predict(
+        landmarks, flat, size, T, K, K_inverse, pixel, depth, spread, shown,
+        corner, share, template, window, other, vectors[0], vectors[1], P[0], P[1], P[2],
+    )  # fmt: skip
+    _keep(landmarks, frame, cell, pixel, depth, spread, shown, best)
+    landmark_count = due = compared = 0
+    for n in range(count):
+        if shown[n] != 0:
+            out.compared[compared, 0], out.compared[compared, 1] = pixel[n, 0], pixel[n, 1]
+            out.hidden[compared] = shown[n] < 0
+            compared += 1
+    for row in range(best.shape[0]):
+        for column in range(best.shape[1]):
+            n = best[row, column]
+            if n < 0:
+                continue
+            square = 0.0
+            for i in range(3):
+                square += (landmarks.pose[n, i, 3] - T[i, 3]) ** 2
+            out.slot[landmark_count], out.rho[landmark_count] = n, 1 / depth[n]
+            out.pixel[landmark_count, 0], out.pixel[landmark_count, 1] = pixel[n, 0], pixel[n, 1]
+            out.variance[landmark_count] = (spread[n] / (depth[n] * depth[n])) ** 2
+            if np.sqrt(square) >= _DUE * depth[n] * min(1 + landmarks.confirmed[n], _LONGEST):
+                out.searched[due] = landmark_count
+                due += 1
+            landmark_count += 1
+    found = landmark_count
+    for row in range(best.shape[0]):
+        for column in range(best.shape[1]):
+            if best[row, column] < 0 and steepest(image, cell, row, column, out.pixel[found]):
+                out.rho[found], out.variance[found], out.searched[due] = 0.0, 1.0, found
+                found += 1
+                due += 1
+    return landmark_count, found, due, compared
+
+
+@reordered_leaf
+def _keep(landmarks, frame, cell, pixel, depth, spread, shown, best):
+    """Count successes and failures, and write the landmark of each cell [R, C], -1 = none."""
     used, confirmed, failed, seen = landmarks.used, landmarks.confirmed, landmarks.failed, landmarks.seen
+    best[:] = -1
     for n in range(len(shown)):
         if shown[n] < 0:
             failed[n] += 1
@@ -173,40 +190,29 @@ def _keep(landmarks, frame, centre, cell, pixel, depth, spread, shown, best, slo
             other = n
         if other >= 0:
             used[other] = False
-    count = 0
-    for row in range(best.shape[0]):
-        for column in range(best.shape[1]):
-            n = best[row, column]
-            if n < 0:
-                continue
-            square = 0.0
-            for i in range(3):
-                square += (landmarks.pose[n, i, 3] - centre[i]) ** 2
-            slot[count], due[count] = n, np.sqrt(square) >= _DUE * depth[n] * min(1 + confirmed[n], _LONGEST)
-            count += 1
-    return count
 
 
-@reordered
-def _sight(landmarks, image, P, centre, K_inverse, pixel, depth, spread, shown):
+@reordered_leaf
+def _predict(
+    landmarks, flat, size, T, K, K_inverse, pixel, depth, spread, shown,
+    corner, share, template, window, other, p, error, P, rotated, homography,
+):  # fmt: skip
+    """Write where landmarks lie in the camera T [4, 4]: (u, v) [N, 2] [px], depth [N] and its standard deviation [N]
+    [m]; and [N] 1 where the image shows the landmark, -1 where it shows something else, 0 outside the image or where
+    the view differs too much for a comparison. The second line of arguments are buffers."""
     point, pose, sigma, patch = landmarks.point, landmarks.pose, landmarks.sigma, landmarks.patch
-    height, width = image.shape
-    flat, template = image.reshape(image.size), empty(WIDE * WIDE, np.float32)
-    corner, share = empty(WIDE * WIDE, np.uint32), empty((2, WIDE * WIDE), np.float32)
-    window, other = empty(COUNT, np.float32), empty(COUNT, np.float32)
-    p, error, rotated, homography = (
-        empty(3, np.float64),
-        empty(3, np.float64),
-        empty((3, 3), np.float64),
-        empty((3, 3), np.float64),
-    )
+    width, height = size
+    for i in range(3):
+        for j in range(3):
+            P[i, j] = K[i, 0] * T[j, 0] + K[i, 1] * T[j, 1] + K[i, 2] * T[j, 2]
     for n in range(len(point)):
+        shown[n] = 0
         if not landmarks.used[n]:
             continue
         for i in range(3):
             p[i] = 0.0
             for j in range(3):
-                p[i] += P[i, j] * (point[n, j] - centre[j])
+                p[i] += P[i, j] * (point[n, j] - T[j, 3])
         z = p[2]  # the last row of K is (0, 0, 1)
         if z <= 1e-3:
             continue
@@ -243,3 +249,140 @@ def _sight(landmarks, image, P, centre, K_inverse, pixel, depth, spread, shown):
             for i in range(SIDE):
                 other[j * SIDE + i] = patch[n, j, i]
         shown[n] = 1 if zncc(other, window) > SHOWN else -1
+
+
+@reordered
+def settle(landmarks, frame, image, T, K_inverse, sighted, agreed, accepted, rho, variance, trusted, memory, numbers):
+    """Confirm or refute landmarks by new measurements, store these, and update the running estimates.
+
+    Two measurements confirm each other if they differ by at most ``_SIGMAS`` standard deviations and the share
+    ``_SHARE`` of the inverse depth, added in quadrature.
+
+    Args:
+        landmarks: see :class:`Columns`.
+        frame: index of the image.
+        image: [H, W] uint8.
+        T: [4, 4] camera-to-world [m].
+        K_inverse: [3, 3] inverse of the intrinsics.
+        sighted: see :class:`Sighted`; the first K pixels, inverse depths and variances are overwritten by those of the
+            pixels with a depth.
+        agreed, accepted, rho, variance: [M] of the searched pixels: number of agreeing views, whether the measurement
+            is reliable, inverse depth [1/m] and its variance [1/m^2].
+        trusted: False = poses and images contradict each other; no measurement is used.
+        memory: share of the running estimates that remains after a frame.
+        numbers: [2], updated: ``apart`` of :class:`ufmstar_torch.anchors.dense_memory.Memory`, and the median depth of
+            the scene [m].
+
+    Returns:
+        K, and the number of refuted landmarks.
+    """
+    landmark_count, count, total = len(sighted.slot), len(landmarks.used), len(sighted.rho)
+    before, spread = empty(total, np.float64), empty(total, np.float64)
+    measured, storable, valid = empty(total, np.bool_), empty(total, np.bool_), empty(total, np.bool_)
+    squares, variances, values = empty(total, np.float64), empty(total, np.float64), empty(total, np.float64)
+    height, width = image.shape
+    flat, template, patch = image.reshape(image.size), empty(WIDE * WIDE, np.float32), empty(COUNT, np.float32)
+    corner, share = empty(WIDE * WIDE, np.uint32), empty((2, WIDE * WIDE), np.float32)
+    along_u, along_v = empty(COUNT, np.float32), empty(COUNT, np.float32)
+    window = corner, share, template, patch, along_u, along_v
+    for n in range(total):
+        measured[n] = storable[n] = False
+        before[n], spread[n] = sighted.rho[n], sighted.variance[n]
+        valid[n] = trusted and n < landmark_count
+    for i in range(len(accepted)):
+        if not (accepted[i] and trusted):
+            continue
+        n, scale = sighted.searched[i], SCALE * rho[i]
+        storable[n] = agreed[i] > 1 or variance[i] < (CERTAIN * rho[i]) ** 2
+        if rho[i] > np.sqrt(variance[i] + scale * scale):
+            measured[n], sighted.rho[n], sighted.variance[n] = True, rho[i], variance[i] + scale * scale
+    compared = refuted = 0
+    apart = numbers[0]
+    for n in range(landmark_count):
+        if not measured[n]:
+            continue
+        slot, new, noise, square = sighted.slot[n], sighted.rho[n], sighted.variance[n], before[n] * before[n]
+        difference, sum_ = (new - before[n]) ** 2, spread[n] + noise
+        squares[compared], variances[compared] = difference / square, sum_ / square
+        compared += 1
+        if difference <= _SIGMAS**2 * (sum_ + apart * square) + _SHARE**2 * square:
+            landmarks.confirmed[slot] += 1
+            old, more = 1 / spread[n], 1 / noise
+            sighted.rho[n] = (before[n] * old + new * more) / (old + more)
+            # Measurements share keyframes and patches: merging them does not reduce the smaller variance.
+            sighted.variance[n] = min(spread[n], noise)
+            _store(landmarks, slot, frame, flat, width, height, sighted, n, T, K_inverse, window)
+        else:
+            refuted += 1
+            valid[n] = False
+            landmarks.failed[slot] += 2
+            if landmarks.confirmed[slot] == 0 or landmarks.failed[slot] > FAILURES + landmarks.confirmed[slot]:
+                landmarks.used[slot] = False
+    if compared >= _ENOUGH:
+        numbers[0] = memory * apart + (1 - memory) * _beyond(squares[:compared], variances[:compared], values)
+    free = 0
+    for n in range(landmark_count, total):
+        valid[n] = measured[n]
+        if not (measured[n] and storable[n]):
+            continue
+        while free < count and landmarks.used[free]:
+            free += 1
+        slot = free
+        if free == count:  # the one not seen for longest
+            slot = 0
+            for i in range(1, count):
+                if landmarks.seen[i] < landmarks.seen[slot]:
+                    slot = i
+            if landmarks.seen[slot] == frame:
+                continue
+        landmarks.confirmed[slot] = 0
+        _store(landmarks, slot, frame, flat, width, height, sighted, n, T, K_inverse, window)
+    found = 0
+    for n in range(total):
+        if valid[n]:
+            sighted.pixel[found, 0], sighted.pixel[found, 1] = sighted.pixel[n, 0], sighted.pixel[n, 1]
+            sighted.rho[found], sighted.variance[found] = sighted.rho[n], sighted.variance[n]
+            values[found] = 1 / sighted.rho[n]
+            found += 1
+    if found >= _ENOUGH:
+        numbers[1] *= np.exp((1 - memory) * np.log(median(values, found) / numbers[1]))
+    return found, refuted
+
+
+@reordered_leaf
+def _beyond(square, variance, values):
+    """Variance to add to the stated ones [n] so that the normalised squared differences [n] have the median of a normal
+    one. ``values`` is a buffer."""
+    low, high = 1e-7, 0.3**2
+    for step in range(_STEPS + 1):
+        middle = low if step == 0 else np.sqrt(low * high)
+        for i in range(len(square)):
+            values[i] = square[i] / (variance[i] + middle)
+        if median(values, len(square)) > MEDIAN_SQUARE:
+            low = middle
+        elif step == 0:
+            return 0.0
+        else:
+            high = middle
+    return high
+
+
+@reordered_leaf
+def _store(landmarks, slot, frame, flat, width, height, sighted, n, T, K_inverse, window):
+    """Write the sighted pixel n, ``MARGIN`` from the border or more, to a slot."""
+    corner, share, template, patch, along_u, along_v = window
+    u, v, rho = sighted.pixel[n, 0], sighted.pixel[n, 1], sighted.rho[n]
+    x, y = K_inverse[0, 0] * u + K_inverse[0, 1] * v + K_inverse[0, 2], K_inverse[1, 1] * v + K_inverse[1, 2]
+    for i in range(3):
+        landmarks.point[slot, i] = (T[i, 0] * x + T[i, 1] * y + T[i, 2]) / rho + T[i, 3]
+    for i in range(4):
+        for j in range(4):
+            landmarks.pose[slot, i, j] = T[i, j]
+    shown = sampled(flat, width, height, u, v, 1.0, 0.0, 0.0, 1.0, corner, share, template)
+    if shown:
+        normalised(template, patch, along_u, along_v)
+    for j in range(SIDE):
+        for i in range(SIDE):
+            landmarks.patch[slot, j, i] = patch[j * SIDE + i] if shown else np.float32(0)
+    landmarks.sigma[slot] = np.sqrt(sighted.variance[n]) / rho
+    landmarks.used[slot], landmarks.failed[slot], landmarks.seen[slot] = True, 0, frame

@@ -35,7 +35,7 @@ LARGEST_SCALE = 2.0
 
 def eights(images: NDArray[np.uint8]) -> NDArray[np.uint64]:
     """View images [V, H, W] as [V, H W - 7] numbers: each holds eight consecutive pixels."""
-    views, size = len(images), images[0].size
+    views, size = len(images), images.shape[1] * images.shape[2]
     return np.ndarray((views, max(size - SIDE + 1, 0)), np.uint64, images, strides=(size, 1))
 
 

@@ -1,4 +1,4 @@
-"""The check of a frame's values on the CPU: maps in NumPy, cameras in plain numbers.
+"""The check of a frame's values on the CPU (numba): a call for the cameras and a call for the pixels.
 
 The same comparisons as the reference in :mod:`ufmstar_torch.frames.frame`, whose chain of small tensors takes a
 millisecond. Thresholds are rounded to the maps' dtype as torch rounds them.
@@ -6,8 +6,6 @@ millisecond. Thresholds are rounded to the maps' dtype as torch rounds them.
 
 from __future__ import annotations
 
-import itertools
-import math
 from typing import Any
 
 import numpy as np
@@ -17,12 +15,12 @@ from torch import Tensor
 
 from ufmstar_torch.frames.frame import DEPTH_RANGE, FARTHEST, FOCAL_RANGE, LARGEST, FrameInput
 from ufmstar_torch.gaussians.camera import POLAR_STEPS
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
 from ufmstar_torch.kernels.cpu.calls import array
 
-_Matrix = list[list[float]]
-_EYE3, _EYE4 = np.eye(3).tolist(), np.eye(4).tolist()
-_AXES = range(3)
+Matrices = NDArray[np.floating[Any]]
 _ROUNDING = 4e-16  # deviation of R^T R below which a further step changes nothing
+_LEAST_FOCAL, _LARGEST_FOCAL = FOCAL_RANGE
 
 
 def check_values(
@@ -38,123 +36,170 @@ def check_values(
     max_depth: float,
 ) -> FrameInput:
     """As :func:`ufmstar_torch.frames.frame.check_values`, for the CPU. Depth that is valid everywhere is not copied."""
-    b, height, width = depth.shape
-    poses, cameras = (_matrices(matrix, b) for matrix in (pose, intrinsics))
-    checked = [_camera(T, K, height, width, rotation_tolerance) for T, K in zip(poses, cameras, strict=True)]
-    T_safe, K_safe, faults, deviations = zip(*checked, strict=True)
-    z, wanted = array(depth), None if mask is None else array(mask)
-    use = np.ones(z.shape, np.bool_) if wanted is None else wanted.copy()
-    _restrict(use, z, DEPTH_RANGE[0], min(max_depth, DEPTH_RANGE[1]))
-    for variance in (aleatoric, epistemic):
-        if variance is not None:
-            _restrict(use, array(variance), 0.0, LARGEST)
-    for channel in [] if features is None else array(features).swapaxes(0, 1):
-        _restrict(use, channel, -LARGEST, LARGEST)
-    if any(faults):
-        use[np.flatnonzero(faults)] = False
-    safe, counts = z, np.zeros((3, b), np.int64)
-    counts[0] = faults
-    if not use.all():
-        left_out = np.flatnonzero(~use)
-        values, stream = z.reshape(-1)[left_out], left_out // (height * width)
-        has_depth = (values > 0) & (values < np.inf) & (counts[0] == 0)[stream]
-        if wanted is not None:
-            has_depth &= wanted.reshape(-1)[left_out]
-        far = values > max_depth
-        for kind, chosen in enumerate((has_depth & far, has_depth & ~far), start=1):
-            counts[kind] = np.bincount(stream[chosen], minlength=b)
-        safe = z.copy()
-        safe.reshape(-1)[left_out] = 0
-    arrays = safe, np.array(T_safe), np.array(K_safe), use, np.array(deviations), *counts
-    safe_depth, T, K, valid, deviation, fault, beyond, out_of_range = map(torch.from_numpy, arrays)
+    z = array(depth)
+    b, shape = len(z), (len(z), z[0].size)
+    cameras = _checked_cameras(array(pose), array(intrinsics), b, z.shape[1:], rotation_tolerance)
+    wanted = np.ones(z.shape, np.bool_) if mask is None else array(mask)
+    use, safe, counts = wanted if mask is None else wanted.copy(), np.empty_like(z), np.empty((3, b), np.int64)
+    pixels = use.reshape(shape)
+    for values, least in ((aleatoric, 0.0), (epistemic, 0.0), (features, -LARGEST)):
+        if values is not None:
+            _restrict(pixels, array(values).reshape(b, -1, shape[1]), least, LARGEST)
+    limits = DEPTH_RANGE[0], min(max_depth, DEPTH_RANGE[1]), max_depth
+    wanted = wanted.reshape(shape)
+    usable = _count(z.reshape(shape), pixels, wanted, mask is not None, safe.reshape(shape), cameras[3], limits, counts)
+    T, K, deviation, fault, valid = map(torch.from_numpy, (*cameras, use))
+    beyond, out_of_range, valid_pixels = torch.from_numpy(counts).unbind()
     return FrameInput(
-        safe_depth, T, K, aleatoric, epistemic, features, valid, fault, deviation, beyond, out_of_range, fault
-    )
+        torch.from_numpy(z if usable == z.size else safe), T, K, aleatoric, epistemic, features, valid, fault,
+        deviation, beyond, out_of_range, valid_pixels, fault,
+    )  # fmt: skip
 
 
-def _matrices(tensor: Tensor, streams: int) -> list[_Matrix]:
-    """One matrix for each stream as lists of numbers, from [B, n, n], [1, n, n] or [n, n]."""
-    matrices = tensor.tolist() if tensor.dim() == 3 else [tensor.tolist()]
-    return matrices if len(matrices) == streams else matrices * streams
+def camera_faults(pose: Matrices, K: Matrices, size: tuple[float, ...], tolerance: float) -> list[int]:
+    """Codes of the first faults (``frame.FRAME_FAULTS``, 0 for none) of poses [B, 4, 4] [m] and intrinsics [B, 3, 3] of
+    images of a size (H, W) [px]; ``tolerance`` is the largest deviation of R^T R from the identity."""
+    return _checked_cameras(pose, K, len(pose), size, tolerance)[3].tolist()
 
 
-def _restrict(use: NDArray[np.bool_], values: NDArray[Any], least: float, most: float) -> None:
-    """Clear ``use`` [B, H, W] where values are outside [least, most] or NaN.
-
-    Where all values are inside, the extremes show it without memory for masks.
-    """
-    if not (values.min() >= least and values.max() <= most):
-        use &= values >= least
-        use &= values <= most
-
-
-def pose_fault(T: _Matrix, tolerance: float) -> int:
-    """Code 1 to 4 or 7 of a camera-to-world pose (``frame.FRAME_FAULTS``), 0 for none.
-
-    Args:
-        T: [4][4] [m].
-        tolerance: largest deviation of R^T R from the identity.
-    """
-    return _pose_fault(T, _deviation(_gram(T)), tolerance)
+def _checked_cameras(
+    pose: Matrices, K: Matrices, streams: int, size: tuple[float, ...], tolerance: float
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """The poses with their nearest rotations and the intrinsics of each stream, identities where there is a fault; the
+    deviations max |R^T R - I| of the poses; and the codes of the first faults. One matrix may be of all streams."""
+    T, camera = (np.ascontiguousarray(value, np.float64).reshape(-1, *value.shape[-2:]) for value in (pose, K))
+    out = np.empty((streams, 4, 4)), np.empty((streams, 3, 3)), np.empty(streams), np.empty(streams, np.int64)
+    _check_cameras(T, camera, float(size[0]), float(size[1]), tolerance, *out)
+    return out
 
 
-def intrinsics_fault(K: _Matrix, height: float, width: float) -> int:
-    """Code 5, 6, 8 or 9 of intrinsics [3][3] of an image of ``height`` and ``width`` [px], 0 for none."""
-    (fx, skew, cx), (other, fy, cy), last = K
+@kernel
+def _check_cameras(poses, intrinsics, height, width, tolerance, out_T, out_K, deviations, faults):
+    """Write the results of :func:`_checked_cameras`."""
+    gram, Q = empty((3, 3), np.float64), empty((3, 3), np.float64)
+    for b in range(faults.size):
+        T, K, R, camera = poses[b % len(poses)], intrinsics[b % len(intrinsics)], out_T[b], out_K[b]
+        _gram(T, gram)
+        deviations[b] = _deviation(gram)
+        fault = _pose_fault(T, deviations[b], tolerance)
+        faults[b] = fault = fault if fault > 0 else _intrinsics_fault(K, height, width)
+        for i in range(4):
+            for j in range(4):
+                R[i, j] = T[i, j] if fault == 0 and i < 3 else 1.0 if i == j else 0.0
+        for i in range(3):
+            for j in range(3):
+                camera[i, j] = K[i, j] if fault == 0 else 1.0 if i == j else 0.0
+        for _ in range(POLAR_STEPS if fault == 0 else 0):  # as ``camera.nearest_rotation``: R <- R (3 I - R^T R)/2
+            if _deviation(gram) < _ROUNDING:
+                break
+            for i in range(3):
+                for j in range(3):
+                    Q[i, j] = (1.5 if i == j else 0.0) - 0.5 * gram[i, j]
+            for i in range(3):
+                x, y, z = R[i, 0], R[i, 1], R[i, 2]
+                for j in range(3):
+                    R[i, j] = x * Q[0, j] + y * Q[1, j] + z * Q[2, j]
+            _gram(R, gram)
+
+
+@leaf
+def _gram(R, gram):
+    """Write R^T R of the first three rows and columns."""
+    for i in range(3):
+        for j in range(3):
+            gram[i, j] = R[0, i] * R[0, j] + R[1, i] * R[1, j] + R[2, i] * R[2, j]
+
+
+@leaf
+def _deviation(gram):
+    """max |G - I|, NaN where an entry is."""
+    most = 0.0
+    for i in range(3):
+        for j in range(i, 3):
+            off = abs(gram[i, j] - (1.0 if i == j else 0.0))
+            most = off if off > most or off != off else most
+    return most
+
+
+@leaf
+def _finite(matrix):
+    """True if all entries are finite."""
+    total = 0.0
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            total += 0.0 * matrix[i, j]
+    return total == 0.0
+
+
+@leaf
+def _pose_fault(T, deviation, tolerance):
+    """Code 1 to 4 or 7 of a pose, 0 for none."""
+    if not _finite(T):
+        return 1
+    if max(abs(T[3, 0]), abs(T[3, 1]), abs(T[3, 2]), abs(T[3, 3] - 1.0)) > tolerance:
+        return 2
+    if deviation > tolerance:
+        return 3
+    x, y = T[0, 1] * T[1, 2] - T[0, 2] * T[1, 1], T[0, 2] * T[1, 0] - T[0, 0] * T[1, 2]
+    z = T[0, 0] * T[1, 1] - T[0, 1] * T[1, 0]
+    if x * T[2, 0] + y * T[2, 1] + z * T[2, 2] < 0:
+        return 4
+    return 7 if max(abs(T[0, 3]), abs(T[1, 3]), abs(T[2, 3])) > FARTHEST else 0
+
+
+@leaf
+def _intrinsics_fault(K, height, width):
+    """Code 5, 6, 8 or 9 of intrinsics, 0 for none."""
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     if not _finite(K):
         return 5
-    if skew or other or last != [0.0, 0.0, 1.0] or fx <= 0 or fy <= 0:
+    if K[0, 1] != 0 or K[1, 0] != 0 or K[2, 0] != 0 or K[2, 1] != 0 or K[2, 2] != 1 or fx <= 0 or fy <= 0:
         return 6
-    if min(fx, fy) < FOCAL_RANGE[0] or max(fx, fy) > FOCAL_RANGE[1]:
+    if min(fx, fy) < _LEAST_FOCAL or max(fx, fy) > _LARGEST_FOCAL:
         return 8
     return 9 if min(cx, cy) < -0.5 or cx > width - 0.5 or cy > height - 0.5 else 0
 
 
-def _camera(T: _Matrix, K: _Matrix, height: int, width: int, tolerance: float) -> tuple[_Matrix, _Matrix, int, float]:
-    """The pose with its nearest rotation and the intrinsics of a stream (identities where there is a fault), the code
-    of the first fault (``FRAME_FAULTS``), and max |R^T R - I| of the pose ``T``."""
-    gram = _gram(T)
-    deviation = _deviation(gram)
-    fault = _pose_fault(T, deviation, tolerance) or intrinsics_fault(K, height, width)
-    if fault:
-        return _EYE4, _EYE3, fault, deviation
-    rotation = [row[:3] for row in T[:3]]
-    for _ in range(POLAR_STEPS):  # as ``camera.nearest_rotation``: R <- R (3 I - R^T R)/2
-        if _deviation(gram) < _ROUNDING:
-            break
-        Q = [[(1.5 if i == j else 0.0) - 0.5 * value for j, value in enumerate(row)] for i, row in enumerate(gram)]
-        rotation = [[a * Q[0][j] + b * Q[1][j] + c * Q[2][j] for j in _AXES] for a, b, c in rotation]
-        gram = _gram(rotation)
-    return [[*row, T[i][3]] for i, row in enumerate(rotation)] + _EYE4[3:], K, 0, deviation
+@kernel
+def _restrict(use, values, least, most):
+    """Clear ``use`` [B, P] where a channel of values [B, C, P] is outside [least, most] or NaN."""
+    for b in range(values.shape[0]):
+        for channel in range(values.shape[1]):
+            _within(values[b, channel], values.dtype.type(least), values.dtype.type(most), use[b])
 
 
-def _gram(R: _Matrix) -> _Matrix:
-    """R^T R of the first three rows and columns."""
-    x, y, z = R[:3]
-    return [[x[i] * x[j] + y[i] * y[j] + z[i] * z[j] for j in _AXES] for i in _AXES]
+@kernel
+def _count(depth, use, wanted, masked, safe, faults, limits, counts):
+    """Clear ``use`` [B, P] where the depth is out of range or the stream has a fault; return the number of usable
+    pixels. If some are not, write ``safe``: the depth, 0 where not usable.
+
+    Args:
+        wanted: the caller's mask, if ``masked``.
+        limits: the least and the largest usable depth, and the largest depth that the network states [m].
+        counts: [3, B] written: of the wanted pixels with a depth those beyond it, those otherwise not usable, and the
+            usable ones.
+    """
+    real, every = depth.dtype.type, 0
+    for b in range(faults.size):
+        low = real(limits[0]) if faults[b] == 0 else real(np.inf)
+        counts[0, b] = counts[1, b] = 0
+        counts[2, b] = _within(depth[b], low, real(limits[1]), use[b])
+        every += counts[2, b]
+    for b in range(faults.size if every < depth.size else 0):
+        z, usable, deepest = depth[b], use[b], real(limits[2])
+        for i in range(z.size):
+            has_depth = (z[i] > 0) & (z[i] < np.inf) & (faults[b] == 0) & (not masked or wanted[b, i])
+            counts[0, b] += has_depth & (z[i] > deepest)
+            counts[1, b] += has_depth & (z[i] <= deepest) & (not usable[i])
+            safe[b, i] = z[i] if usable[i] else real(0)
+    return every
 
 
-def _deviation(gram: _Matrix) -> float:
-    """max |G - I|, NaN where an entry is."""
-    (a, b, c), (_, d, e), (_, _, f) = gram
-    off = abs(a - 1), abs(b), abs(c), abs(d - 1), abs(e), abs(f - 1)
-    return math.nan if math.isnan(sum(off)) else max(off)
-
-
-def _finite(matrix: _Matrix) -> bool:
-    return all(map(math.isfinite, itertools.chain.from_iterable(matrix)))
-
-
-def _pose_fault(T: _Matrix, deviation: float, tolerance: float) -> int:
-    """Code 1 to 4 or 7 of a pose, 0 for none."""
-    if not _finite(T):
-        return 1
-    x, y, z, last = T
-    if max(abs(a - b) for a, b in zip(last, _EYE4[3], strict=True)) > tolerance:
-        return 2
-    if deviation > tolerance:
-        return 3
-    cross = x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]
-    if sum(a * b for a, b in zip(cross, z, strict=False)) < 0:
-        return 4
-    return 7 if max(abs(row[3]) for row in T[:3]) > FARTHEST else 0
+@leaf
+def _within(values, low, high, use):
+    """Clear ``use`` where values are outside [low, high] or NaN; return the number that is left."""
+    count = 0
+    for i in range(values.size):
+        use[i] &= (values[i] >= low) & (values[i] <= high)
+        count += use[i]
+    return count

@@ -141,10 +141,10 @@ class Memory:
         """A number of an array of int64, as an index of another array."""
         return self._builder.load(self._at(index, 0))
 
-    def put(self, value: Lanes, index: Any, offset: int = 0) -> None:
+    def put(self, value: Lanes, index: Any) -> None:
         """Write the first number of a vector."""
         first = self._builder.extract_element(value.value, ir.IntType(32)(0))
-        self._builder.store(first, self._at(index, offset))
+        self._builder.store(first, self._at(index, 0))
 
 
 class Code:

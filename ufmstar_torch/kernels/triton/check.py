@@ -45,7 +45,7 @@ def check_values(
         host_fault = torch.where(pose_faults > 0, pose_faults, intrinsics_fault(intrinsics, (height, width)))
     T, K = (v.to(device, non_blocking=True).contiguous() for v in (pose, intrinsics))
     T_safe, K_safe, deviation = torch.empty_like(T), torch.empty_like(K), T.new_empty(b)
-    counts = torch.zeros(2, b, dtype=torch.int64, device=device)
+    counts = torch.zeros(3, b, dtype=torch.int64, device=device)
     fault = torch.empty(b, dtype=torch.int64, device=device)
     launch(
         _camera, (b,), T, K, T_safe, K_safe, deviation, fault, height, width, tolerance=float(rotation_tolerance),
@@ -61,7 +61,19 @@ def check_values(
         nearest=DEPTH_RANGE[0], deepest=DEPTH_RANGE[1], max_depth=float(max_depth), largest=LARGEST, chunk=1024,
     )  # fmt: skip
     return FrameInput(
-        safe, T_safe, K_safe, aleatoric, epistemic, features, valid, fault, deviation, counts[0], counts[1], host_fault
+        safe,
+        T_safe,
+        K_safe,
+        aleatoric,
+        epistemic,
+        features,
+        valid,
+        fault,
+        deviation,
+        counts[0],
+        counts[1],
+        counts[2],
+        host_fault,
     )
 
 
@@ -175,3 +187,4 @@ def _maps(
     tl.store(valid + pixel, use, mask=inside)
     tl.atomic_add(counts + b, tl.sum(beyond.to(tl.int32), 0))
     tl.atomic_add(counts + streams + b, tl.sum((near & ~use).to(tl.int32), 0))
+    tl.atomic_add(counts + 2 * streams + b, tl.sum(use.to(tl.int32), 0))

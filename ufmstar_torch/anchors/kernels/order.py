@@ -1,0 +1,15 @@
+"""Order statistics in compiled code."""
+
+from __future__ import annotations
+
+from ufmstar_torch.kernels.compile_cpu import leaf
+from ufmstar_torch.kernels.cpu.sample import smallest
+
+# The median of the square of a standard normal variable.
+MEDIAN_SQUARE = 0.4549
+
+
+@leaf
+def median(values, count):
+    """The median of the first ``count`` values, at least one, which are reordered."""
+    return (smallest(values, count, (count - 1) // 2) + smallest(values, count, count // 2)) / 2
