@@ -39,7 +39,8 @@ from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.frames.output import UncertaintyOutput
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.trained import load_trained
-from ufmstar_torch.posterior.conformal import LEVELS, TRANSFER
+from ufmstar_torch.posterior.conformal import TRANSFER
+from ufmstar_torch.posterior.distribution import LEVELS
 
 # Ten tours for the tables, and ten others for ``--fit``.
 TOURS, OTHERS = (

@@ -21,6 +21,7 @@ PROCESSOR, MOST_SECONDS = "processor_seconds", 20
 MAX_WORKERS = 4  # each takes up to 3 GB
 COMPILE = Path(__file__).with_name("compile_kernels.py")
 COMPILERS: pytest.StashKey[list[subprocess.Popen[bytes]]] = pytest.StashKey()
+MODULES: pytest.StashKey[int] = pytest.StashKey()  # number of imported modules
 
 settings.register_profile("fast", deadline=None, max_examples=10)
 settings.register_profile("thorough", deadline=None, max_examples=50, print_blob=True)
@@ -68,6 +69,18 @@ def pytest_collection() -> Iterator[None]:
     finally:
         gc.freeze()
         gc.enable()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item: pytest.Item) -> Iterator[None]:
+    """Do likewise after a test that has imported further packages."""
+    try:
+        return (yield)
+    finally:
+        if len(sys.modules) > item.config.stash.get(MODULES, 0):
+            item.config.stash[MODULES] = len(sys.modules)
+            gc.collect()
+            gc.freeze()
 
 
 def pytest_sessionfinish() -> None:

@@ -27,7 +27,7 @@ REACH, RADIUS, NEAR, WEAK, CLIP, APART = 1.0, 0.15, 0.05, 0.25**2, 9.0, 0.5
 
 def start():
     return {"frames": 0, "m0": 0.0, "slopes": np.zeros(3), "b": np.zeros(4), "C": np.diag(PRIOR),
-            "sums": {k: [v * n, n] for k, (v, n, _, _) in START.items()}}  # fmt: skip
+            "intervals": [0.0] * 4, "sums": {k: [v * n, n] for k, (v, n, _, _) in START.items()}}  # fmt: skip
 
 
 def ratio(state, name):
@@ -224,7 +224,8 @@ def learnt(state, logs, mean0, Q, seen, fit):
     weights = 3 + sum(MEMORY**k for k in range(state["frames"] + 1))
     slopes = state["slopes"] * (1 - 1 / weights) + fit.mean[1:4] / weights
     after = {"frames": state["frames"] + 1, "m0": logs.mean(), "slopes": slopes, "b": fit.mean[:4],
-             "C": fit.C[:4, :4], "sums": {}, "scores": new.pop("scores"), "most": c}  # fmt: skip
+             "C": fit.C[:4, :4], "sums": {}, "most": c,
+             "intervals": interval.updated(state["intervals"], *new.pop("scores"))}  # fmt: skip
     for name, (value, prior, low, high) in START.items():
         above, below = state["sums"][name]
         below = MEMORY * below + (1 - MEMORY) * prior + new[name][1]

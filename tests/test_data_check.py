@@ -193,9 +193,9 @@ def test_no_depth_and_no_poses(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("name", "layout", "frames", "worst"),
     [
-        ("hololens_office", "generic", 100, 0.01),
+        pytest.param("hololens_office", "generic", 100, 0.01, marks=pytest.mark.slow),
         ("rgbd_dataset_freiburg1_xyz", "tum", 40, 0.02),
-        ("rgbd_dataset_freiburg3_teddy", "tum", 50, 0.02),
+        pytest.param("rgbd_dataset_freiburg3_teddy", "tum", 50, 0.02, marks=pytest.mark.slow),
         ("tartanair_sample", "tartanair", 30, 0.01),
     ],
 )

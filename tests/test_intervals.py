@@ -12,12 +12,14 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from torch.special import ndtr
 
 from ufmstar_torch import AnchorConfig, PosteriorConfig, Recalibration, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.posterior import conformal
 from ufmstar_torch.posterior.distribution import DepthDistribution
+from ufmstar_torch.posterior.running import views
 
 CONFIG = UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())
 K = torch.tensor([[40.0, 0, 24], [0, 40, 18], [0, 0, 1]])
@@ -72,40 +74,53 @@ def test_a_depth_is_positive():
 def test_the_update_equals_the_oracle_s(scored, frames, log):
     scores, weights = (np.array([x[i] for x in scored]) for i in range(2))
     state = np.array([frames, log, log + 0.1, log - 0.2])
-    after = conformal.updated(state, scores, weights)
+    after, found = updated(state, scores, weights), np.zeros(5)
     np.testing.assert_allclose(after, oracle.updated(state, scores, weights), rtol=1e-12)
-    expected = oracle.quantiles(after)
-    np.testing.assert_allclose(conformal.quantiles(torch.from_numpy(after)[None])[0], expected, rtol=1e-12)
+    conformal.quantiles(after, found, 2)
+    np.testing.assert_allclose(found[2:], oracle.quantiles(after), rtol=1e-12)
+
+
+def updated(state, scores, weights):
+    """The state after a frame with errors of ``scores`` standard deviations, on either side."""
+    after, z = state.copy(), scores * np.where(np.arange(len(scores)) % 2, 1, -1)
+    conformal.adapt(after, ndtr(torch.from_numpy(z)).numpy(), weights)
+    return after
 
 
 def test_weights_equal_the_oracle_s_and_give_the_scores_the_image_s_distances():
     rng = np.random.default_rng(0)
     distance, area, everywhere = rng.uniform(0, 0.5, 60), rng.uniform(0.1, 1, 60), rng.uniform(0, 0.3, 784) ** 2
-    weights = conformal.image_weights(distance, area, everywhere)
+    weights = weighed(distance, area, everywhere)
     np.testing.assert_allclose(weights, oracle.weights(distance, area, everywhere), rtol=1e-12)
     rare = (distance > 0.05) & (distance <= 0.12)
     share = ((everywhere > 0.05) & (everywhere <= 0.12)).mean()
     assert weights[rare].sum() / weights.sum() == pytest.approx(share, rel=0.3)
-    assert not conformal.image_weights(distance, 0 * area, everywhere).any()
+    assert not weighed(distance, 0 * area, everywhere).any()
+
+
+def weighed(distance, area, everywhere):
+    weights = np.zeros_like(area)
+    conformal.weigh(distance, area, everywhere, weights)
+    return weights
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 2.5])
 def test_the_quantiles_follow_the_scores(factor):
     """Scores are ``factor`` times those of a normal distribution: 200 frames later the quantiles are too."""
-    rng, state, last = np.random.default_rng(1), np.zeros(conformal.SIZE), []
+    rng, state, last = np.random.default_rng(1), np.zeros(4), []
     for _ in range(200):
-        state = conformal.updated(state, factor * np.abs(rng.standard_normal(100)), np.ones(100))
+        state = updated(state, factor * np.abs(rng.standard_normal(100)), np.ones(100))
         last.append(np.exp(state[1:]))
     assert np.mean(last[-50:], 0)[:2] == pytest.approx(factor, rel=0.1)
     assert np.mean(last[-50:], 0)[2] == pytest.approx(factor, rel=0.2)
 
 
 def test_old_scores_are_forgotten_and_a_frame_with_few_counts_less():
-    rng, state = np.random.default_rng(2), np.zeros(conformal.SIZE)
+    rng, state = np.random.default_rng(2), np.zeros(4)
     for factor in [1.0] * 60 + [3.0] * 60:
-        state = conformal.updated(state, factor * np.abs(rng.standard_normal(100)), np.ones(100))
+        state = updated(state, factor * np.abs(rng.standard_normal(100)), np.ones(100))
     assert math.exp(state[2]) == pytest.approx(3, rel=0.2)
-    one, many = (conformal.updated(state, np.full(n, 99.0), np.ones(n)) for n in (1, 100))
+    one, many = (updated(state, np.full(n, 99.0), np.ones(n)) for n in (1, 100))
     assert 0 < one[2] - state[2] < 0.1 * (many[2] - state[2])
 
 
@@ -234,14 +249,14 @@ def test_the_correction_is_saved_with_the_state():
     second.load_state_dict(first.state_dict())
     for depth, T, anchors in given_frames[5:]:
         after = second(depth, T, K, anchors=anchors)
-    assert torch.equal(second.intervals, whole.intervals)
+    assert torch.equal(second.posterior, whole.posterior)
     expected = whole(given_frames[-1][0], given_frames[-1][1], K).quantiles
     assert torch.equal(second(given_frames[-1][0], given_frames[-1][1], K).quantiles, expected)
     assert after.has_intervals
     second.reset([0])
-    assert not bool(second.intervals.any())
+    assert not bool(second.posterior.any())
     whole.reset(keep_evidence=True)
-    assert bool(whole.intervals.any())
+    assert bool(whole.posterior.any())
 
 
 @pytest.mark.parametrize("values", [[-1.0, 0, 0, 0], [2.5, 0, 0, 0], [3.0, 9.0, 0, 0]])
@@ -249,6 +264,6 @@ def test_an_impossible_correction_is_refused(values):
     ufm = UfMStar(CONFIG)
     last_output(ufm, n=4)
     state = {name: value.clone() for name, value in ufm.state_dict().items()}
-    state["intervals"] = torch.tensor([values], dtype=torch.float64)
-    with pytest.raises(RuntimeError, match="intervals holds impossible values"):
+    views(state["posterior"][0].numpy()).intervals[:] = values
+    with pytest.raises(RuntimeError, match=r"posterior holds impossible values: (quantiles|a number of frames)"):
         ufm.load_state_dict(state)

@@ -244,20 +244,21 @@ def test_a_recording_live(ufmstar, tmp_path):
     assert code == 0, err + out
     assert int(torch.load(tmp_path / "state.pt")["image_index"]) > images  # the run continued
     before = sorted((tmp_path / "out").iterdir())
-    code, _, err = ufmstar(TOUR, "--out", tmp_path / "out")
+    code, _, err = ufmstar(TOUR, "--plain", "--out", tmp_path / "out")
     assert code == 2
     assert f"--out {tmp_path / 'out'} holds an earlier live run: --overwrite replaces it" in err
     assert sorted((tmp_path / "out").iterdir()) == before
     lock = hold(tmp_path / ".state.pt.lock")
-    code, _, err = ufmstar(TOUR, "--out", tmp_path / "out", "--overwrite", "--state", tmp_path / "state.pt")
+    plain = (TOUR, "--plain", "--state", tmp_path / "state.pt")
+    code, _, err = ufmstar(*plain, "--out", tmp_path / "out", "--overwrite")
     assert (code, sorted((tmp_path / "out").iterdir())) == (2, before)  # refused before anything is replaced
     assert "another process is writing" in err
     lock.release()
-    assert ufmstar("tour:4?frames=2&size=64x96", "--out", tmp_path / "out", "--overwrite")[0] == 0
+    assert ufmstar("tour:4?frames=2&size=64x96", "--plain", "--out", tmp_path / "out", "--overwrite")[0] == 0
     assert not any((tmp_path / "out" / f"{line['stamp']:.6f}.npz").exists() for line in lines[2:])
     for content, text in ((b"no state", "it begins with b'no state'"), (malicious(tmp_path), "never loaded because")):
         (tmp_path / "state.pt").write_bytes(content)
-        code, _, err = ufmstar(TOUR, "--state", tmp_path / "state.pt")
+        code, _, err = ufmstar(*plain)
         assert code == 2
         assert "cannot be continued" in err
         assert text in err
@@ -280,7 +281,7 @@ def test_a_recording_waits_for_a_network_that_starts_slowly(ufmstar, monkeypatch
 
     monkeypatch.setattr(sources, "time", SimpleNamespace(sleep=time.sleep, perf_counter=perf_counter))
     monkeypatch.setattr(NetworksInTurn, "member", slow_at_first)
-    code, out, err = ufmstar(TOUR, "--speed", "100", "--json")
+    code, out, err = ufmstar(TOUR, "--plain", "--speed", "100", "--json")
     assert code == 0, err + out
     assert too_early == [False]
     assert running.is_set()
@@ -299,14 +300,14 @@ def test_lines_on_standard_input_live(ufmstar, tmp_path, monkeypatch):
     assert "of 5 images" in out
     monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join([*lines, "no JSON"])))
     intrinsics = ("--intrinsics", K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-    code, out, err = ufmstar("-", *intrinsics, "--out", tmp_path / "out")
+    code, out, err = ufmstar("-", "--plain", *intrinsics, "--out", tmp_path / "out")
     assert code == 1
     assert "line 11: no JSON" in err
     assert "of 5 images" in out, "the summary table"
     summary = json.loads((tmp_path / "out" / "realtime.json").read_text())
     assert (summary["state"], summary["reason"]) == ("failed", "line 11: no JSON: no JSON")
     monkeypatch.setattr(sys, "stdin", io.StringIO(lines[1]))
-    code, _, err = ufmstar("-")
+    code, _, err = ufmstar("-", "--plain")
     assert code == 1
     assert "line 1: an image needs intrinsics, in its line, an earlier one or --intrinsics" in err
 
@@ -351,7 +352,7 @@ def test_a_folder_that_grows_live(ufmstar, tmp_path, monkeypatch):
     writer.start()
     K = sequence.intrinsics
     words = ("--trajectory", tmp_path / "poses.txt", "--intrinsics", K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-    code, printed, err = ufmstar(folder, "--follow", "--seconds", "1", "--out", out, *words)
+    code, printed, err = ufmstar(folder, "--plain", "--follow", "--seconds", "1", "--out", out, *words)
     ended.set()
     writer.join()
     assert code == 0, err + printed
@@ -378,7 +379,7 @@ def test_a_viewer_shows_the_results_on_this_computer_alone(ufmstar, stand_in, mo
         return started[0]
 
     monkeypatch.setattr(rerun_log.subprocess, "Popen", viewer)
-    code, out, err = ufmstar(TOUR, "--view", "--speed", "0.2")
+    code, out, err = ufmstar(TOUR, "--plain", "--view", "--speed", "0.2")
     started[0].terminate()
     started[0].wait(10)
     if not display:
@@ -399,5 +400,5 @@ def test_poses_that_contradict_the_images_of_a_recording_are_named(ufmstar, tmp_
     path = export_tour(open_sequence("tour:41?frames=12&size=120x160"), tmp_path / "walk")
     for poses, named in (((), 0), (("--poses", "opengl"), 1)):
         caplog.clear()
-        assert ufmstar(path, "--speed", "100", *poses)[0] == 0
+        assert ufmstar(path, "--plain", "--speed", "100", *poses)[0] == 0
         assert sum(text.startswith(f"{path}: poses disagree with the images") for text in caplog.messages) == named

@@ -16,12 +16,13 @@ from ufmstar_torch.anchors import Anchors, landmark_source, motion
 from ufmstar_torch.anchors.motion import LANDMARK, LINE, SEARCH, MotionTests, located, moves
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.sequences.open import open_sequence
-from ufmstar_torch.posterior.motion import probability
-from ufmstar_torch.posterior.motion import tests_at as at_nodes
+from ufmstar_torch.kernels.compile_cpu import kernel
+from ufmstar_torch.posterior import motion as motion_of_nodes
 from ufmstar_torch.posterior.running import SIZE
 from ufmstar_torch.posterior.update import update
 
 CELL, SHAPE = 10, (120, 160)
+at_nodes, probability = kernel(motion_of_nodes.tests_at), kernel(motion_of_nodes.probability)
 
 
 def searches(failing, seed=0):
@@ -197,11 +198,11 @@ def test_a_ratio_that_no_other_surface_has_is_explained_by_motion_and_a_usual_on
     offset, logs, zero = np.zeros((28, 28)), np.zeros((28, 28)), np.zeros(n)
     offset[8:20, 8:16], logs[8:20, 8:16] = 0.7, -0.8
     arguments = offset.ravel(), logs.ravel(), zero, zero, zero
-    P = probability(*arguments, 0.05**2, (28, 28)).reshape(28, 28)
+    P = probability(*arguments, 0.05**2, 28, 28).reshape(28, 28)
     assert P[10:18, 10:14].min() > 0.4
     assert P[offset == 0].max() < 0.1, "the depth edge bounds the region"
-    assert probability(*arguments, 0.5**2, (28, 28)).max() < 0.15, "in this stream surfaces differ that much"
-    far = probability(offset.ravel(), logs.ravel(), zero + 1, zero, zero, 0.05**2, (28, 28))
+    assert probability(*arguments, 0.5**2, 28, 28).max() < 0.15, "in this stream surfaces differ that much"
+    far = probability(offset.ravel(), logs.ravel(), zero + 1, zero, zero, 0.05**2, 28, 28)
     assert far.max() < 0.06, "without evidence there is nothing to explain"
 
 
@@ -210,11 +211,11 @@ def test_motion_that_passes_the_tests_makes_a_surface_look_farther():
     e, logs, zero = np.zeros((28, 28)), np.zeros((28, 28)), np.zeros(n)
     e[8:20, 8:16], logs[8:20, 8:16] = 0.7, -0.8
     inside, passed = (e > 0).ravel(), np.full(n, -4.0)
-    P = probability(e.ravel(), logs.ravel(), zero, passed, zero, 0.05**2, (28, 28))
-    nearer = probability(-e.ravel(), logs.ravel(), zero, passed, zero, 0.05**2, (28, 28))
+    P = probability(e.ravel(), logs.ravel(), zero, passed, zero, 0.05**2, 28, 28)
+    nearer = probability(-e.ravel(), logs.ravel(), zero, passed, zero, 0.05**2, 28, 28)
     assert P[inside].max() > 0.3
     assert nearer[inside].max() < P[inside].max() / 2
-    P, nearer = (probability(x.ravel(), logs.ravel(), zero, zero + 3, zero, 0.05**2, (28, 28)) for x in (e, -e))
+    P, nearer = (probability(x.ravel(), logs.ravel(), zero, zero + 3, zero, 0.05**2, 28, 28) for x in (e, -e))
     assert nearer[inside].min() > P[inside].min() - 0.1, "tests that fail show motion on either side"
 
 

@@ -18,7 +18,7 @@ from ufmstar_torch.kernels.compile_cpu import kernel
 from ufmstar_torch.posterior import field
 from ufmstar_torch.posterior.config import constants
 from ufmstar_torch.posterior.moments import divide, second_moments
-from ufmstar_torch.posterior.running import FEATURES, SIZE, Running
+from ufmstar_torch.posterior.running import FEATURES, RATIOS, SIZE, priors, views, write_ratios
 from ufmstar_torch.posterior.scene import SIDE, elsewhere_variance
 from ufmstar_torch.posterior.update import update
 
@@ -49,6 +49,13 @@ def checked(depth, pixel, g, variance):
     return frame, check_anchors(anchors, frame)
 
 
+def ratios(packed):
+    """Those of a memory [SIZE], by name."""
+    values = np.empty(RATIOS)
+    write_ratios(views(packed.numpy()), priors(MODEL), values)
+    return dict(zip(oracle.START, values.tolist(), strict=True))
+
+
 def test_values_against_the_oracle_over_frames():
     state, packed = oracle.start(), torch.zeros(1, SIZE, dtype=torch.float64)
     for seed in range(2):
@@ -61,7 +68,7 @@ def test_values_against_the_oracle_over_frames():
         np.testing.assert_allclose(out.outlier[0], outlier, rtol=1e-7)
         assert float(out.calibration) == pytest.approx(oracle.ratio(state, "calibration"), rel=1e-7)
         assert float(out.unseen) == pytest.approx(oracle.ratio(state, "unseen"), rel=1e-7)
-        np.testing.assert_allclose(out.scores[0], np.array(state["scores"]), rtol=1e-6)
+        np.testing.assert_allclose(views(packed[0].numpy()).intervals, state["intervals"], rtol=1e-7)
 
 
 solve, distance, divided = kernel(field.solve), kernel(field.distance), kernel(divide)
@@ -127,10 +134,10 @@ def test_streams_of_one_batch_equal_the_oracle_s(dtype, rtol):
                 np.testing.assert_allclose(getattr(out, name)[i], value, rtol=rtol, err_msg=name)
             assert float(out.calibration[i]) == pytest.approx(oracle.ratio(states[i], "calibration"), rel=rtol)
             assert float(out.unseen[i]) == pytest.approx(oracle.ratio(states[i], "unseen"), rel=rtol)
-            memory = Running.of(packed[i].numpy(), MODEL)
+            memory = views(packed[i].numpy())
             np.testing.assert_allclose(memory.coefficients, states[i]["b"], rtol=100 * rtol, atol=rtol)
             np.testing.assert_allclose(memory.covariance, states[i]["C"], rtol=100 * rtol, atol=rtol)
-            assert memory.ratios._asdict() == pytest.approx(
+            assert ratios(packed[i]) == pytest.approx(
                 {name: oracle.ratio(states[i], name) for name in oracle.START}, rtol
             )
         assert not bool(packed[2].any())
@@ -144,21 +151,15 @@ def test_a_frame_without_anchors_equals_one_with_invalid_anchors():
     invalid = dataclasses.replace(anchors, valid=torch.zeros_like(anchors.valid))
     (a, first), (b, second) = (update(packed, frame, none, claimed, MODEL) for none in (None, invalid))
     assert torch.equal(a, b)
-    assert [len(scores[0]) for scores in (*first.scores, *second.scores)] == [0] * 6
-    for name, value in maps_of(first).items():
-        torch.testing.assert_close(value[:2], maps_of(second)[name][:2], rtol=0, atol=0, equal_nan=True)
-
-
-def maps_of(posterior):
-    """Its tensors by name, without the scores."""
-    return {name: value for name, value in vars(posterior).items() if name != "scores"}
+    for name, value in vars(first).items():
+        torch.testing.assert_close(value[:2], vars(second)[name][:2], rtol=0, atol=0, equal_nan=True)
 
 
 def test_on_device_meta_the_results_have_shapes():
     frame, anchors, claimed = streams_of((0, 1, 2), torch.float32)
     arguments = torch.zeros(3, SIZE, dtype=torch.float64), frame, anchors, claimed
     (expected, real), (packed, out) = (update(*moved(arguments, device), MODEL) for device in ("cpu", "meta"))
-    for value, same in zip((packed, *maps_of(out).values()), (expected, *maps_of(real).values()), strict=True):
+    for value, same in zip((packed, *vars(out).values()), (expected, *vars(real).values()), strict=True):
         assert value.is_meta
         assert (value.shape, value.dtype) == (same.shape, same.dtype)
 
@@ -197,13 +198,13 @@ def test_without_anchors_the_slopes_of_the_correction_revert_and_its_scale_remai
     desk = np.tile(np.linspace(0.5, 1.0, 56), (56, 1))
     g = 1.5 * desk[rows, cols] ** 2
     packed, _ = updated(desk, (np.stack([cols, rows], -1).astype(float), g, (0.01 * g) ** 2))
-    b = [Running.of(packed[0].numpy(), MODEL).coefficients]
+    b = [views(packed[0].numpy()).coefficients.copy()]
     room = np.tile(np.linspace(2.0, 6.0, 56), (56, 1))
     frame, anchors = checked(room, np.zeros((1, 2)), np.ones(1), np.ones(1))
     for _ in range(10):
         packed, out = update(packed, frame, dataclasses.replace(anchors, valid=torch.zeros_like(anchors.valid)),
                              torch.zeros(1, 56, 56), MODEL)  # fmt: skip
-        b.append(Running.of(packed[0].numpy(), MODEL).coefficients)
+        b.append(views(packed[0].numpy()).coefficients.copy())
     shift = np.log(room).mean() - np.log(desk).mean()
     assert b[1][0] == pytest.approx(b[0][0] + b[0][1] * shift, rel=1e-2)
     kept, mean_slopes = 1 - MODEL.reversion, b[0][1:] / (1 + MODEL.slope_weight)  # after one frame with anchors
@@ -259,7 +260,7 @@ def test_outliers_do_not_widen_what_is_stated_of_the_other_pixels():
         packed, out = updated(depth, (pixel, g, (0.05 * g) ** 2), claimed, packed)
     seen = depth > 0
     error = np.log(out.depth[0].numpy() / (depth * factor))[seen]
-    assert Running.of(packed[0].numpy(), MODEL).ratios.inlier < 0.3
+    assert ratios(packed[0])["inlier"] < 0.3
     assert 0.22 < np.sqrt((error**2 / (out.inlier / out.depth.square())[0].numpy()[seen]).mean()) < 1
 
 
@@ -296,7 +297,7 @@ def wall(error):
     for frame in range(12):
         g = 2 * np.exp(error(np.random.default_rng(frame))[rows // 2, cols // 2])
         packed, out = updated(depth, (np.stack([cols, rows], -1) + 0.5, g, np.full(len(g), 1e-4)), packed=packed)
-    return Running.of(packed[0].numpy(), MODEL).ratios, out
+    return ratios(packed[0]), out
 
 
 def test_errors_that_neighbouring_anchors_do_not_share_are_not_taken_for_the_networks():
@@ -304,8 +305,8 @@ def test_errors_that_neighbouring_anchors_do_not_share_are_not_taken_for_the_net
     patches = np.kron(np.random.default_rng(4).normal(0, 0.3, (4, 4)), np.ones((7, 7)))
     shared, _ = wall(lambda rng: patches)
     independent, _ = wall(lambda rng: rng.permutation(patches.ravel()).reshape(28, 28))
-    assert shared.amplitude > 5 * independent.amplitude
-    assert shared.unseen > 2 * independent.unseen
+    assert shared["amplitude"] > 5 * independent["amplitude"]
+    assert shared["unseen"] > 2 * independent["unseen"]
 
 
 @pytest.mark.parametrize("p", [0.0, 0.5])
@@ -332,7 +333,7 @@ def test_more_regions_on_another_surface_make_it_more_probable():
         return wall(error)
 
     (few, calm), (many, rough) = spots(0.0), spots(0.15)
-    assert few.wrong < MODEL.wrong < many.wrong
+    assert few["wrong"] < MODEL.wrong < many["wrong"]
     assert rough.outlier.mean() > 2 * calm.outlier.mean()
 
 

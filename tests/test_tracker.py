@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import islice
 
+import cv2
 import numpy as np
 import oracle_triangulate
 import pytest
@@ -13,11 +14,14 @@ from hypothesis import strategies as st
 from landmark_runs import walk
 from scipy.spatial.transform import Rotation
 
-from ufmstar_torch.anchors.epipolar import off_lines
+from ufmstar_torch.anchors.kernels.epipolar import off_line, on_lines, weighted_quantile
+from ufmstar_torch.anchors.kernels.numbers import finite, median
+from ufmstar_torch.anchors.kernels.tracks import brightness_ratio, cover, predict
 from ufmstar_torch.anchors.kernels.triangulate import triangulate
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.gaussians.camera import resize_intrinsics
+from ufmstar_torch.kernels.compile_cpu import reordered
 
 HERE = np.array([1000.0, -500.0, 20.0])  # far from the world's origin
 K = np.array([[300.0, 0, 160], [0, 310, 120], [0, 0, 1]])
@@ -129,7 +133,8 @@ def test_matches_lie_on_the_part_of_the_line_where_points_of_the_scene_are(turne
     now, then = seen_from(points, np.stack([T, before])).transpose(1, 0, 2)
 
     def off(match):
-        distance, rho, baseline = off_lines(now, match, T, np.tile(before, (50, 1, 1)), K, 0.1, 30.0)
+        cameras = T, before, K, np.linalg.inv(K), 0.1, 30.0
+        distance, rho, baseline = np.array([off_line(*one, *cameras) for one in zip(now, match, strict=True)]).T
         np.testing.assert_allclose(baseline, 0.2)
         return np.median(distance), rho
 
@@ -153,3 +158,87 @@ def test_few_corners_of_a_camera_that_turns_are_none():
             assert abs(np.median(np.log(marks.depth / truth)[truth > 0])) < 0.3
     assert used[:3] == [0, 0, 0]
     assert max(used) > 20
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 60])
+def test_weighted_quantiles_and_medians_are_those_of_a_sort(count):
+    rng = np.random.default_rng(count)
+    for _ in range(20):
+        values, weight, chosen = rng.normal(size=count), rng.uniform(0.1, 1, count), rng.random(count) < 0.7
+        chosen[0] = True
+        order = np.argsort(values[chosen])
+        below = np.cumsum(weight[chosen][order])
+        for share in (0.1, 0.3, 0.5, 1.0):
+            expected = values[chosen][order][min(np.searchsorted(below, share * below[-1]), chosen.sum() - 1)]
+            assert weighted_quantile(values, weight, chosen, share, np.zeros(count, int)) == expected
+        assert median(values.copy(), count) == np.median(values)
+
+
+def test_most_of_the_area_decides_which_matches_fit_though_a_thing_that_moves_has_most_corners():
+    rng = np.random.default_rng(0)
+    still, thing = rng.uniform([0, 0], [320, 240], (60, 2)), rng.uniform([100, 80], [140, 110], (100, 2))
+    pixel = np.concatenate([still, thing])
+    distance = np.abs(np.concatenate([rng.normal(0, 0.3, 60), rng.normal(4, 0.3, 100)]))
+    fits, weight, order = np.zeros(160, bool), np.zeros(160), np.zeros(160, int)
+    on_lines(distance, pixel, (320, 240), 0.1, fits, weight, order)
+    np.testing.assert_array_equal(fits, np.arange(160) < 60)
+    cells = (pixel * 6 / [320, 240]).astype(int) @ [1, 6]
+    np.testing.assert_allclose(weight, 1 / np.bincount(cells)[cells])
+
+
+def test_corners_are_predicted_by_their_points_or_by_the_median_depth():
+    rng, last, T = np.random.default_rng(0), np.eye(4), np.eye(4)
+    last[:3, :3], last[:3, 3] = Rotation.from_rotvec([0.1, 0.2, 0]).as_matrix(), (0.1, 0.2, 0)
+    T[:3, :3], T[:3, 3] = Rotation.from_rotvec([0.1, 0.25, 0.02]).as_matrix(), (0.2, 0.2, 0.05)
+    inside, depth = rng.uniform([20, 20], [300, 200], (20, 2)), rng.uniform(1, 4, 20)
+    depth[12:] = np.median(depth[:12])
+    rays = np.concatenate([inside, np.ones((20, 1))], 1) @ np.linalg.inv(K).T
+    points = (depth[:, None] * rays) @ last[:3, :3].T + last[:3, 3]
+    goal, expected = seen_from(points, T[None])[:, 0], np.zeros((20, 2))
+    points[12:] = np.nan
+    cameras = last, T, K, np.linalg.inv(K)
+    assert predict(inside, points, *cameras, expected)
+    np.testing.assert_allclose(expected, goal, atol=1e-9)
+    points[4:] = np.nan
+    assert not predict(inside, points, *cameras, expected), "four points are too few"
+
+
+def test_brightness_around_corners_is_that_of_a_blurred_image():
+    rng = np.random.default_rng(0)
+    before = cv2.GaussianBlur(rng.integers(0, 256, (60, 80)).astype(np.uint8), (0, 0), 3)
+    after = (before * 0.8).astype(np.uint8)
+    position, found = (rng.uniform(0, [79, 59], (40, 2)) for _ in range(2))
+    position[:2], found[:2] = [[0, 0], [79, 59]], [[79, 0], [0, 59]]
+    fine = rng.random(40) < 0.8
+    means = []
+    for image, corners in ((before, position), (after, found)):
+        u, v = np.rint(corners).astype(int).T
+        means.append(cv2.blur(image, (17, 17))[v, u].astype(float))
+    assert brightness_ratio(before, after, position, found, fine) == np.median((means[1] / means[0])[fine])
+    assert brightness_ratio(before, after * 0, position, found, fine) == 1.0, "a black image has no usable mean"
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+def test_corners_are_covered_by_discs(factor):
+    rng, free = np.random.default_rng(0), np.full((60, 80), 255, np.uint8)
+    followed, expected = rng.uniform(0, factor * np.array([79, 59]), (12, 2)), free.copy()
+    followed[0] = 0
+    disc = cv2.circle(np.zeros((11, 11), np.uint8), (5, 5), 5, 1, -1)
+    cover(free, disc, followed, factor)
+    for u, v in np.rint((followed + 0.5) / factor - 0.5).astype(int).tolist():
+        cv2.circle(expected, (u, v), 5, 0, -1)
+    np.testing.assert_array_equal(free, expected)
+
+
+def test_a_sum_that_is_not_a_number_is_not_finite_in_compiled_code():
+    @reordered
+    def sums(values, out):
+        for i in range(len(values)):
+            total = 0.0
+            for j in range(values.shape[1]):
+                total += values[i, j]
+            out[i] = finite(total)
+
+    out = np.zeros(4, bool)
+    sums(np.array([[1.0, 2.0], [1.0, np.nan], [np.inf, 1.0], [np.inf, -np.inf]]), out)
+    assert out.tolist() == [True, False, False, False]

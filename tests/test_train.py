@@ -383,6 +383,22 @@ def test_a_training_by_command(ufmstar, frames, tmp_path):
     assert (code, err) == (0, "")
 
 
+def test_a_dry_run_prints_the_plan_and_writes_nothing(ufmstar, frames, tmp_path):
+    code, out, err = ufmstar(*words(frames, tmp_path / "out", "--dry-run", "--members", 2, "--seed", 3))
+    assert (code, err) == (0, "")
+    *lines, last = out.splitlines()
+    values = dict(line.split(maxsplit=1) for line in lines)
+    assert (values["members"], values["network.size"], values["data.part"], values["seed"]) == (
+        "2", "[32, 32]", "0:12", "3",
+    )  # fmt: skip
+    assert last == "12 frames to train on, 4 to validate on; at most 150 steps for each of 2 trained networks"
+    more = ("--preset", "fastdepth-aleatoric", "--data", "tour", "--out", tmp_path / "out", "--dry-run")
+    assert (
+        "4000 frames to train on, 320 to validate on; at most 25000 steps for each of 1" in ufmstar("train", *more)[1]
+    )
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_file_that_cannot_be_read_ends_a_training_in_a_line(ufmstar, tmp_path):
     path = write_frames(tmp_path / "walk")
     for file in (path / "depth").iterdir():

@@ -109,6 +109,7 @@ class TrainOptions:
 
     Attributes:
         list: Print the presets and stop.
+        dry_run: Print all values, and how many frames and steps there are, and stop.
         preset: Train what this preset states.
         members: The ensemble or BatchEnsemble has this many members.
         out: Write all results to this folder; a training there with the same settings continues.
@@ -127,6 +128,7 @@ class TrainOptions:
     )
 
     list: Flag = False
+    dry_run: Flag = False
     preset: Text = None
     members: Count = None
     out: Folder = None
@@ -254,9 +256,12 @@ def main(options: _Command) -> int:
     from lightning.pytorch.utilities import rank_zero_only
 
     from ufmstar_torch.eval.sequences.frame import FrameError
-    from ufmstar_torch.train.fit import fit, report
+    from ufmstar_torch.train.fit import fit, plan, report
     from ufmstar_torch.train.start import missing_start
 
+    if options.dry_run:
+        print(plan(job))
+        return 0
     process: Any = rank_zero_only
     remark = missing_start(job.recipe.network, job.settings.init)
     if remark and process.rank == 0:

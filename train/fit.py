@@ -17,7 +17,9 @@ from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.machine import hardware, versions
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.models.trained import save_trained
-from ufmstar_torch.train.folder import SUMMARY, WEIGHTS, open_folder
+from ufmstar_torch.runtime.checked import flat
+from ufmstar_torch.train.data import sources
+from ufmstar_torch.train.folder import SUMMARY, WEIGHTS, identity, open_folder
 from ufmstar_torch.train.member import (
     make_trainer,
     quiet_lightning,
@@ -69,6 +71,18 @@ def fit(job: Job, *, overwrite: bool = False, command: Sequence[str] = ()) -> di
                     LOGGER.warning("the weights so far cannot be written: %s", unwritten)
             raise
         return _conclude(job, None, time.monotonic() - began, command) if first else {}
+
+
+def plan(job: Job) -> str:
+    """The values of a training, and the number of its frames and steps, as lines. Writes nothing, and renders no tour.
+    Raises OSError, ValueError: as ``DepthDataModule.setup``."""
+    d, r = job.data, job.recipe
+    tours = [d.tour_frames * count for count in (d.tours, d.validation_tours)]
+    frames, validated = tours if d.kind == "tour" else [len(part) for part in sources(d)]
+    values = identity(job)
+    rows = [(name, str(value)) for name, value in flat({**values.pop("recipe"), **values}).items()]
+    steps = f"{r.max_steps or r.epochs * (frames // r.batch_size)} steps for each of {r.members} trained networks"
+    return f"{text_table(rows)}\n{frames} frames to train on, {validated} to validate on; at most {steps}"
 
 
 def _meet(trainer: pl.Trainer, out: Path) -> None:

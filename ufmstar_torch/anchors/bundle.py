@@ -24,22 +24,17 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.anchors.epipolar import FAR, NEAR, median, off_lines, on_lines
 from ufmstar_torch.anchors.saved_state import POSITIVE, SavedState
 from ufmstar_torch.anchors.time_offset import TimeOffset
+from ufmstar_torch.gaussians.camera import inverse_intrinsics
 
-# [px] Standard deviations of a position by errors of the poses: at first (best on tours whose poses err by .05 to .15
-# degrees and 2 mm), and their limits when they are learnt.
-_FIRST, _LEAST, _LARGEST = 0.5, 0.003, 20.0
-# Share of the running estimates that remains after a frame.
-_MEMORY = 0.8
+# [px] First standard deviation of a position by errors of the poses: best on tours whose poses err by .05 to .15
+# degrees and 2 mm.
+_FIRST = 0.5
 # A pose starts another trajectory if the score of its error, chi-squared with six degrees of freedom, exceeds _SCORE
 # and _TIMES the recent scores, and its shift of positions is clear (``kernels.bundle``). Otherwise the poses are
 # noisier than learnt so far.
 _SCORE, _TIMES = 60.0, 5.0
-# Least share of the tracks that do not fit the input poses, for them to be taken for tracks of things that move, which
-# the poses would follow; below .2 on recordings of still scenes. Least number of tracks that is judged.
-_MOVING, _FEWEST = 0.25, 8
 # Least number of views for a refinement.
 _VIEWS = 3
 
@@ -110,61 +105,26 @@ class PoseRefinement(SavedState):
         Returns:
             [W, 4, 4] refined poses; the input poses if too few corners are seen, or after a jump.
         """
-        from ufmstar_torch.anchors.kernels.bundle import refined  # compiles when it is first needed
+        from ufmstar_torch.anchors.kernels.bundle import Learnt, refine  # compiles when it is first needed
 
         self.shared, self.jumped = 0.0, False
         views = np.flatnonzero(seen.any(0))
         if len(views) < _VIEWS:
             return T_world_cam
-        unit = np.array([[1], [depth]]) / K[0, 0]  # w [rad] and s [m] that shift a position by a pixel
-        stated, prior = T_world_cam[views], np.tile(np.repeat(1 / (self._variance * unit[:, 0] ** 2), 3), len(views))
-        shift, most = self.offset.shift(stated), max(_SCORE, _TIMES * self._recent_score)
-        pixel, seen = pixel[:, views], seen[:, views]
-        seen = seen & _static(pixel, seen, stated, K, depth)[:, None]
-        result, score, self.jumped = refined(pixel, seen, stated, K, depth, shift, prior, most)
-        if score == score:
-            self._recent_score = max(score, _MEMORY * self._recent_score)
-        if result is None:
+        if len(views) < len(T_world_cam):
+            poses = T_world_cam.copy()
+            pixel, seen = np.ascontiguousarray(pixel[:, views]), np.ascontiguousarray(seen[:, views])
+            poses[views] = self.refine(pixel, seen, T_world_cam[views], K, depth)
+            return poses
+        numbers = np.array([self._learnt, self.correlated, 0.0, self._recent_score, self._offset_variance])
+        poses, shift = np.empty(T_world_cam.shape), self.offset.shift(T_world_cam)
+        (prior, error), covariance = np.empty((2, shift.size)), np.empty((shift.size, shift.size))
+        camera, learnt = (K, inverse_intrinsics(K), depth), Learnt(self._variance, self._last_error, numbers)
+        most = max(_SCORE, _TIMES * self._recent_score)
+        refined = refine(pixel, seen, T_world_cam, *camera, shift, most, learnt, poses, prior, error, covariance)
+        count, self.correlated, self.shared, self._recent_score, self._offset_variance = numbers.tolist()
+        self._learnt, self.jumped = int(count), refined < 0
+        if refined <= 0:
             return T_world_cam
-        self.shared = median(result.depth_variance)
-        self._offset_variance = float(np.square(shift[-1].reshape(2, 3) / unit).sum()) / 3
-        self._learn(result.error[-6:].reshape(2, 3) / unit, result.covariance.diagonal()[-6:].reshape(2, 3) / unit**2)
-        self.offset.learn(stated, prior, result.error, result.covariance)
-        poses = T_world_cam.copy()
-        poses[views] = result.poses
+        self.offset.learn(T_world_cam, prior, error, covariance)
         return poses
-
-    def _learn(self, error: NDArray[np.float64], posterior_variance: NDArray[np.float64]) -> None:
-        """Update the variances by the newest pose's error [2, 3] and its posterior variance [2, 3], in pixels, as far
-        as the images determine them."""
-        determined = (1 - posterior_variance / self._variance[:, None]).sum(1)  # how many of 3 components
-        excess = np.square(error).sum(1) - determined * self._variance
-        self._learnt += 1
-        share = max(1 - _MEMORY, 1 / (self._learnt + 1))  # at first the mean with the prior
-        variance = self._variance + share * excess / np.maximum(determined, 1)
-        self._variance = variance.clip(_LEAST**2 / 2, _LARGEST**2 / 2)
-        product = float((error * self._last_error).sum()) / 3
-        self.correlated = max(_MEMORY * self.correlated + (1 - _MEMORY) * product, 0.0)
-        self._last_error = error
-
-
-def _static(
-    pixel: NDArray[np.float64], seen: NDArray[np.bool_], T_world_cam: NDArray[np.float64], K: NDArray[np.float64],
-    depth: float,
-) -> NDArray[np.bool_]:  # fmt: skip
-    """Which tracks [N] refine the poses [W, 4, 4]: the largest group that fits them between its first view and the
-    newest. All, where few do not fit: their Student-t weights suffice. Arguments as in :meth:`PoseRefinement.refine`.
-    """
-    from ufmstar_torch.anchors.kernels.bundle import position_variance
-
-    tracks = np.flatnonzero(seen[:, -1] & (seen.sum(1) > 1))
-    result = np.ones(len(pixel), np.bool_)
-    if len(tracks) < _FEWEST:
-        return result
-    first, newest = seen[tracks].argmax(1), pixel[tracks, -1]
-    views = newest, pixel[tracks, first], T_world_cam[-1], T_world_cam[first]
-    distance, *_ = off_lines(*views, K, NEAR * depth, FAR * depth)
-    sigma = np.sqrt(position_variance(seen.shape[1] - 1 - first))
-    fits, _ = on_lines(distance / sigma, newest, 2 * K[:2, 2], 1.0)
-    result[tracks] = fits | bool(fits.mean() > 1 - _MOVING)
-    return result

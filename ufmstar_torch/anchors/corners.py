@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.anchors.epipolar import median
 from ufmstar_torch.anchors.landmarks import opencv
 
 # Lucas-Kanade on patches 8 px wide and 16 px high, over four octaves of at most ten iterations. OpenCV processes eight
@@ -29,9 +28,8 @@ _HALVED_FROM = 480
 _HARRIS, _WEAKEST = 0.04, 1e-4
 
 # Adaptation to another exposure: logarithm of the ratio of brightness from which the first image is adapted; most
-# rounds; share of corners that must be tracked to measure the ratio at them; window of the local means [px]; range of
-# the means in use [gray levels].
-_LOG_RATIO, _ROUNDS, _SHARE, _MEAN_WINDOW, _MEAN_RANGE = 0.03, 3, 0.15, (17, 17), (8, 240)
+# rounds; share of corners that must be tracked to measure the ratio at them.
+_LOG_RATIO, _ROUNDS, _SHARE = 0.03, 3, 0.15
 
 
 def follow(
@@ -55,11 +53,13 @@ def follow(
     Returns:
         Positions [N, 2] in ``after`` [px], and [N] True where reliable: tracked both ways and inside the image.
     """
+    from ufmstar_torch.anchors.kernels.tracks import brightness_ratio  # compiles when it is first needed
+
     found, fine = _followed(before, after, position, back_tolerance, expected)
     gain = 1.0
     for _ in range(_ROUNDS):
         few = np.count_nonzero(fine) < _SHARE * len(fine)
-        ratio = _ratio(before, after) if few else _ratio_at(before, after, position[fine], found[fine])
+        ratio = _ratio(before, after) if few else brightness_ratio(before, after, position, found, fine)
         if abs(np.log(ratio / gain)) <= _LOG_RATIO:
             break
         gain = ratio
@@ -74,21 +74,6 @@ def follow(
 def _ratio(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
     """Ratio of the median brightness of the images: a rough estimate if they show different things."""
     return float(max(np.median(after), 1) / max(np.median(before), 1))
-
-
-def _ratio_at(
-    before: NDArray[np.uint8], after: NDArray[np.uint8], position: NDArray[np.float64], found: NDArray[np.float64]
-) -> float:
-    """Ratio of brightness around tracked corners, their median."""
-    cv2 = opencv()
-    means = []
-    for image, corners in ((before, position), (after, found)):
-        u, v = np.rint(corners).astype(np.int64).T
-        means.append(cv2.blur(image, _MEAN_WINDOW)[v, u].astype(np.float64))
-    mean_before, mean_after = means
-    low, high = np.minimum(mean_before, mean_after), np.maximum(mean_before, mean_after)
-    usable = (low > _MEAN_RANGE[0]) & (high < _MEAN_RANGE[1])
-    return median(mean_after[usable] / mean_before[usable]) if usable.any() else 1.0
 
 
 def _followed(
@@ -110,21 +95,20 @@ def _there_and_back(
     levels: int, back_tolerance: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:  # fmt: skip
     """As :func:`follow`, from a ``first`` guess of the positions, over ``levels`` octaves beyond the first."""
+    from ufmstar_torch.anchors.kernels.tracks import returned  # compiles when it is first needed
+
     cv2 = opencv()
     # The first flag replaces the difference of the patches, which takes a separate pass, by the patch's eigenvalue.
     # Neither is used.
     flags = cv2.OPTFLOW_LK_GET_MIN_EIGENVALS | cv2.OPTFLOW_USE_INITIAL_FLOW
     options: dict[str, Any] = {"winSize": _PATCH, "criteria": (3, _ITERATIONS, _CONVERGED), "flags": flags}
     start, guess = (np.array(value, np.float32, order="C").reshape(-1, 1, 2) for value in (position, first))
-    forward, result, _ = cv2.calcOpticalFlowPyrLK(before, after, start, guess, maxLevel=levels, **options)
+    forward, tracked, _ = cv2.calcOpticalFlowPyrLK(before, after, start, guess, maxLevel=levels, **options)
     # Track back with the start as the first guess: the finest level is enough.
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, forward, start.copy(), maxLevel=0, **options)
-    gap = np.linalg.norm(back - start, axis=-1)[:, 0]
-    height, width = after.shape
-    u, v = forward[:, 0, 0], forward[:, 0, 1]
-    inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
-    fine = (result[:, 0] == 1) & (returned[:, 0] == 1) & (gap < back_tolerance) & inside
-    return forward[:, 0].astype(np.float64), fine
+    back, tracked_back, _ = cv2.calcOpticalFlowPyrLK(after, before, forward, start.copy(), maxLevel=0, **options)
+    found, fine = np.empty((len(position), 2)), np.empty(len(position), np.bool_)
+    returned(start, forward, back, tracked, tracked_back, after.shape, back_tolerance, found, fine)
+    return found, fine
 
 
 def find(gray: NDArray[np.uint8], count: int, spacing: float, followed: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -139,14 +123,17 @@ def find(gray: NDArray[np.uint8], count: int, spacing: float, followed: NDArray[
     Returns:
         [n, 2] positions (u, v), the strongest first [px].
     """
+    from ufmstar_torch.anchors.kernels.tracks import cover  # compiles when it is first needed
+
     cv2 = opencv()
     # Searching a large image at half its size takes a tenth of the time. The position of a corner need not be exact,
     # only the same from frame to frame.
     factor = 2 if gray.shape[1] >= _HALVED_FROM else 1
     searched = gray if factor == 1 else cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     free = np.full(searched.shape, 255, np.uint8)
-    for u, v in np.rint((followed + 0.5) / factor - 0.5).astype(int).tolist():
-        cv2.circle(free, (u, v), round(spacing / factor), 0, -1)
+    radius = round(spacing / factor)
+    disc = cv2.circle(np.zeros((2 * radius + 1, 2 * radius + 1), np.uint8), (radius, radius), radius, 1, -1)
+    cover(free, disc, followed, factor)
     corners = cv2.goodFeaturesToTrack(
         searched, count, _WEAKEST, spacing / factor, mask=free, useHarrisDetector=True, k=_HARRIS
     )

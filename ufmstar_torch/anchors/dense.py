@@ -189,10 +189,10 @@ class DenseEvidence(SavedState):
         if self._size.any() and (gray.shape != tuple(self._size) or not np.array_equal(K, self._K)):
             raise OtherCameraError
         small, scale = _reduced(gray, self.config.width)
-        if self._tracker.repeats(small, T):
-            return Landmarks.skipped(REPEATED)
+        corners = self._tracker.track(small, T, scale @ K)
+        if corners.none == REPEATED:
+            return corners
         self._size, self._K = np.array(gray.shape), K
-        corners = self._tracker.update(small, T, scale @ K)
         T, (number, poses) = self._tracker.pose, self._tracker.refined
         if self._memory.empty:
             self._depth = self._tracker.depth

@@ -97,7 +97,9 @@ class Keyframes(SavedState):
 
         b, ring = len(baselines), self._count + 1
         whole, half = (
-            Views(images, *np.zeros((2, b), np.int64), np.zeros((b, 3, 3)), np.zeros((b, 3)), np.zeros(b))
+            Views(
+                images, np.zeros(b, np.int64), np.zeros(b, np.int64), np.zeros((b, 3, 3)), np.zeros((b, 3)), np.zeros(b)
+            )
             for images in (self._image, self._half)
         )
         newest, number = (self._added - 1) % ring, min(self._added, self._count)

@@ -14,6 +14,7 @@ because noise of the image's pose is also in e and would bias the result.
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import numpy as np
@@ -58,9 +59,13 @@ class TimeOffset(SavedState):
         along the world's [m]. The motion at the newest pose is extrapolated."""
         if not self.lag:
             return np.zeros((len(T_world_cam), 6))
-        steps = _motion(T_world_cam[:-1], T_world_cam[1:])
-        parts = [steps[:1], steps] if self.lag < 0 else [steps, steps[-1:]]
-        return np.asarray(self.lag * np.concatenate(parts), np.float64)
+        from ufmstar_torch.anchors.kernels.time_offset import steps  # compiles when it is first needed
+
+        result = np.empty((len(T_world_cam), 6))
+        motion = result[1:] if self.lag < 0 else result[:-1]
+        steps(T_world_cam, motion)
+        result[0 if self.lag < 0 else -1] = motion[0 if self.lag < 0 else -1]
+        return self.lag * result
 
     def learn(
         self, T_world_cam: NDArray[np.float64], precision: NDArray[np.float64], error: NDArray[np.float64],
@@ -74,30 +79,14 @@ class TimeOffset(SavedState):
             error: [6 W] e, beyond :meth:`shift`.
             covariance: [6 W, 6 W] C.
         """
-        views = len(T_world_cam)  # before and after each view; neighbours of the first and the last view
-        before, after = [1, *range(views - 2), views - 3], [2, *range(2, views), views - 2]
-        motion = _motion(T_world_cam[before], T_world_cam[after])
-        motion[1:-1] /= 2
-        motion = motion.ravel()
-        weighted = precision * motion
-        # Windows overlap: each pose is in W windows.
-        window_information = float(weighted @ (motion - covariance @ weighted)) / len(T_world_cam)
-        if not window_information > 0:
-            return
-        lag = self.lag + float(weighted @ error) / len(T_world_cam) / window_information
-        if not np.isfinite(lag):
+        from ufmstar_torch.anchors.kernels.time_offset import late  # compiles when it is first needed
+
+        window_information, beyond = late(T_world_cam, precision, error, covariance)
+        lag = self.lag + beyond
+        if not (window_information > 0 and math.isfinite(lag)):
             return
         information = 1 / (1 / window_information + _WINDOW**2)
-        self._sum = _MEMORY * self._sum + information * float(np.clip(lag, -_LARGEST, _LARGEST))
+        self._sum = _MEMORY * self._sum + information * min(max(lag, -_LARGEST), _LARGEST)
         self._information = _MEMORY * self._information + information
         mean = self._sum / (self._information + 1 / _PRIOR**2)
         self.lag = mean * max(0.0, 1 - _SIGNIFICANT / max(mean**2 * self._information, 1e-9))
-
-
-def _motion(T_world_cam: NDArray[np.float64], T_next: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[n, 6] motion between poses [n, 4, 4]: rotation vector in the camera's axes, shift along the world's."""
-    R = T_world_cam[:, :3, :3].transpose(0, 2, 1) @ T_next[:, :3, :3]
-    axis = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], 1) / 2
-    sine, cosine = np.linalg.norm(axis, axis=1), (np.trace(R, axis1=1, axis2=2) - 1) / 2
-    turn = axis * (np.arctan2(sine, cosine) / np.maximum(sine, 1e-12))[:, None]
-    return np.concatenate([turn, T_next[:, :3, 3] - T_world_cam[:, :3, 3]], 1)

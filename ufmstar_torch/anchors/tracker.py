@@ -17,7 +17,6 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.bundle import PoseRefinement
 from ufmstar_torch.anchors.corners import find, follow
-from ufmstar_torch.anchors.epipolar import FAR, NEAR, NEAREST, median, off_lines, on_lines, weighted_quantile
 from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, OtherCameraError, checked
 from ufmstar_torch.anchors.saved_state import POSITIVE, SavedState, saved_image
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
@@ -26,33 +25,15 @@ from ufmstar_torch.runtime.checked import Checked, number
 if TYPE_CHECKING:
     from ufmstar_torch.anchors.kernels.triangulate import Triangulated
 
-# Least number of tracks for a comparison with the poses.
-_ENOUGH = 5
-# Errors of a tracked position add up from view to view: the variance of a track of v views is _DRIFT (v - 1) times that
-# of independent positions. The squared errors on four rendered tours confirm both the growth with v and the factor.
-_DRIFT = 0.6
-# Share of the running estimate of the residuals' variance that remains after a frame; least number of views of the
-# tracks for that estimate.
-_MEMORY, _LONG = 0.8, 4
 # Why an image has no landmark.
 _NO_TRACK, _NO_DEPTH = "no corner followed from the frame before", "no parallax, or no track that fits the poses"
 # Largest difference of the entries of equal poses [1, m].
 _SAME = 1e-6
-# Upper limit of depths over the median in an image without motion: all points of a frozen image would lie beyond it,
-# but only half of a scene's points do.
-_MEDIAN_DEPTH = 1.0
-# Share of the running distance from the epipolar lines that remains after a frame; least motion of a corner that
-# determines a depth, and median motion below which an image stands still [px].
-_FADE, _MOVES, _STILL = 0.6, 1.0, 0.2
+# Share of the running distance from the epipolar lines, and of the scene's depth, that remains after a frame.
+_FADE, _MEMORY = 0.6, 0.8
 # Least median baseline of the corners over the depth of the scene. Refined poses of a camera that stands or only turns
 # still differ by their errors.
 _PARALLAX = 0.005
-# Least share of the corners with clear parallax. Where the share is smaller, the parallax is mostly error, and corners
-# seem too near: by a factor of 7 with a share of .05, of 1.2 with .3 (a turning camera, on tours). Where the camera
-# moves, the share exceeds one half.
-_CLEAR_SHARE = 1 / 3
-# The median of the absolute value of a standard normal variable.
-_MEDIAN = 0.6745
 
 
 @dataclass(frozen=True)
@@ -121,7 +102,6 @@ class LandmarkTracker(SavedState):
         "_input_poses": "given_poses",
         "_poses": "poses",
         "_number": "number",
-        "_view": "view",
         "_noise": "noise",
         "_line_error": "off",
         "_newest_line_error": "off_now",
@@ -148,8 +128,7 @@ class LandmarkTracker(SavedState):
         self._pixel = np.zeros((n, w, 2))
         self._seen = np.zeros((n, w), dtype=bool)
         self._input_poses, self._poses = np.tile(np.eye(4), (2, w, 1, 1))  # of the input, and refined
-        self._number = np.full(w, -1)  # index of each view's image
-        self._view = -1
+        self._number = np.full(w, -1)  # index of each view's image; the newest view is the last
         self._refinement.reset()
         self._noise = self.config.pixel_noise**2
         # Standard deviation of corners from their epipolar lines [px], running and in the newest image; negative = not
@@ -190,37 +169,39 @@ class LandmarkTracker(SavedState):
                 :meth:`reset` first); the tracker stays unchanged.
             ModuleNotFoundError: OpenCV is not installed.
         """
-        gray, T, K = checked(image, T_world_cam, K)
+        return self.track(*checked(image, T_world_cam, K))
+
+    def track(self, gray: NDArray[np.uint8], T: NDArray[np.float64], K: NDArray[np.float64]) -> Landmarks:
+        """:meth:`update` with checked arguments and a gray image."""
         if self._gray.size:
             if gray.shape != self._gray.shape or not np.array_equal(K, self._K):
                 raise OtherCameraError
-            if self.repeats(gray, T):
+            if self._repeats(gray, T):
                 return Landmarks.skipped(REPEATED)
-            position, alive = self._followed(gray, T)
-        else:
-            position, alive = np.zeros((self.config.max_points, 2)), np.zeros(self.config.max_points, dtype=bool)
-        last, self._view = self._view, (self._view + 1) % self.config.window
-        self._number[self._view] = self._number[last] + 1
-        self._seen[~alive] = False  # free the slots of lost corners
-        self._seen[:, self._view] = alive
-        self._pixel[:, self._view] = position
-        self._input_poses[self._view] = self._poses[self._view] = T
-        tracked = int(alive.sum())
+        position, alive = self._followed(gray, T)
+        tracked = int(np.count_nonzero(alive))
+        self._number = np.append(self._number[1:], self._number[-1] + 1)
+        self._pixel = np.concatenate([self._pixel[:, 1:], position[:, None]], 1)
+        self._seen = np.concatenate(
+            [self._seen[:, 1:] & alive[:, None], alive[:, None]], 1
+        )  # lost corners are free slots
+        self._input_poses = np.concatenate([self._input_poses[1:], T[None]])
         self._gray, self._K = gray, K
-        self._refine()
+        self._poses = self._refinement.refine(self._pixel, self._seen, self._input_poses, K, self._depth)
+        if self.jumped:
+            self._seen[:, :-1] = False
         self._compare_with_poses()
         self._fill(gray)
         return self._landmarks(tracked)
 
-    def repeats(self, gray: NDArray[np.uint8], T_world_cam: NDArray[np.float64]) -> bool:
+    def _repeats(self, gray: NDArray[np.uint8], T_world_cam: NDArray[np.float64]) -> bool:
         """True if a gray image equals the last one but has another pose: a frozen or duplicated image."""
-        last = self._input_poses[self._view]
-        return np.array_equal(gray, self._gray) and not np.allclose(T_world_cam, last, atol=_SAME)
+        return np.array_equal(gray, self._gray) and not np.allclose(T_world_cam, self._input_poses[-1], atol=_SAME)
 
     @property
     def pose(self) -> NDArray[np.float64]:
         """[4, 4] refined pose of the last image, camera-to-world [m]."""
-        return np.array(self._poses[self._view])
+        return np.array(self._poses[-1])
 
     @property
     def jumped(self) -> bool:
@@ -279,86 +260,55 @@ class LandmarkTracker(SavedState):
         """Largest standard deviation of corners from their epipolar lines [px]."""
         return self.config.max_pose_error * self._gray.shape[1]
 
-    def _refine(self) -> None:
-        """Refine the window's poses by its corners."""
-        order = (self._view + 1 + np.arange(self.config.window)) % self.config.window
-        views = self._pixel[:, order], self._seen[:, order], self._input_poses[order]
-        self._poses[order] = self._refinement.refine(*views, self._K, self._depth)
-        if self.jumped:
-            self._seen[:, order[:-1]] = False
-
     def _compare_with_poses(self) -> None:
         """Update the distance of corners from their epipolar lines, each in its first view, and the scene's depth."""
-        order = (self._view + 1 + np.arange(self.config.window)) % self.config.window
-        seen = self._seen[:, order]
-        chosen = np.flatnonzero(seen[:, -1] & seen[:, :-1].any(1))
-        if len(chosen) < _ENOUGH:
+        from ufmstar_torch.anchors.kernels.tracks import compare  # compiles when it is first needed
+
+        camera = self._poses, self._K, inverse_intrinsics(self._K), self._gray.shape[::-1]
+        newest, baseline, rho = compare(self._pixel, self._seen, *camera, self._depth, self.config.pixel_noise)
+        if newest < 0:
             return
-        first = order[seen[chosen].argmax(1)]
-        views = self._pixel[chosen, self._view], self._pixel[chosen, first], self._poses[self._view], self._poses[first]
-        motion = np.linalg.norm(views[0] - views[1], axis=1)
-        far = self._depth * (_MEDIAN_DEPTH if median(motion) < _STILL else FAR)
-        distance, rho, baseline = off_lines(*views, self._K, NEAR * self._depth, far)
-        group, weight = on_lines(distance, views[0], self._gray.shape[::-1], self.config.pixel_noise / 2)
-        newest = weighted_quantile(distance[group], weight[group], 0.5) / _MEDIAN
-        self._newest_line_error = newest
+        self._newest_line_error, self.baseline = newest, baseline
         self._line_error = newest if self._line_error < 0 else _FADE * self._line_error + (1 - _FADE) * newest
-        self.baseline = median(baseline)
-        determines_depth = (rho > 0) & (motion > _MOVES)
-        if determines_depth.sum() >= _ENOUGH:
+        if rho > 0:
             self._depth_count += 1
             share = max(1 - _MEMORY, 1 / self._depth_count)
-            self._depth *= (
-                1 / weighted_quantile(rho[determines_depth], weight[determines_depth], 0.5) / self._depth
-            ) ** share
+            self._depth *= (1 / rho / self._depth) ** share
 
     def _followed(self, gray: NDArray[np.uint8], T: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
         """Positions [N, 2] in the new image, and [N] True for corners that were tracked there and back."""
-        position, alive = self._pixel[:, self._view].copy(), self._seen[:, self._view].copy()
-        if alive.any():
-            start, expected = position[alive], self._expected(alive, T)
-            position[alive], alive[alive] = follow(self._gray, gray, start, self.config.back_tolerance, expected)
+        from ufmstar_torch.anchors.kernels.tracks import predict  # compiles when it is first needed
+
+        position, alive = self._pixel[:, -1].copy(), self._seen[:, -1].copy()
+        corners = np.flatnonzero(alive)
+        if len(corners):
+            start, expected = position[corners], np.empty((len(corners), 2))
+            cameras = self._poses[-1], T, self._K, inverse_intrinsics(self._K)
+            predicted = predict(start, self._point[corners], *cameras, expected)
+            found = follow(self._gray, gray, start, self.config.back_tolerance, expected if predicted else None)
+            position[corners], alive[corners] = found
         return position, alive
-
-    def _expected(self, chosen: NDArray[np.bool_], T: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Predict the positions of the chosen corners in the image of a camera T [4, 4] from their points. A corner
-        without a point gets the median depth of the others. None if too few have a point."""
-        last, K = self._poses[self._view], self._K
-        position, point = self._pixel[chosen, self._view], self._point[chosen]
-        depth = (point - last[:3, 3]) @ last[:3, 2]
-        finite = np.isfinite(depth)
-        if finite.sum() < _ENOUGH:
-            return None
-        rays = np.concatenate([position, np.ones((len(position), 1))], axis=1) @ inverse_intrinsics(K).T
-        median_depth = median(depth[finite])
-        point = np.where(finite[:, None], point, median_depth * rays @ last[:3, :3].T + last[:3, 3])
-
-        def project(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-            cam = (point - pose[:3, 3]) @ pose[:3, :3]
-            return np.asarray(cam @ K[:2].T / np.maximum(cam[:, 2:], NEAREST * median_depth))
-
-        return np.asarray(position + project(T) - project(last))
 
     def _fill(self, gray: NDArray[np.uint8]) -> None:
         """Detect new corners for free slots, away from tracked ones."""
-        followed = self._seen[:, self._view]
+        followed = self._seen[:, -1]
         free = np.flatnonzero(~followed)
         # Not for a few slots: a search takes half as long as tracking all corners.
         if len(free) < max(1, self.config.max_points // 5):
             return
         spacing = self.config.spacing * gray.shape[1] / 640
-        result = find(gray, len(free), spacing, self._pixel[followed, self._view])
+        result = find(gray, len(free), spacing, self._pixel[followed, -1])
         slots = free[: len(result)]
         self._seen[slots] = False
-        self._seen[slots, self._view] = True
-        self._pixel[slots, self._view] = result
+        self._seen[slots, -1] = True
+        self._pixel[slots, -1] = result
 
-    def _triangulated(self) -> tuple[NDArray[np.bool_], Triangulated | None]:
-        """Triangulate the corners of the newest image that have enough views in the window (mask [N]), and store the
-        points that fit."""
-        chosen = self._seen[:, self._view] & (self._seen.sum(1) >= self.config.min_views)
+    def _triangulated(self) -> tuple[NDArray[np.int64], Triangulated | None]:
+        """Triangulate the corners [N] of the newest image that have enough views in the window, and store the points
+        that fit."""
+        chosen = np.flatnonzero(self._seen[:, -1] & (self._seen.sum(1) >= self.config.min_views))
         self._point = np.full((self.config.max_points, 3), np.nan)
-        if not chosen.any():
+        if not len(chosen):
             return chosen, None
         from ufmstar_torch.anchors.kernels.triangulate import triangulate  # compiles when it is first needed
 
@@ -379,29 +329,15 @@ class LandmarkTracker(SavedState):
             pixel = np.zeros((0, 2))
             judged = self.pose_error, shared, self.contradicted
             return Landmarks(pixel, nothing, nothing, tracked, none, *judged, lag=self.lag)
-        T = self._poses[self._view]
-        axis = T[:3, 2]
-        depth = (result.point - T[:3, 3]) @ axis
-        fits, views = result.error <= config.max_error, self._seen[chosen].sum(1)
-        residual = np.square(result.error) * 2 * views / np.maximum(2 * views - 3, 1)
-        long_tracks = fits & result.ahead & (views >= _LONG)
-        if long_tracks.sum() >= _ENOUGH:
-            self._noise = _MEMORY * self._noise + (1 - _MEMORY) * median(residual[long_tracks])
-        # A residual above the noise increases the variance of the track.
-        one_pixel = np.einsum("i,nij,j->n", axis, result.covariance, axis)
-        variance = _DRIFT * (views - 1) * np.maximum(residual, self._noise) * one_pixel
-        safe = np.maximum(depth, 1e-9)
-        # Two views can only disagree across the epipolar line. Tracks of three views decide, if there are enough.
-        decisive = fits[views > 2] if (views > 2).sum() >= _ENOUGH else fits
-        fine = fits & result.ahead & (depth > 0) & (decisive.mean() >= config.min_share)
-        # Degenerate geometry can make the covariance indefinite.
-        independent = np.maximum(residual, config.pixel_noise**2) * one_pixel
-        fine &= (variance >= 0) & (independent <= np.square(config.max_relative_sigma * safe))
-        fine &= fine.mean() >= _CLEAR_SHARE
-        pixel = self._pixel[chosen][fine, self._view]
-        shared = self.shared(self.baseline) + self._refinement.shared
-        variance = variance[fine] + shared * depth[fine] ** 4
-        return Landmarks(pixel, depth[fine], variance, tracked, none, self.pose_error, shared, lag=self.lag)
+        from ufmstar_torch.anchors.kernels.tracks import Limits, accept  # compiles when it is first needed
+
+        depth, variance, fine = *np.empty((2, len(chosen))), np.empty(len(chosen), np.bool_)
+        limits = Limits(config.pixel_noise, config.max_relative_sigma, config.max_error, config.min_share)
+        arguments = result, self._seen[chosen], self._poses[-1], limits, self._noise
+        self._noise = accept(*arguments, depth, variance, fine)
+        depth, shared = depth[fine], self.shared(self.baseline) + self._refinement.shared
+        pixel, variance = self._pixel[chosen[fine], -1], variance[fine] + shared * depth**4
+        return Landmarks(pixel, depth, variance, tracked, none, self.pose_error, shared, lag=self.lag)
 
     def shared(self, baseline: float) -> float:
         """Variance of the inverse-depth error that wrong poses cause in all points over a baseline [m] [1/m^2].

@@ -15,7 +15,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.frame import LARGEST, FrameInput
 from ufmstar_torch.gaussians.camera import rotation_deviation
 from ufmstar_torch.gaussians.mixture import GaussianMixture
-from ufmstar_torch.posterior import conformal, running
+from ufmstar_torch.posterior import running
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ class UfMStarState:
         """The empty state of ``streams`` independent streams.
 
         With ``config.anchors``: ``evidence`` [B, K, 3] and ``overall_evidence`` [B, 3], sums over anchors by component
-        and of the stream. With ``config.confidence``: ``confidence`` [B, S]. With ``config.posterior``, in float64:
-        ``posterior`` [B, S], the memory of a stream (``running``), and ``intervals`` [B, 4] (``conformal``).
+        and of the stream. With ``config.confidence``: ``confidence`` [B, S]. With ``config.posterior``: ``posterior``
+        [B, S] float64, the memory of a stream (``running``).
         """
         capacity = min(config.initial_capacity, config.max_components or config.initial_capacity)
         mixture = GaussianMixture.empty(streams, capacity, features=config.entries, dtype=dtype, device=device)
@@ -73,8 +73,7 @@ class UfMStarState:
             size = confidence.size(config.confidence)
             by_stream["confidence"] = torch.zeros(streams, size, dtype=dtype, device=device)
         if config.posterior is not None:
-            for name, size in (("posterior", running.SIZE), ("intervals", conformal.SIZE)):
-                by_stream[name] = torch.zeros(streams, size, dtype=torch.float64, device=device)
+            by_stream["posterior"] = torch.zeros(streams, running.SIZE, dtype=torch.float64, device=device)
         return cls(
             **components,
             T_world_first=torch.eye(4, dtype=torch.float64, device=device).repeat(streams, 1, 1),
@@ -166,7 +165,6 @@ class UfMStarState:
             confidence.require(tensors["confidence"], config.confidence)
         if config.posterior is not None:
             running.require(tensors["posterior"])
-            conformal.require(tensors["intervals"])
 
     def tensors(self) -> dict[str, Tensor]:
         """The tensors by name, without copying."""
@@ -195,4 +193,4 @@ class UfMStarState:
 # Names of the tensors without anchors, in order.
 NAMES = tuple(f.name for f in fields(UfMStarState) if f.name not in ("by_component", "by_stream"))
 # Names of the tensors that stay float64 when the module is converted.
-ALWAYS_FLOAT64 = ("T_world_first", "posterior", "intervals")
+ALWAYS_FLOAT64 = ("T_world_first", "posterior")

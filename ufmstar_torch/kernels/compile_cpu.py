@@ -190,7 +190,7 @@ def code_stamp(function: Callable[..., Any]) -> str:
         if isinstance(value, FunctionType):
             if value not in seen:
                 seen.add(value)
-                add(_COMPILED_WITH.get(value))
+                add((_COMPILED_WITH.get(value), value.__module__))  # a cached kernel names the modules of its parts
                 cells = [cell.cell_contents for cell in value.__closure__ or ()]
                 names = {**value.__globals__, **dict(zip(value.__code__.co_freevars, cells, strict=True))}
                 visit_code(value.__code__, names, value.__code__.co_consts[0] if value.__doc__ else None)
@@ -312,9 +312,10 @@ leaf = _inner(_nrt=False)
 # A leaf with fused multiply-add where the processor has it: one rounding less.
 contracted = _inner(_nrt=False, fastmath={"contract"})
 
-# A kernel and a leaf whose sums may be reordered, so that they are vectorised.
+# A kernel, a part and a leaf whose sums may be reordered, so that they are vectorised.
 _ANY_ORDER = {"reassoc", "contract", "nsz"}
 reordered = cached(fastmath=_ANY_ORDER)
+reordered_part = _inner(fastmath=_ANY_ORDER)
 reordered_leaf = _inner(_nrt=False, fastmath=_ANY_ORDER)
 
 

@@ -1,4 +1,5 @@
-"""Means of pixels in cells, and interpolation from nodes to pixels, without smoothing across depth edges (numba)."""
+"""Means of pixels in cells, sums in windows around nodes, and interpolation from nodes to pixels, without smoothing
+across depth edges (numba)."""
 
 from __future__ import annotations
 
@@ -81,25 +82,74 @@ def _vary(f, rows, cols, out):
 
 
 @part
-def interpolate(depth, valid, logs, claimed, nodes, coefficients, grid, config, y, variance, inlier, outlier):
+def windows_around(scene, rows, width):
+    """[k, n] sums of ``rows`` [k, N] over the anchors of a scene in a Gaussian window around every node of standard
+    deviation ``width`` [image widths]."""
+    grid, node, layers = scene.grid, scene.observed.node, rows.shape[0]
+    out = empty((layers, grid.log_depth.size), np.float64)
+    windows = empty((grid.rows, grid.rows), np.float64), empty((grid.cols, grid.cols), np.float64)
+    work = empty((grid.rows, grid.cols), np.float64), empty(grid.cols, np.float64)
+    for layer in range(layers):
+        for i in range(out.shape[1]):
+            out[layer, i] = 0.0
+        for k in range(node.size):
+            out[layer, node[k]] += rows[layer, k]
+    _blur(out, windows[0], windows[1], work[0], work[1], width)
+    return out
+
+
+@reordered_leaf
+def _blur(cells, row_window, col_window, across, line, width):
+    """Replace sums over cells [k, R C] by those in Gaussian windows around every cell."""
+    rows, cols = across.shape
+    for window in (row_window, col_window):
+        n = window.shape[0]
+        for distance in range(n):
+            weight = math.exp(-((distance / n / width) ** 2) / 2)
+            for i in range(n - distance):
+                window[i, i + distance] = window[i + distance, i] = weight
+    for layer in range(cells.shape[0]):
+        for i in range(rows):
+            for c in range(cols):
+                line[c] = 0.0
+            for j in range(cols):
+                value = cells[layer, i * cols + j]
+                if value != 0:  # most cells have no anchor
+                    for c in range(cols):
+                        line[c] += value * col_window[j, c]
+            for c in range(cols):
+                across[i, c] = line[c]
+        for i in range(rows):
+            for c in range(cols):
+                line[c] = 0.0
+            for j in range(rows):
+                weight = row_window[i, j]
+                for c in range(cols):
+                    line[c] += weight * across[j, c]
+            for c in range(cols):
+                cells[layer, i * cols + c] = line[c]
+
+
+@part
+def interpolate(maps, nodes, coefficients, grid, config, outputs):
     """Write y, the two variances and the probability of another surface at every pixel [H, W].
 
     The four nodes around a pixel have their bilinear weights times 1/(1 + (D/edge_contrast)^2); D is the difference
     between the pixel's log d and the node's.
 
     Args:
-        depth: [H, W] d [m].
-        valid: [H, W].
-        logs: [H, W] log d.
-        claimed: [H, W] UfM*'s variance [m^2]; its product with the share without evidence is a lower limit.
+        maps: depth d [m]; valid; log d; and UfM*'s variance [m^2], whose product with the share without evidence is a
+            lower limit [H, W].
         nodes: [6, n] log d, y - b . x, variance over the squared depth, the same on the evidence's surface, probability
             of another surface, and share without evidence.
         coefficients: [4] of 1, log d - m_0, u, v.
         grid: of the nodes.
         config: of the posterior.
-        y, outlier: y and the probability, NaN where not valid.
-        variance, inlier: variance of the depth d e^y over e^2y [m^2], and that on the surface of the evidence.
+        outputs: [H, W], written: y, NaN where not valid; variance of the depth d e^y over e^2y [m^2]; the probability,
+            NaN where not valid; and the variance on the surface of the evidence.
     """
+    depth, valid, logs, claimed = maps
+    y, variance, outlier, inlier = outputs
     b, rows, cols, width = coefficients, grid.rows, grid.cols, depth.shape[1]
     left, right = empty((rows, 6, width), np.float64), empty((rows, 6, width), np.float64)
     across, base = empty(width, np.float64), empty(width, np.float64)

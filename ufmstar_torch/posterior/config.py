@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import functools
-from collections import namedtuple
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
+
+import numpy as np
 
 from ufmstar_torch.runtime.checked import Checked, number
 
@@ -97,13 +98,11 @@ class PosteriorConfig(Checked):
         return (self.prior_sigma**2, self.slope_sigma**2, self.tilt_sigma**2, self.tilt_sigma**2)
 
 
-if TYPE_CHECKING:
-    Constants = Any
-else:
-    Constants = namedtuple("Constants", PosteriorConfig.__annotations__)
+# A pointer to the numbers: compiled code with an argument for each of them would take longer to compile.
+_RECORD = np.dtype((np.record, [(name, np.float64) for name in PosteriorConfig.__annotations__]))
 
 
 @functools.lru_cache(maxsize=4)  # a posterior has the same config in every frame
 def constants(config: PosteriorConfig) -> Any:
     """The settings and constants of a config as numbers by name, for compiled code."""
-    return Constants(*(float(getattr(config, name)) for name in PosteriorConfig.__annotations__))
+    return np.array(tuple(float(getattr(config, name)) for name in _RECORD.names), _RECORD)[()]

@@ -11,13 +11,15 @@ z(x) = Phi^-1(F(x)) is standard normal where the mixture is right. ``conformal``
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import torch
 from torch import Tensor
 from torch.special import ndtr, ndtri
 
-from ufmstar_torch.posterior.conformal import corrected, uncorrected
-
+LEVELS: Final = (0.5, 0.9, 0.99)
+# |z| of the normal distribution at the levels.
+NORMAL: Final = (0.6744897501960817, 1.6448536269514722, 2.5758293035489004)
 # [m^2] of a component: a variance of 0 has no density.
 LEAST_VARIANCE = 1e-12
 # Least distance of F from 0 and 1 [1]: z stays finite in float64.
@@ -34,7 +36,7 @@ class DepthDistribution:
         weight: [C, B, ...] of the components; their sum is 1. NaN where there is no depth.
         mean: [C, B, ...] [m].
         variance: [C, B, ...] [m^2], positive.
-        quantiles: [B, 3] |z| at the levels of ``conformal.LEVELS``, increasing; NaN = no evidence.
+        quantiles: [B, 3] |z| at the ``LEVELS``, increasing; NaN = no evidence.
     """
 
     weight: Tensor
@@ -89,3 +91,37 @@ def _conditional(distribution: DepthDistribution, depth: Tensor) -> Tensor:
     """F [B, ...]."""
     at_zero = distribution._sum(torch.zeros_like(depth))
     return (distribution._sum(depth) - at_zero) / (1 - at_zero)
+
+
+def normal_where_missing(quantiles: Tensor | None, variance: Tensor) -> Tensor:
+    """[B, 3] the quantiles, the normal distribution's where they are NaN or None; ``variance``: [B, ...]."""
+    if quantiles is None:
+        return variance.new_tensor(NORMAL).expand(len(variance), len(NORMAL))
+    return torch.where(quantiles.isnan(), quantiles.new_tensor(NORMAL), quantiles)
+
+
+def corrected(size: Tensor, quantiles: Tensor) -> Tensor:
+    """|z| of the normal distribution for |z| = ``size`` [B, ...]: linear between 0 and the ``quantiles`` [3, B, ...],
+    proportional beyond the last."""
+    return _linear(size, quantiles, _normal(quantiles))
+
+
+def uncorrected(size: Tensor, quantiles: Tensor) -> Tensor:
+    """Inverse of :func:`corrected`."""
+    return _linear(size, _normal(quantiles), quantiles)
+
+
+def _normal(quantiles: Tensor) -> Tensor:
+    """``NORMAL`` in the shape of ``quantiles`` [3, B, ...]."""
+    return quantiles.new_tensor(NORMAL).view(-1, *[1] * (quantiles.dim() - 1)).expand_as(quantiles)
+
+
+def _linear(x: Tensor, start: Tensor, end: Tensor) -> Tensor:
+    """The increasing function with the value 0 at 0 and ``end`` at ``start`` [3, B, ...]: linear between, proportional
+    beyond. NaN where ``end`` or ``start`` is."""
+    result, left, bottom = x * (end[-1] / start[-1]), torch.zeros_like(start[0]), torch.zeros_like(end[0])
+    for right, top in zip(start, end, strict=True):
+        share = (x - left) / (right - left).clamp_min(1e-12)  # two quantiles may be equal
+        result = torch.where((x >= left) & (x <= right), bottom + share * (top - bottom), result)
+        left, bottom = right, top
+    return result + 0 * (start + end).sum(0)

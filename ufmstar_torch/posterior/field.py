@@ -6,11 +6,11 @@ with the features x and the field f of precision Q: f^T Q f = kappa |f|^2 + sum 
 the link. An observation of variance 1/w at node i adds w to Q_ii. A Schur complement integrates b out. The only large
 system is that of the nodes.
 
-A Cholesky factorisation (float64) solves it in a window of 32 nodes. With C columns, the precision matrix has
-the bandwidth C, and elimination fills only the band. The window of C + 1 nodes
-is a full matrix, which nodes enter and leave in order. A backward pass over the factor gives the covariance within the
-window (Takahashi's equations), and with it all marginal variances. Node i has the slot i mod 32, so that every loop has
-one fixed length.
+A Cholesky factorisation (float64) solves it in the band: with C columns, the precision matrix and its factor have the
+bandwidth C. Each row of the factor is that of the matrix less multiples of the C rows before, and has the matrix's
+diagonal first. A backward pass over the factor gives the covariance within a window of 32 nodes (Takahashi's
+equations), and with it all marginal variances; node i has the slot i mod 32. Both passes are vector instructions, since
+LLVM would keep the sums over earlier rows in memory.
 """
 
 from __future__ import annotations
@@ -21,13 +21,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.kernels.compile_cpu import empty, leaf, part, reordered_leaf
+from ufmstar_torch.kernels.compile_cpu import empty, leaf, part
+from ufmstar_torch.kernels.cpu.vectors import Lanes, vectors
 from ufmstar_torch.posterior.running import Floats
 
 WINDOW = 32
-# Number of right-hand sides: features, y, and zeros up to a multiple of four.
+# Number of right-hand sides: features, y, and zeros up to a vector of 64 bytes.
 RIGHT = 8
-_WIDTH = WINDOW + RIGHT
+# Numbers in a row of the factor: the band, a vector of zeros, and the right-hand sides. Numbers in a row of the window.
+_ROW, _WIDTH = WINDOW + 2 * RIGHT, WINDOW + RIGHT
 
 
 class Field(NamedTuple):
@@ -195,89 +197,114 @@ def solve(diagonal, right, down, columns, cols):
         X [n, RIGHT], and the diagonal of A^-1 [n].
     """
     n = diagonal.size
-    factor, window, row = empty((n, _WIDTH), np.float64), empty((WINDOW, _WIDTH), np.float64), empty(_WIDTH, np.float64)
+    factor, window, work = (
+        empty((cols + n, _ROW), np.float64), empty((WINDOW, _WIDTH), np.float64), empty(8 + 2 * WINDOW, np.float64),
+    )  # fmt: skip
     solved, variance = empty((n, RIGHT), np.float64), empty(n, np.float64)
-    _eliminate(diagonal, right, down, columns, cols, window, factor)
-    _covariances(factor, window, row, solved, variance)
+    _eliminate(diagonal, right, down, columns, cols, factor)
+    _covariances(factor, cols, window, work, solved, variance)
     return solved, variance
 
 
-@reordered_leaf
-def _eliminate(diagonal, right, down, columns, cols, window, factor):
-    """Write the factor [n, 40]: row j has the window's nodes at their slots, then the right-hand sides."""
-    n = diagonal.size
-    _clear(window)
-    for j in range(-cols, n):
-        if j + cols < n:
-            _enter(window, j + cols, diagonal, right, down, columns, cols)
-        if j < 0:
-            continue
-        slot, row = j % WINDOW, factor[j]
-        scale = 1 / math.sqrt(window[slot, slot])
-        for c in range(_WIDTH):
-            row[c] = window[slot, c] * scale
-        for k in range(WINDOW):
-            other, multiple = window[k], row[k]
-            for c in range(len(row)):  # the compiler would unroll a constant length instead of vectorising
-                other[c] -= multiple * row[c]
-        for k in range(WINDOW):
-            window[k, slot] = 0.0
-        for c in range(_WIDTH):
-            window[slot, c] = 0.0
+@leaf
+def _eliminate(diagonal, right, down, columns, cols, factor):
+    """Write the factor [C + n, 48]: zeros, then for each node the diagonal, the following nodes of the band, zeros from
+    the 33rd number on, and the right-hand sides."""
+    for i in range(factor.shape[0]):
+        for c in range(_ROW):
+            factor[i, c] = 0.0
+    one, two, three, four = min(cols, 8), min(max(cols - 8, 0), 8), min(max(cols - 16, 0), 8), max(cols - 24, 0)
+    for i in range(diagonal.size):
+        row, total = factor[cols + i], diagonal[i]
+        total += right[i - 1] if i % cols else 0.0
+        total += down[i - cols] if i >= cols else 0.0
+        if (i + 1) % cols:
+            total += right[i]
+            row[1] -= right[i]
+        if i + cols < diagonal.size:
+            total += down[i]
+            row[cols] -= down[i]
+        row[0] = total
+        for c in range(RIGHT):
+            row[_ROW - RIGHT + c] = columns[i, c]
+        _subtract(factor, (cols + i) * _ROW, cols, one, two, three, four)
+        scale = 1 / math.sqrt(row[0])
+        for c in range(_ROW):
+            row[c] *= scale
+
+
+@vectors
+def _subtract(code, factor, at, cols, one, two, three, four):
+    """Subtract multiples of the ``cols`` rows before the row at the index ``at`` from it, the farthest first. The row k
+    before has the multiple in its column k, and zeros beyond column ``cols``: of the farthest ``one`` rows, a vector
+    remains, of the next ``two``, two vectors remain, and so on."""
+    band, answers = [factor.load(at, 8 * v) for v in range(4)], factor.load(at, _ROW - RIGHT)
+    farthest = code.plus(at, code.times(cols, 1 - _ROW)), code.plus(at, code.times(cols, -_ROW))
+    for before, rows in enumerate((one, two, three, four)):
+        sums = [code.variable(answers * 0.0) for _ in range(before + 2)]
+        with code.loop(rows) as t:
+            column, row = (
+                code.plus(start, code.times(t, step)) for start, step in zip(farthest, (_ROW - 1, _ROW), strict=True)
+            )
+            multiple = factor.one(column, 8 * before * (_ROW - 1))
+            for v in range(before + 1):
+                part_of_row = factor.load(column, 8 * before * (_ROW - 1) + 8 * v)
+                sums[v].value = sums[v].value + multiple * part_of_row
+            sums[-1].value = sums[-1].value + multiple * factor.load(row, 8 * before * _ROW + _ROW - RIGHT)
+        band = [value - sums[v].value if v <= before else value for v, value in enumerate(band)]
+        answers = answers - sums[-1].value
+    for v, value in enumerate(band):
+        factor.store(value, at, 8 * v)
+    factor.store(answers, at, _ROW - RIGHT)
 
 
 @leaf
-def _clear(window):
+def _covariances(factor, cols, window, work, solved, variance):
+    """Backward pass over the factor, whose diagonal is overwritten: the solutions and marginal variances."""
     for k in range(WINDOW):
         for c in range(_WIDTH):
             window[k, c] = 0.0
-
-
-@leaf
-def _enter(window, i, diagonal, right, down, columns, cols):
-    """Enter node i with its links to earlier nodes at a slot that is 0."""
-    slot, n = i % WINDOW, diagonal.size
-    total = diagonal[i]
-    if (i + 1) % cols:
-        total += right[i]
-    if i + cols < n:
-        total += down[i]
-    if i % cols:
-        total += right[i - 1]
-        window[slot, (i - 1) % WINDOW] -= right[i - 1]
-        window[(i - 1) % WINDOW, slot] -= right[i - 1]
-    if i >= cols:
-        total += down[i - cols]
-        window[slot, (i - cols) % WINDOW] -= down[i - cols]
-        window[(i - cols) % WINDOW, slot] -= down[i - cols]
-    window[slot, slot] += total
-    for c in range(RIGHT):
-        window[slot, WINDOW + c] = columns[i, c]
-
-
-@reordered_leaf
-def _covariances(factor, window, out, solved, variance):
-    """Backward pass over the factor, whose diagonal is overwritten: the solutions and marginal variances."""
-    _clear(window)
-    for j in range(len(factor) - 1, -1, -1):
-        slot, row = j % WINDOW, factor[j]
-        scale = 1 / row[slot]
-        row[slot] = 0.0
-        for c in range(_WIDTH):
-            out[c] = 0.0
-        for k in range(0, WINDOW, 4):
-            one, two, three, four = row[k], row[k + 1], row[k + 2], row[k + 3]
-            for c in range(_WIDTH):
-                first = one * window[k, c] + two * window[k + 1, c]
-                out[c] += first + three * window[k + 2, c] + four * window[k + 3, c]
-        total = 1.0
+    for j in range(variance.size - 1, -1, -1):
+        row, slot = factor[cols + j], j % WINDOW
+        scale = work[0] = 1 / row[0]
+        row[0] = 0.0
+        later = min(cols, WINDOW - 1 - slot)
+        _combine(factor, (cols + j) * _ROW, window, slot, later, cols - later, solved, j, work)
         for c in range(WINDOW):
-            total += out[c] * row[c]
-            window[slot, c] = -scale * out[c]
-            window[c, slot] = -scale * out[c]
-        variance[j] = window[slot, slot] = scale * scale * total
-        for c in range(RIGHT):
-            solved[j, c] = window[slot, WINDOW + c] = scale * (row[WINDOW + c] - out[WINDOW + c])
+            window[c, slot] = window[slot, c]
+        variance[j] = window[slot, slot] = scale * scale - scale * work[1]
+
+
+@vectors
+def _combine(code, factor, at, window, slot, later, wrapped, solved, j, work):
+    """Write the covariances of node j with the window, its solution, and the sum of its covariances weighted by its row
+    of the factor, from this row at the index ``at``. The ``later`` next nodes have the slots after the node's, the
+    ``wrapped`` ones after them those from 0 on.
+
+    ``work`` has 1 over the factor's diagonal; the sum becomes its second number, and the covariances its last 64.
+    """
+    zero, scale = work.one(0) * 0.0, work.one(0)
+    sums, line = [code.variable(zero) for _ in range(5)], code.times(slot, _WIDTH)
+    for count, first, offset, column in (
+        (later, line, _WIDTH, at),
+        (wrapped, code.times(slot, 0), 0, code.plus(at, later)),
+    ):
+        with code.loop(count) as t:
+            multiple, other = factor.one(code.plus(column, t), 1), code.plus(first, code.times(t, _WIDTH))
+            for v, total in enumerate(sums):
+                total.value = total.value + multiple * window.load(other, offset + 8 * v)
+    for v, total in enumerate(sums[:4]):
+        covariance = zero - scale * total.value
+        window.store(covariance, line, 8 * v)
+        work.store(covariance, 8 + 8 * v)
+        work.store(covariance, 40 + 8 * v)
+    solution = scale * (factor.load(at, _ROW - RIGHT) - sums[4].value)
+    window.store(solution, line, WINDOW)
+    solved.store(solution, code.times(j, RIGHT))
+    product = zero
+    for v in range(4):
+        product = product + factor.load(at, 8 * v) * work.load(slot, 8 + 8 * v)
+    work.put(product.everywhere(Lanes.__add__), 1)
 
 
 @part

@@ -86,7 +86,7 @@ def _add_neighbours(scene, left_out, ratios, config, sums):
         variance, residual = left_out.total[k], left_out.residual[k]
         excess = min(residual * residual, config.clip * variance) - variance
         for ratio, value, term in (
-            (ROUGHNESS, ratios.roughness, ratios.roughness), (NOISE, ratios.noise, scene.stated[k]),
+            (ROUGHNESS, ratios[ROUGHNESS], ratios[ROUGHNESS]), (NOISE, ratios[NOISE], scene.stated[k]),
         ):  # fmt: skip
             w = (term / variance) ** 2 / count[scene.observed.node[k]]
             _add(sums, ratio, w * (term + excess) * value / max(term, 1e-12), w)
@@ -120,13 +120,13 @@ def _add_discs(scene, weight, left_out, ratios, rest, held_out, config, sums):
         noise, away, scale, believed = scene.noise[k], distances[i], scales[i], scene.believed[k] / max(area[i], 1e-12)
         node[m], scores[1, m], scores[2, m] = i, away, believed
         values[0, m], values[1, m], values[2, m], values[3, m] = error, variance, away, noise
-        unseen = away * ratios.unseen
+        unseen = away * ratios[UNSEEN]
         wide, factor = elsewhere_variance(config, around[i], unseen), inlier_factor(config, ratios, away)
         inlier, more_wrong = (
             scale * (factor * (variance + noise + unseen) + steep[i]),
             wrong_factor(config, away, scale),
         )
-        p = min(ratios.wrong * more_wrong, MOST_WRONG)
+        p = min(ratios[WRONG] * more_wrong, MOST_WRONG)
         z2 = error * error / inlier - (error + offset) ** 2 / (noise + wide)
         # infinite odds of the evidence's surface make 0
         elsewhere = 1 / (1 + math.exp(-math.log(p / (1 - p)) - (math.log(inlier / (noise + wide)) + z2) / 2))
@@ -136,7 +136,7 @@ def _add_discs(scene, weight, left_out, ratios, rest, held_out, config, sums):
         _add(sums, CALIBRATION, believed * error * error / stated, believed)
         # At a pixel there is neither an anchor's blur nor its part in ``alone``, only the noise of its measurement.
         measured = scene.stated[k] - config.alone / weight.size
-        at_pixel = at_pixels(config, factor, variance, ratios.roughness, unseen, steep[i], 0.0)
+        at_pixel = at_pixels(config, factor, variance, ratios[ROUGHNESS], unseen, steep[i], 0.0)
         moment, inlier = second_moments(config, scale * (at_pixel + measured), p, offset, wide + measured)
         scores[0, m] = below(math.exp(error), p, moment, inlier)
         m += 1
@@ -175,7 +175,7 @@ def _add_pairs(grid, node, values, ratios, sums):
                 alone[i] = alone[other] = False
                 pairs += 1
                 variance, away = (means[1, i] + means[1, other]) / 2, (means[2, i] + means[2, other]) / 2
-                covariance = max(variance - APART * ratios.amplitude * link / 2, 0.0)
+                covariance = max(variance - APART * ratios[AMPLITUDE] * link / 2, 0.0)
                 noise = (means[3, i] + means[3, other]) / 2
                 _add_product(means[0, i] * means[0, other], covariance, variance, noise, away, 1.0, ratios, sums)
     for i in range(n):
@@ -193,7 +193,7 @@ def _add_pairs(grid, node, values, ratios, sums):
 def _add_product(product, expected, variance, noise, away, share, ratios, sums):
     """Add a product of errors whose ``expected`` value holds without the error's growth with the distance."""
     weight = share / max(variance + noise, 1e-12)
-    _add(sums, AMPLITUDE, weight * product, weight * expected / ratios.amplitude)
+    _add(sums, AMPLITUDE, weight * product, weight * expected / ratios[AMPLITUDE])
     _add(sums, UNSEEN, share * away * (product - expected), share * away * away)
 
 

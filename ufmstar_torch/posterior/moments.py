@@ -83,16 +83,20 @@ def divide(variance, inlier, p):
     n, ordered = inlier.size, empty(inlier.size, np.float64)
     for i in range(n):
         ordered[i] = inlier[i]
-    position = _TYPICAL * (n - 1)
-    lower = int(position)
-    quantile = smallest(ordered, n, lower)
-    upper = np.inf  # the next value: the smaller ones were sorted to the left
-    for i in range(lower + 1, n):
-        upper = min(upper, ordered[i])
-    if position > lower:
-        quantile += (position - lower) * (upper - quantile)
+    most = quantile(ordered, _TYPICAL)
     for i in range(n):
         elsewhere = max((variance[i] - (1 - p[i]) * inlier[i]) / max(p[i], 1e-12), inlier[i])
-        inlier[i] = min(inlier[i], quantile)
+        inlier[i] = min(inlier[i], most)
         excess = max(elsewhere, _APART * inlier[i]) - inlier[i]
         p[i] = max(p[i], min(max((variance[i] - inlier[i]) / max(excess, 1e-12), 0.0), 1.0))
+
+
+@leaf
+def quantile(values, share):
+    """The quantile of values [n], as ``np.quantile``; reorders them."""
+    n, position = values.size, share * (values.size - 1)
+    lower = int(position)
+    value, upper = smallest(values, n, lower), np.inf
+    for i in range(lower + 1, n):  # the next value: the smaller ones were sorted to the left
+        upper = min(upper, values[i])
+    return value + (position - lower) * (upper - value) if position > lower else value

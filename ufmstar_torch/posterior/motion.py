@@ -41,10 +41,10 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import reordered
-from ufmstar_torch.posterior.config import PosteriorConfig
-from ufmstar_torch.posterior.running import Floats, Running
-from ufmstar_torch.posterior.scene import AnchorRows, Scene
+from ufmstar_torch.kernels.compile_cpu import empty, leaf, part, reordered_leaf
+from ufmstar_torch.posterior.moments import quantile
+from ufmstar_torch.posterior.running import BETWEEN, CENTRE, after_frame
+from ufmstar_torch.posterior.scene import AnchorRows, node_of
 
 # Standard deviation of log depth that motion adds; probability that motion that passes all tests looks nearer.
 _MOVING, _NEARER = 0.8, 0.05
@@ -52,40 +52,55 @@ _MOVING, _NEARER = 0.8, 0.05
 _PRIOR, _PASSING, _WEIGHT, _CERTAIN = -1.57, 0.12, 1.06, 0.15
 # Window of the mean: standard deviation and half width [nodes], and difference of log d at which a weight is halved.
 _SIGMA, _HALF, _CONTRAST = 1.5, 3, 0.3
+_WIDE = 2 * _HALF + 1
 # Number of nodes that count as one surface in the choice of c, and as one anchor in the estimate of s.
 _SURFACE, _ANCHOR = 40.0, 8.0
 # Largest |y - c| of evidence over s, the 99 % quantile of |t_2|; and the log ratio of motion where all is beyond.
 _FARTHEST, _BEYOND = 9.92, 50.0
-# Standard deviation of c about its running mean; number of first candidates, and of iterations.
-_CHANGE, _CANDIDATES, _ITERATIONS = 0.15, 33, 8
+# Standard deviation of c about its running mean; number of first candidates, the lowest of them as a quantile, and
+# number of iterations.
+_CHANGE, _CANDIDATES, _LOWEST, _ITERATIONS = 0.15, 33, 0.02, 8
+_LARGE = 1e100  # limit of a product: a further factor stays in range
 
 
-def plausible(
-    anchors: AnchorRows, running: Running, image: tuple[int, ...], size: tuple[int, int], config: PosteriorConfig
-) -> tuple[AnchorRows, Floats]:
+@part
+def plausible(anchors, frames, ratios, size, grid, config):
     """The anchors whose ratio a surface that stands still may have, and [R C] the share of the others at every node.
 
     Args:
-        anchors: of the frame.
-        running: up to the frame before.
-        image: H and W of the depth map.
-        size: R and C of the nodes.
+        anchors: :class:`~ufmstar_torch.posterior.scene.AnchorRows`.
+        frames: number of frames with anchors before.
+        ratios: up to the frame before.
+        size: H and W.
+        grid: of the frame.
         config: of the posterior.
     """
-    c, limit = running.ratios.centre, max(_FARTHEST * math.sqrt(running.ratios.between), math.log(config.farthest))
-    far = anchors.valid & (np.abs(np.log(anchors.depth / anchors.predicted) - c) > limit)
-    if not running.frames or 2 * far.sum() > anchors.valid.sum():
-        return anchors, np.zeros(size[0] * size[1])
-    cell = (anchors.pixel + 0.5) * (size[1], size[0]) // (image[1], image[0])
-    node = cell.clip(0, (size[1] - 1, size[0] - 1)).astype(np.int64) @ (1, size[1])
-    count, beyond = (np.bincount(node, mask, size[0] * size[1]) for mask in (anchors.valid, far))
-    return anchors._replace(valid=anchors.valid & ~far), beyond / np.maximum(count, 1)
+    valid, n, far, total = empty(anchors.valid.size, np.bool_), grid.log_depth.size, 0, 0
+    beyond, count = empty(n, np.float64), empty(n, np.float64)
+    for i in range(n):
+        beyond[i] = count[i] = 0.0
+    limit = max(_FARTHEST * math.sqrt(ratios[BETWEEN]), math.log(config.farthest))
+    for k in range(valid.size):
+        y = math.log(anchors.depth[k] / anchors.predicted[k])
+        valid[k] = anchors.valid[k] and abs(y - ratios[CENTRE]) <= limit
+        total += anchors.valid[k]
+        far += anchors.valid[k] and not valid[k]
+    if frames == 0 or 2 * far > total:
+        return anchors, beyond
+    for k in range(valid.size):
+        if anchors.valid[k]:
+            i = node_of((anchors.pixel[k, 0] + 0.5) / size[1], (anchors.pixel[k, 1] + 0.5) / size[0], grid)
+            count[i] += 1
+            beyond[i] += not valid[k]
+    for i in range(n):
+        beyond[i] /= max(count[i], 1.0)
+    rows = AnchorRows(anchors.pixel, anchors.at_pixel, anchors.predicted, anchors.depth, anchors.variance, valid)
+    return rows, beyond
 
 
-def surfaces(
-    scene: Scene, b: Floats, running: Running, config: PosteriorConfig
-) -> tuple[float, dict[str, tuple[float, float]]]:
-    """The constant c of a frame, and the sums for the ratios "centre" and "between" (``running``).
+@part
+def surfaces(scene, b, memory, priors, ratios, config, sums):
+    """The constant c of a frame; writes the sums [2, R] for the ratios "centre" and "between" (``running``).
 
     Each iteration computes c for s by a step of iterated reweighting, and s for c. The first starts at the most
     probable of some quantiles of y - b_u u - b_v v.
@@ -93,65 +108,118 @@ def surfaces(
     Args:
         scene: of the frame.
         b: [4] coefficients of the frame.
-        running: up to the frame before.
+        memory, priors, ratios: up to the frame before.
         config: of the posterior.
+        sums: changed.
     """
-    observed, nu, s2 = scene.observed, config.degrees_of_freedom, running.ratios.between
-    mean, variance = running.ratios.centre, _CHANGE**2 if running.frames else config.prior_sigma**2
-    weights = np.bincount(observed.node, 1 / scene.noise, len(scene.grid.log_depth))
-    seen = np.flatnonzero(weights)
-    if not len(seen):
-        return mean, {"centre": (0.0, 0.0), "between": (0.0, 0.0)}
-    weighted = (observed.value - in_image(observed.features, b)) / scene.noise
-    y = np.bincount(observed.node, weighted, len(weights))[seen] / weights[seen]
-    candidates, count = np.append(_quantiles(y), mean), len(y) / _ANCHOR
-    loss = (nu + 1) / 2 * np.log1p((y[:, None] - candidates) ** 2 / s2 / nu).sum(0) / _SURFACE
-    c, square = float(candidates[(loss + (candidates - mean) ** 2 / variance / 2).argmin()]), 0.0
+    nu, s2, mean = config.degrees_of_freedom, ratios[BETWEEN], ratios[CENTRE]
+    variance = _CHANGE**2 if memory.frames[0] > 0 else config.prior_sigma**2
+    y = _at_nodes(scene, b)
+    if not y.size:
+        return mean
+    c, count, square = _first(y, mean, variance, s2, nu), y.size / _ANCHOR, 0.0
     for _ in range(_ITERATIONS):
-        weight = (nu + 1) / (nu + (y - c) ** 2 / s2)
-        precision = weight / s2 / _SURFACE
-        c = float((precision @ y + mean / variance) / (precision.sum() + 1 / variance))
-        square = float((weight * (y - c) ** 2).mean())
-        s2 = running.after("between", square * count, count, config)
-    return c, {"centre": (c * count, count), "between": (square * count, count)}
+        total, precision, squares = 0.0, 0.0, 0.0
+        for i in range(y.size):
+            share = (nu + 1) / (nu + (y[i] - c) ** 2 / s2) / s2 / _SURFACE
+            precision += share
+            total += share * y[i]
+        before = c
+        c = (total + mean / variance) / (precision + 1 / variance)
+        for i in range(y.size):
+            squares += (nu + 1) / (nu + (y[i] - before) ** 2 / s2) * (y[i] - c) ** 2
+        square = squares / y.size
+        above, below = after_frame(memory, priors, BETWEEN, square * count, count, config)
+        s2 = above / below
+    sums[0, CENTRE], sums[1, CENTRE] = c * count, count
+    sums[0, BETWEEN], sums[1, BETWEEN] = square * count, count
+    return c
 
 
-def _quantiles(y: Floats) -> Floats:
-    """Some quantiles of y [n], as ``np.quantile``, which takes ten times as long."""
-    return np.interp(np.linspace(0.02, 0.98, _CANDIDATES), np.linspace(0, 1, len(y)), np.sort(y))
+@part
+def _at_nodes(scene, b):
+    """[n] means of y - b_u u - b_v v at the nodes with anchors, weighted by 1/noise."""
+    observed, size = scene.observed, scene.grid.log_depth.size
+    total, weights, count = empty(size, np.float64), empty(size, np.float64), 0
+    for i in range(size):
+        total[i] = weights[i] = 0.0
+    for k in range(observed.node.size):
+        i, weight = observed.node[k], 1 / scene.noise[k]
+        count += weights[i] == 0
+        weights[i] += weight
+        total[i] += weight * (observed.value[k] - in_image(observed.features, k, b))
+    y, n = empty(count, np.float64), 0
+    for i in range(size):
+        if weights[i] > 0:
+            y[n] = total[i] / weights[i]
+            n += 1
+    return y
 
 
-def in_image(x: Floats, b: Floats) -> Floats:
-    """[N] b_u u + b_v v for features x [N, 4]."""
-    part: Floats = x[:, 2:] @ b[2:]
-    return part
+@part
+def _first(y, mean, variance, s2, nu):
+    """The most probable candidate for c: quantiles of y [n], and the running mean."""
+    ordered, best, least = empty(y.size, np.float64), mean, np.inf
+    for i in range(y.size):
+        ordered[i] = y[i]
+    for k in range(_CANDIDATES + 1):
+        c = mean
+        if k < _CANDIDATES:
+            c = quantile(ordered, _LOWEST + (1 - 2 * _LOWEST) * k / (_CANDIDATES - 1))
+        loss, product = 0.0, 1.0
+        for i in range(y.size):
+            product *= 1 + (y[i] - c) ** 2 / s2 / nu
+            if product > _LARGE:  # one logarithm for several factors
+                loss, product = loss + math.log(product), 1.0
+        loss = (nu + 1) / 2 / _SURFACE * (loss + math.log(product)) + (c - mean) ** 2 / variance / 2
+        if loss < least:
+            best, least = c, loss
+    return best
 
 
-def tests_at(motion: Floats, height: int, width: int, rows: int, cols: int) -> Floats:
+@leaf
+def in_image(x, k, b):
+    """b_u u + b_v v for the features ``x[k]``."""
+    return x[k, 2] * b[2] + x[k, 3] * b[3]
+
+
+@part
+def tests_at(motion, height, width, rows, cols):
     """[rows cols] log likelihood ratios of motion at the nodes of a map: means of the points ``motion`` [M, 3] (u, v,
     ratio) around them, with bilinear weights; 0 where there is none."""
-    finite = motion[np.isfinite(motion).all(1)]
-    sums, weights = np.zeros((2, rows, cols))
-    u, v = (finite[:, 0] + 0.5) / width * cols - 0.5, (finite[:, 1] + 0.5) / height * rows - 0.5
-    _spread(u, v, finite[:, 2], sums, weights)
-    mean: Floats = (sums / np.maximum(weights, 1e-9)).ravel()
-    return mean
+    sums, weights = empty(rows * cols, np.float64), empty(rows * cols, np.float64)
+    for i in range(sums.size):
+        sums[i] = weights[i] = 0.0
+    for k in range(motion.shape[0]):
+        u, v = (motion[k, 0] + 0.5) / width * cols - 0.5, (motion[k, 1] + 0.5) / height * rows - 0.5
+        if not _finite(motion, k):
+            continue
+        for i in range(max(int(v), 0), min(int(v) + 2, rows)):
+            for j in range(max(int(u), 0), min(int(u) + 2, cols)):
+                w = max(1 - abs(v - i), 0.0) * max(1 - abs(u - j), 0.0)
+                sums[i * cols + j] += w * motion[k, 2]
+                weights[i * cols + j] += w
+    for i in range(sums.size):
+        sums[i] /= max(weights[i], 1e-9)
+    return sums
 
 
-@reordered
-def _spread(u, v, value, sums, weights):
-    rows, cols = sums.shape
-    for k in range(len(value)):
-        for i in range(max(int(v[k]), 0), min(int(v[k]) + 2, rows)):
-            for j in range(max(int(u[k]), 0), min(int(u[k]) + 2, cols)):
-                w = max(1 - abs(v[k] - i), 0.0) * max(1 - abs(u[k] - j), 0.0)
-                sums[i, j] += w * value[k]
-                weights[i, j] += w
+@part
+def tested(motion):
+    """True if a point of ``motion`` [M, 3] has no NaN and no infinity."""
+    found = False
+    for k in range(motion.shape[0]):
+        found |= _finite(motion, k)
+    return found
 
 
-def probability(
-    e: Floats, log_depth: Floats, away: Floats, tests: Floats, beyond: Floats, between: float, size: tuple[int, int]
-) -> Floats:
+@leaf
+def _finite(motion, k):
+    return math.isfinite(motion[k, 0]) and math.isfinite(motion[k, 1]) and math.isfinite(motion[k, 2])
+
+
+@part
+def probability(e, log_depth, away, tests, beyond, between, rows, cols):
     """[n] probability P that the surface at a node moves.
 
     Args:
@@ -161,36 +229,41 @@ def probability(
         tests: [n] from :func:`tests_at`.
         beyond: [n] from :func:`plausible`.
         between: s^2, the squared scale of e over still surfaces.
-        size: R and C of the nodes.
+        rows, cols: R and C of the nodes.
     """
-    variance, square, near = between + _MOVING**2, e**2, np.maximum(1 - away, 0)
-    moving = -(square / variance + math.log(2 * math.pi * variance)) / 2
-    still = -1.5 * np.log1p(square / between / 2) - math.log(2 * math.sqrt(2 * between))
-    side = np.where(e > 0, math.log(2 * (1 - _NEARER)), math.log(2 * _NEARER))
-    means = np.zeros((2, *size))
-    ratio = (1 - beyond) * near * (moving - still) + beyond * _BEYOND
-    for value, mean in zip((ratio, near * side), means, strict=True):
-        _mean_around(value.reshape(size), log_depth.reshape(size), mean)
-    r, q = _WEIGHT * means.reshape(2, -1)
-    odds = _PRIOR + r + np.log(_PASSING * np.exp(q) + (1 - _PASSING) * np.exp(tests))
-    P: Floats = np.maximum(1 / (1 + np.exp(-odds.clip(-50, 50))) - _CERTAIN, 0) / (1 - _CERTAIN)
+    n, variance = e.size, between + _MOVING**2
+    values, means, window = empty((2, n), np.float64), empty((2, n), np.float64), empty((_WIDE, _WIDE), np.float64)
+    farther, nearer = math.log(2 * (1 - _NEARER)), math.log(2 * _NEARER)
+    for i in range(n):
+        square, near = e[i] * e[i], max(1 - away[i], 0.0)
+        moving = -(square / variance + math.log(2 * math.pi * variance)) / 2
+        still = -1.5 * math.log1p(square / between / 2) - math.log(2 * math.sqrt(2 * between))
+        values[0, i] = (1 - beyond[i]) * near * (moving - still) + beyond[i] * _BEYOND
+        values[1, i] = near * (farther if e[i] > 0 else nearer)
+    _means_around(values, log_depth, rows, cols, window, means)
+    P = empty(n, np.float64)
+    for i in range(n):
+        r, q = _WEIGHT * means[0, i], _WEIGHT * means[1, i]
+        odds = _PRIOR + r + math.log(_PASSING * math.exp(q) + (1 - _PASSING) * math.exp(tests[i]))
+        P[i] = max(1 / (1 + math.exp(-min(max(odds, -50.0), 50.0))) - _CERTAIN, 0.0) / (1 - _CERTAIN)
     return P
 
 
-@reordered
-def _mean_around(value, log_depth, out):
-    rows, cols = value.shape
-    window = np.empty((2 * _HALF + 1, 2 * _HALF + 1))
+@reordered_leaf
+def _means_around(values, log_depth, rows, cols, window, out):
+    """Write the means of two rows of values [2, n] around every node."""
     for i in range(-_HALF, _HALF + 1):
         for j in range(-_HALF, _HALF + 1):
             window[i + _HALF, j + _HALF] = math.exp(-(i * i + j * j) / (2 * _SIGMA * _SIGMA))
     for r in range(rows):
         for c in range(cols):
-            total = weights = 0.0
+            node, first, second, weights = r * cols + c, 0.0, 0.0, 0.0
             for i in range(max(r - _HALF, 0), min(r + _HALF + 1, rows)):
                 for j in range(max(c - _HALF, 0), min(c + _HALF + 1, cols)):
-                    jump = (log_depth[i, j] - log_depth[r, c]) / _CONTRAST
+                    other = i * cols + j
+                    jump = (log_depth[other] - log_depth[node]) / _CONTRAST
                     w = window[i - r + _HALF, j - c + _HALF] / (1 + jump * jump)
-                    total += w * value[i, j]
+                    first += w * values[0, other]
+                    second += w * values[1, other]
                     weights += w
-            out[r, c] = total / weights
+            out[0, node], out[1, node] = first / weights, second / weights

@@ -1,4 +1,5 @@
-"""The posterior's memory of a stream: sums with a half-life, the mean slopes, and the last frame's coefficients.
+"""The posterior's memory of a stream: sums with a half-life, the mean slopes, the last frame's coefficients, and the
+quantiles of errors at held-out anchors.
 
 Frames with anchors update these ratios:
 
@@ -19,39 +20,29 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ufmstar_torch.kernels.compile_cpu import empty, leaf, part
 from ufmstar_torch.posterior.config import PosteriorConfig
+from ufmstar_torch.posterior.distribution import LEVELS
 
 Floats = NDArray[np.float64]
 FEATURES = 4  # 1, log d - m_0, u and v from -1 to 1
 SLOPES = FEATURES - 1
 _MATRIX = FEATURES * FEATURES
+# Limits of the quantiles at held-out anchors over the normal ones.
+LEAST_FACTOR, LARGEST_FACTOR = 0.1, 10.0
 # Limits of stored values, beyond what any run reaches: of m_0, the log of the largest accepted depth
 # (``frame.DEPTH_RANGE``); of all values, which count anchors and frames or are squares of logs.
 LARGEST_LOG, LARGEST = 14.0, 1e9
 
 
-class Ratios(NamedTuple):
-    """The ratios by name; for each, a number or what belongs to it."""
-
-    amplitude: Any
-    roughness: Any
-    noise: Any
-    unseen: Any
-    wrong: Any
-    inlier: Any
-    between: Any
-    centre: Any
-    calibration: Any
-
-
-RATIOS = len(Ratios._fields)
+RATIOS = 9
 AMPLITUDE, ROUGHNESS, NOISE, UNSEEN, WRONG, INLIER, BETWEEN, CENTRE, CALIBRATION = range(RATIOS)
 
 
@@ -60,133 +51,187 @@ def priors(config: PosteriorConfig) -> Floats:
     """[4, R] value and weight [anchors] of each ratio's prior, and the limits of the ratio. The calibration has no
     prior."""
     weight = config.prior_weight
-    columns = Ratios(
-        amplitude=(1.0, weight, 0.1, 100.0),
-        roughness=(config.roughness**2, weight, 0.01**2, 0.2**2),
-        noise=(1.0, weight, 0.25, 16.0),
-        unseen=(config.unseen, weight, 0.0, 16.0),
-        wrong=(config.wrong, weight, config.wrong / 10, 10 * config.wrong),
-        inlier=(1.0, weight, 0.05, 4.0),
-        between=(config.between**2, weight, 0.03**2, 1.0),
-        centre=(0.0, 0.0, -LARGEST_LOG, LARGEST_LOG),
-        calibration=(0.0, 0.0, 0.0, 1e6),
+    columns = {
+        AMPLITUDE: (1.0, weight, 0.1, 100.0),
+        ROUGHNESS: (config.roughness**2, weight, 0.01**2, 0.2**2),
+        NOISE: (1.0, weight, 0.25, 16.0),
+        UNSEEN: (config.unseen, weight, 0.0, 16.0),
+        WRONG: (config.wrong, weight, config.wrong / 10, 10 * config.wrong),
+        INLIER: (1.0, weight, 0.05, 4.0),
+        BETWEEN: (config.between**2, weight, 0.03**2, 1.0),
+        CENTRE: (0.0, 0.0, -LARGEST_LOG, LARGEST_LOG),
+        CALIBRATION: (0.0, 0.0, 0.0, 1e6),
+    }
+    return np.ascontiguousarray(np.array([columns[ratio] for ratio in range(RATIOS)]).T)
+
+
+SIZE = 2 + 2 * RATIOS + SLOPES + FEATURES + _MATRIX + 1 + len(LEVELS)
+_PARTS = (2, 2 * RATIOS, SLOPES, FEATURES, _MATRIX, 1 + len(LEVELS))
+
+
+class Memory(NamedTuple):
+    """The memory of one stream. Zeros are the start.
+
+    Attributes:
+        frames: [2] number of frames with anchors, and m_0 of the last frame.
+        sums: [2, R] numerators and denominators of the ratios.
+        slopes: [3] mean of the slopes in the coefficients over the frames with anchors, with the half-life and with
+            ``slope_weight`` frames of 0.
+        coefficients: [4] of the features in the last frame.
+        covariance: [4, 4] of the coefficients.
+        intervals: [4] (``conformal.adapt``).
+    """
+
+    frames: Floats
+    sums: Floats
+    slopes: Floats
+    coefficients: Floats
+    covariance: Floats
+    intervals: Floats
+
+
+def views(packed: Floats) -> Memory:
+    """The parts of a memory [SIZE], which share its numbers."""
+    ends = np.cumsum(_PARTS)
+    frames, sums, slopes, b, covariance, intervals = (
+        packed[end - size : end] for size, end in zip(_PARTS, ends.tolist(), strict=True)
     )
-    return np.ascontiguousarray(np.array(columns).T)
-
-
-SIZE = 2 + 2 * RATIOS + SLOPES + FEATURES + _MATRIX
-
-
-def restarted(packed: Tensor, config: PosteriorConfig) -> Tensor:
-    """Memory [B, SIZE] with the initial coefficients and slopes: wrong poses can have corrupted them. The ratios depend
-    on network and scene and remain. Zeros before the first anchor."""
-    P = torch.diag(packed.new_tensor(config.prior_variance)).flatten()
-    start = torch.cat([packed.new_zeros(SLOPES + FEATURES), P]) * (packed[:, :1] > 0)
-    return torch.cat([packed[:, : -start.shape[1]], start], 1)
+    return Memory(frames, sums.reshape(2, RATIOS), slopes, b, covariance.reshape(FEATURES, FEATURES), intervals)
 
 
 def require(packed: Tensor) -> None:
     """Raise a ValueError if no anchors can have led to the memory [B, SIZE]."""
-    frames, mean, _, _, covariance = packed.split([1, 1, 2 * RATIOS, SLOPES + FEATURES, _MATRIX], 1)
+    frames, sums, _, _, covariance, intervals = packed.split(_PARTS, 1)
     matrix = covariance.reshape(-1, FEATURES, FEATURES)
-    signed = 2 + CENTRE
-    sums = torch.cat([packed[:, 2:signed], packed[:, signed + 1 : 2 + 2 * RATIOS]], 1)
+    counts = torch.cat([frames[:, :1], sums], 1)[:, [i for i in range(1 + 2 * RATIOS) if i != 1 + CENTRE]]
     scale = matrix.abs().amax((1, 2)).clamp(1e-300, 1e300)
     low = torch.linalg.eigvalsh(matrix / scale[:, None, None])[:, 0]
+    scored, factors = intervals[:, 0], intervals[:, 1:]
     faults = {
         f"values beyond {LARGEST:g}": packed.abs() > LARGEST,
-        "negative sums": torch.cat([frames, sums], 1) < 0,
-        "a mean log depth out of range": mean.abs() > LARGEST_LOG,
+        "negative sums": counts < 0,
+        "a mean log depth out of range": frames[:, 1].abs() > LARGEST_LOG,
         "a covariance with negative eigenvalues": low < -1e-6,
+        "a number of frames with scores that is not whole": (scored < 0) | (scored != scored.round()),
+        "quantiles beyond a factor of 10": factors.abs() > math.log(LARGEST_FACTOR) + 1e-9,
     }
     if names := [name for name, bad in faults.items() if bool(bad.any())]:
         raise ValueError(f"posterior holds impossible values: {', '.join(names)}")
 
 
-class Running(NamedTuple):
-    """The posterior's memory of one stream.
+@leaf
+def _before(memory, priors, ratio):
+    """Numerator and denominator of a ratio; the prior's before the first frame."""
+    if memory.frames[0] == 0:
+        return priors[0, ratio] * priors[1, ratio], priors[1, ratio]
+    return memory.sums[0, ratio], memory.sums[1, ratio]
 
-    Attributes:
-        frames: number of frames with anchors.
-        mean: m_0 of the last frame.
-        above, below: [R] numerators and denominators of the ratios.
-        slopes: [3] mean of the slopes in the coefficients over the frames with anchors, with the half-life and with
-            ``slope_weight`` frames of 0.
-        coefficients: [4] of the features in the last frame.
-        covariance: [4, 4] of the coefficients.
-        ratios: within their limits; the prior's value where the denominator is 0.
+
+@leaf
+def write_ratios(memory, priors, out):
+    """Write the ratios [R] of a :class:`Memory`, within their limits; ``priors`` [4, R] of :func:`priors`."""
+    for ratio in range(RATIOS):
+        above, below = _before(memory, priors, ratio)
+        value = above / max(below, 1e-12) if below > 0 else priors[0, ratio]
+        out[ratio] = min(max(value, priors[2, ratio]), priors[3, ratio])
+
+
+@leaf
+def after_frame(memory, priors, ratio, above, below, config):
+    """Numerator and denominator of a ratio after a frame that adds ``above`` and ``below`` to them."""
+    (before, n), (value, weight) = _before(memory, priors, ratio), (priors[0, ratio], priors[1, ratio])
+    fade = 0.5 ** (1 / config.half_life)
+    n = fade * n + (1 - fade) * weight + below
+    total = fade * before + (1 - fade) * weight * value + above
+    return min(max(total, priors[2, ratio] * n), priors[3, ratio] * n), n
+
+
+@leaf
+def restart(memory, config):
+    """Return to the initial coefficients and slopes: wrong poses can have corrupted them. The ratios depend on network
+    and scene and remain."""
+    for f in range(FEATURES):
+        memory.coefficients[f] = 0.0
+        for g in range(FEATURES):
+            memory.covariance[f, g] = 0.0
+        memory.covariance[f, f] = _prior_variance(f, config) if memory.frames[0] > 0 else 0.0
+    for f in range(SLOPES):
+        memory.slopes[f] = 0.0
+
+
+@leaf
+def _prior_variance(feature, config):
+    """Variance of a coefficient before the first anchor."""
+    if feature == 0:
+        return config.prior_sigma**2
+    return config.slope_sigma**2 if feature == 1 else config.tilt_sigma**2
+
+
+@part
+def expected(memory, mean, config):
+    """Predict coefficients [4] and covariance [4, 4] for a frame whose m_0 is ``mean``.
+
+    The constant follows a random walk from the last frame, which stops adding variance at the prior's. The slopes
+    revert to the variance before the first anchor, that in log d to 0: what anchors showed of one surface is no
+    evidence of the network's shape on another. Those in u and v revert to their mean over the stream.
     """
+    b, covariance = empty(FEATURES, np.float64), empty((FEATURES, FEATURES), np.float64)
+    started, rate, shift = memory.frames[0] > 0, config.reversion, mean - memory.frames[1]
+    for f in range(FEATURES):
+        b[f] = memory.coefficients[f]
+        for g in range(FEATURES):
+            covariance[f, g] = memory.covariance[f, g]
+        if not started:
+            covariance[f, f] = _prior_variance(f, config)
+    if not started:
+        return b, covariance
+    b[0] += shift * b[1]
+    for g in range(FEATURES):
+        covariance[0, g] += shift * covariance[1, g]
+    for f in range(FEATURES):
+        covariance[f, 0] += shift * covariance[f, 1]
+    for f in range(1, FEATURES):
+        b[f] = (1 - rate) * b[f] + (rate * memory.slopes[f - 1] if f > 1 else 0.0)
+        for g in range(FEATURES):
+            covariance[f, g] *= 1 - rate
+            covariance[g, f] *= 1 - rate
+    prior = _prior_variance(0, config)
+    covariance[0, 0] += config.drift**2 * min(max(1 - covariance[0, 0] / prior, 0.0), 1.0)
+    for f in range(1, FEATURES):
+        covariance[f, f] += (1 - (1 - rate) ** 2) * _prior_variance(f, config)
+    return b, covariance
 
-    frames: float
-    mean: float
-    above: Floats
-    below: Floats
-    slopes: Floats
-    coefficients: Floats
-    covariance: Floats
-    ratios: Ratios
 
-    @classmethod
-    def of(cls, packed: Floats, config: PosteriorConfig) -> Running:
-        """Unpack [SIZE]; zeros are the start."""
-        value, weight, least, largest = priors(config)
-        (above, below), rest = packed[2 : 2 + 2 * RATIOS].reshape(2, RATIOS), packed[2 + 2 * RATIOS :]
-        slopes, b = rest[:SLOPES], rest[SLOPES : SLOPES + FEATURES]
-        covariance = rest[SLOPES + FEATURES :].reshape(FEATURES, FEATURES)
-        if packed[0] == 0:
-            above, below, covariance = value * weight, weight, np.diag(config.prior_variance)
-        values = np.where(below > 0, above / np.maximum(below, 1e-12), value).clip(least, largest)
-        frames, mean = packed[:2].tolist()
-        return cls(frames, mean, above, below, slopes, b, covariance, Ratios(*values.tolist()))
+@leaf
+def learn(memory, sums, mean, b, covariance, priors, config):
+    """Change the memory after a frame with anchors: with the ``sums`` [2, R] for the ratios, m_0 = ``mean``, and the
+    coefficients [4] and their covariance."""
+    for ratio in range(RATIOS):
+        above, below = after_frame(memory, priors, ratio, sums[0, ratio], sums[1, ratio], config)
+        sums[0, ratio], sums[1, ratio] = above, below
+    for ratio in range(RATIOS):
+        memory.sums[0, ratio], memory.sums[1, ratio] = sums[0, ratio], sums[1, ratio]
+    memory.frames[0] += 1
+    rate = math.log(2.0) / config.half_life
+    weight = math.expm1(-rate * memory.frames[0]) / math.expm1(-rate)  # of the frames with anchors, 1 of the last
+    for f in range(SLOPES):
+        memory.slopes[f] += (b[1 + f] - memory.slopes[f]) / (weight + config.slope_weight)
+    _store(memory, mean, b, covariance)
 
-    def after(self, name: str, above: float, below: float, config: PosteriorConfig) -> float:
-        """A ratio after a frame with its numerator and denominator."""
-        k = Ratios._fields.index(name)
-        value, weight, least, largest = priors(config)[:, k].tolist()
-        fade = 0.5 ** (1 / config.half_life)
-        n = fade * float(self.below[k]) + (1 - fade) * weight + below
-        total = fade * float(self.above[k]) + (1 - fade) * weight * value + above
-        return min(max(total / n, least), largest)
 
-    def added(self, sums: Floats, config: PosteriorConfig) -> tuple[Floats, Floats]:
-        """Numerators and denominators [R] after a frame with the ``sums`` [2, R]."""
-        value, weight, least, largest = priors(config)
-        fade, (above, below) = 0.5 ** (1 / config.half_life), sums
-        n = fade * self.below + (1 - fade) * weight + below
-        total = fade * self.above + (1 - fade) * weight * value + above
-        return np.minimum(np.maximum(total, least * n), largest * n), n
+@leaf
+def drift(memory, mean, b, covariance, config):
+    """Change the memory after a frame without anchors, with m_0 = ``mean`` and what was :func:`expected` for it. The
+    mean slopes revert, too."""
+    for f in range(SLOPES):
+        memory.slopes[f] *= 1 - config.reversion
+    _store(memory, mean, b, covariance)
 
-    def learnt(
-        self, sums: Floats, mean: float, coefficients: Floats, covariance: Floats, config: PosteriorConfig
-    ) -> Floats:
-        """Pack into [SIZE] after a frame with anchors: with the ``sums`` [2, R] for the ratios, m_0 = ``mean``, and the
-        coefficients and their covariance."""
-        rate = math.log(2) / config.half_life
-        weight = math.expm1(-rate * (self.frames + 1)) / math.expm1(-rate)  # of the frames with anchors, 1 of the last
-        slopes = self.slopes + (coefficients[1:] - self.slopes) / (weight + config.slope_weight)
-        first = [self.frames + 1, mean]
-        return np.concatenate([first, *self.added(sums, config), slopes, coefficients, covariance.ravel()])
 
-    def drifted(self, mean: float, config: PosteriorConfig) -> Floats:
-        """Pack into [SIZE] after a frame without anchors whose m_0 is ``mean``. The mean slopes revert, too."""
-        b, covariance = self.expected(mean, config)
-        slopes = (1 - config.reversion) * self.slopes
-        return np.concatenate([[self.frames, mean], self.above, self.below, slopes, b, covariance.ravel()])
-
-    def expected(self, mean: float, config: PosteriorConfig) -> tuple[Floats, Floats]:
-        """Predict coefficients [4] and covariance [4, 4] for a frame whose m_0 is ``mean``.
-
-        The constant follows a random walk from the last frame, which stops adding variance at the prior's. The slopes
-        revert to the variance before the first anchor, that in log d to 0: what anchors showed of one surface is no
-        evidence of the network's shape on another. Those in u and v revert to their mean over the stream.
-        """
-        if not self.frames:
-            return self.coefficients, self.covariance
-        T, (constant, *slopes) = np.eye(FEATURES), config.prior_variance
-        T[0, 1] = mean - self.mean
-        T[1:] *= 1 - config.reversion
-        transformed = T @ self.covariance @ T.T
-        grown = config.drift**2 * min(max(1 - transformed[0, 0] / constant, 0), 1)
-        added = (1 - (1 - config.reversion) ** 2) * np.array(slopes)
-        mean_slopes = config.reversion * self.slopes * [0, 1, 1]
-        return T @ self.coefficients + [0, *mean_slopes], transformed + np.diag([grown, *added])
+@leaf
+def _store(memory, mean, b, covariance):
+    memory.frames[1] = mean
+    for f in range(FEATURES):
+        memory.coefficients[f] = b[f]
+        for g in range(FEATURES):
+            memory.covariance[f, g] = covariance[f, g]

@@ -15,11 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, part
-from ufmstar_torch.posterior.cells import cell_means, highest_over_lowest
+from ufmstar_torch.kernels.compile_cpu import empty, leaf, part
+from ufmstar_torch.posterior.cells import cell_means, highest_over_lowest, windows_around
 from ufmstar_torch.posterior.field import Observed, Prior, at, conditioned, distance, invert
-from ufmstar_torch.posterior.nodes import windows_around
-from ufmstar_torch.posterior.running import FEATURES, Floats
+from ufmstar_torch.posterior.running import AMPLITUDE, FEATURES, INLIER, NOISE, ROUGHNESS, Floats
 
 # Largest number of nodes in a row and in a column (the field's window allows 31 in a row).
 SIDE = 28
@@ -96,7 +95,7 @@ class LeftOut(NamedTuple):
     total: Floats
 
 
-@kernel
+@part
 def grid_of(logs, valid, rows, cols, config):
     """The :class:`Grid` of log d [H, W], which is read where ``valid`` [H, W]."""
     log_depth, n, total = cell_means(logs, valid, rows, cols), rows * cols, 0.0
@@ -118,10 +117,17 @@ def features(log_depth, u, v, x, k):
     x[k, 0], x[k, 1], x[k, 2], x[k, 3] = 1.0, log_depth, 2 * u - 1, 2 * v - 1
 
 
+@leaf
+def node_of(u, v, grid):
+    """The node at u and v from 0 to 1."""
+    column, row = min(max(int(u * grid.cols), 0), grid.cols - 1), min(max(int(v * grid.rows), 0), grid.rows - 1)
+    return row * grid.cols + column
+
+
 @part
 def _scene_of(grid, depth, valid, anchors, ratios, expected, config):
     """The :class:`Scene` of the :class:`AnchorRows` of a frame of depth d [H, W] [m]. ``ratios`` and ``expected``
-    (``Running.expected``) are those of the frames before."""
+    (``running.expected``) are those of the frames before."""
     N, k, n = 0, 0, grid.log_depth.size
     for i in range(anchors.valid.size):
         N += anchors.valid[i]
@@ -133,13 +139,12 @@ def _scene_of(grid, depth, valid, anchors, ratios, expected, config):
         if not anchors.valid[i]:
             continue
         u, v = (anchors.pixel[i, 0] + 0.5) / depth.shape[1], (anchors.pixel[i, 1] + 0.5) / depth.shape[0]
-        column, row = min(max(int(u * grid.cols), 0), grid.cols - 1), min(max(int(v * grid.rows), 0), grid.rows - 1)
-        node[k], log_depth, g = row * grid.cols + column, math.log(anchors.predicted[i]), anchors.depth[i]
+        node[k], log_depth, g = node_of(u, v, grid), math.log(anchors.predicted[i]), anchors.depth[i]
         features(log_depth - grid.mean, u, v, x, k)
         y[k] = math.log(g) - log_depth
-        stated[k] = ratios.noise * anchors.variance[i] / (g * g) + config.alone / N
+        stated[k] = ratios[NOISE] * anchors.variance[i] / (g * g) + config.alone / N
         blur = math.log(highest_over_lowest(depth, valid, anchors.at_pixel[i])) / 2
-        noise[k] = stated[k] + ratios.roughness + blur * blur
+        noise[k] = stated[k] + ratios[ROUGHNESS] + blur * blur
         believed[k] = by_area[k] = 1 / (1 + noise[k] / config.weak_sigma**2)
         k += 1
     count = counts(node, n)
@@ -165,9 +170,9 @@ def _prior(grid, ratios, expected, config):
     mean, precision = expected
     right, down = empty(grid.right.size, np.float64), empty(grid.down.size, np.float64)
     for i in range(right.size):
-        right[i], down[i] = 1 / (grid.right[i] * ratios.amplitude), 1 / (grid.down[i] * ratios.amplitude)
+        right[i], down[i] = 1 / (grid.right[i] * ratios[AMPLITUDE]), 1 / (grid.down[i] * ratios[AMPLITUDE])
     invert(precision)
-    return Prior(config.precision / ratios.amplitude, right, down, mean, precision, grid.cols)
+    return Prior(config.precision / ratios[AMPLITUDE], right, down, mean, precision, grid.cols)
 
 
 @part
@@ -293,7 +298,7 @@ def misscaled(config, share, p, wide):
 def inlier_factor(config, ratios, away):
     """Factor on the variance of y on the evidence's surface, at the distance ``away``: ``inlier`` at the evidence, 1
     from a disc's diameter on. Held-out anchors are no farther from the others."""
-    return 1 + (ratios.inlier - 1) * max(1 - away / (2 * config.radius), 0.0)
+    return 1 + (ratios[INLIER] - 1) * max(1 - away / (2 * config.radius), 0.0)
 
 
 @leaf

@@ -60,9 +60,9 @@ farther the evidence, the more surfaces lie between. v and w are at most ``wides
 the certainty of every pixel.
 
 Anchors that matching has measured are wrong on surfaces that move. Those whose ratio to the prediction no surface of
-the stream has are left out (``motion.plausible``). With the probability P of ``motion``, the depth is
-that of the prediction at the scale of most surfaces: the variance becomes (1 - P) V + P tail, with the tail about
-their ratio instead of b . x, and p includes P.
+the stream has are left out (``motion.plausible``). With the probability P of ``motion``, the depth is that of the
+prediction at the scale of most surfaces: the variance becomes (1 - P) V + P tail, with the tail about their ratio
+instead of b . x, and p includes P.
 
 A stream whose anchors were all invalid so far has the network's depth with the variance of a node without evidence. A
 stream without anchors has UfM*'s output.
@@ -71,6 +71,7 @@ stream without anchors has UfM*'s output.
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -78,21 +79,36 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.special import ndtri
 
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.frames.frame import FrameInput
-from ufmstar_torch.kernels.compile_cpu import empty, kernel
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, part
 from ufmstar_torch.kernels.cpu.calls import array, each
 from ufmstar_torch.posterior.cells import finish, interpolate, steepness
 from ufmstar_torch.posterior.config import PosteriorConfig, constants
-from ufmstar_torch.posterior.conformal import image_weights
-from ufmstar_torch.posterior.distribution import TAIL
+from ufmstar_torch.posterior.conformal import adapt, quantiles, weigh
+from ufmstar_torch.posterior.distribution import LEVELS
 from ufmstar_torch.posterior.field import at
 from ufmstar_torch.posterior.learn import sums_of
 from ufmstar_torch.posterior.moments import divide, second_moments
-from ufmstar_torch.posterior.motion import in_image, plausible, probability, surfaces, tests_at
-from ufmstar_torch.posterior.running import BETWEEN, CENTRE, FEATURES, Floats, Running
+from ufmstar_torch.posterior.motion import in_image, plausible, probability, surfaces, tested, tests_at
+from ufmstar_torch.posterior.running import (
+    BETWEEN,
+    CALIBRATION,
+    FEATURES,
+    RATIOS,
+    ROUGHNESS,
+    UNSEEN,
+    WRONG,
+    Floats,
+    drift,
+    expected,
+    learn,
+    priors,
+    restart,
+    views,
+    write_ratios,
+)
 from ufmstar_torch.posterior.scene import (
     MOST_WRONG,
     SIDE,
@@ -111,8 +127,11 @@ from ufmstar_torch.posterior.scene import (
     wrong_factor,
 )
 
-_EMPTY = np.empty(0)
+_EMPTY, _UNTESTED = np.empty(0), np.empty((0, 3))
 _NONE = AnchorRows(np.empty((0, 2)), np.empty(0, np.int64), _EMPTY, _EMPTY, _EMPTY, np.empty(0, np.bool_))
+# A stream's anchors, tests of motion [M, 3], and the errors that its anchors share; None without anchors.
+_Found = tuple[AnchorRows, Floats, tuple[float, ...]] | None
+_SHOWN = 2 + len(LEVELS)  # calibration, growth with the distance, and quantiles
 
 
 @dataclass(frozen=True)
@@ -123,21 +142,21 @@ class Posterior:
         depth: [B, H, W] [m]; as predicted before the first anchor. NaN where not valid.
         variance: [B, H, W] [m^2]; UfM*'s in a stream without anchors. With the errors that all anchors of the frame
             share; where most anchors are off by a factor over 100, with their mean squared error.
-        calibration: [B] running mean z^2 of held-out anchors: 1 = as predicted, above = too certain; NaN before any.
-        unseen: [B] variance of y per image width of distance from evidence.
         outlier: [B, H, W] probability in [0, 1] that the error is not one of the inliers: the pixel lies on another
             surface than its evidence, or the surface moves; NaN where not valid or in a stream without anchors.
         inlier: [B, H, W] variance of the inliers [m^2]; UfM*'s in a stream without anchors.
-        scores: for each stream, [2, M] scores of the frame's held-out anchors and their weights (``conformal``).
+        calibration: [B] running mean z^2 of held-out anchors: 1 = as predicted, above = too certain; NaN before any.
+        unseen: [B] variance of y per image width of distance from evidence.
+        quantiles: [B, 3] |z| of held-out anchors at the levels of intervals (``conformal``); NaN = no evidence.
     """
 
     depth: Tensor
     variance: Tensor
-    calibration: Tensor
-    unseen: Tensor
     outlier: Tensor
     inlier: Tensor
-    scores: tuple[Tensor, ...] = ()
+    calibration: Tensor
+    unseen: Tensor
+    quantiles: Tensor
 
 
 def update(
@@ -160,98 +179,113 @@ def update(
     """
     device = frame.depth.device
     if device.type == "meta":
-        return packed, Posterior(frame.depth, claimed, packed[:, 0], packed[:, 0], frame.depth, claimed)
+        one, levels = packed[:, 0], packed[:, : len(LEVELS)]
+        return packed, Posterior(frame.depth, claimed, frame.depth, claimed, one, one, levels)
     before, *maps = (array(x) for x in (packed, frame.depth, frame.valid, claimed))
     after, outputs = before.copy(), np.empty((4, *maps[0].shape), maps[0].dtype)
-    common = _common(anchors, len(before), config)
-    streams = zip(before, after, *maps, _anchors(anchors, len(before)), common, outputs.swapaxes(0, 1), strict=True)
-    scores = each(functools.partial(_of_stream, config, floor), list(streams))
-    memories = [Running.of(one, config) for one in after]
-    calibration = [one.ratios.calibration if one.below[-1] > 0 else np.nan for one in memories]
-    unseen = [one.ratios.unseen for one in memories]
-    depth, variance, outlier, inlier = (torch.from_numpy(x).to(device) for x in outputs)
-    shown, growth = (torch.tensor(x, dtype=torch.float64, device=device) for x in (calibration, unseen))
-    found = Posterior(depth, variance, shown, growth, outlier, inlier, tuple(map(torch.from_numpy, scores)))
-    return torch.from_numpy(after).to(device), found
+    shown = np.empty((len(before), _SHOWN))
+    streams = zip(after, *maps, _anchors(anchors, len(before)), zip(*outputs, strict=True), shown, strict=True)
+    each(functools.partial(_of_stream, config, floor), list(streams))
+    results = (torch.from_numpy(x).to(device) for x in (after, *outputs, shown))
+    memory, depth, variance, outlier, inlier, figures = results
+    return memory, Posterior(depth, variance, outlier, inlier, figures[:, 0], figures[:, 1], figures[:, 2:])
 
 
-def _anchors(anchors: Anchors | None, streams: int) -> list[tuple[AnchorRows, Floats | None] | None]:
-    """For each stream its anchors, and the tests of motion, None without any."""
+def _anchors(anchors: Anchors | None, streams: int) -> list[_Found]:
+    """The anchors of each stream. The shared errors are variances of the inverse depth and of a factor's logarithm, and
+    the mean square of rejected anchors' relative errors."""
     if anchors is None:
         return [None] * streams
     fields = (anchors.pixel, anchors.index, anchors.predicted, anchors.depth, anchors.variance, anchors.mask)
-    motion = [None] * streams if anchors.motion is None else array(anchors.motion)
-    tested = [None if one is None or not np.isfinite(one).any() else one for one in motion]
-    return list(zip(map(AnchorRows, *map(array, fields)), tested, strict=True))
-
-
-def _common(anchors: Anchors | None, streams: int, config: PosteriorConfig) -> list[tuple[float, ...]]:
-    """For each stream the arguments of ``cells.finish``."""
-    columns = [[0.0] * streams] * 3
-    if anchors is not None:
-        shared = (anchors.shared, anchors.scale, anchors.contradiction)
-        columns = [none if x is None else x.tolist() for none, x in zip(columns, shared, strict=True)]
-    return [(*one, config.prior_sigma**2) for one in zip(*columns, strict=True)]
+    motion = [_UNTESTED] * streams if anchors.motion is None else array(anchors.motion)
+    shared = (anchors.shared, anchors.scale, anchors.contradiction)
+    columns = [[0.0] * streams if x is None else x.tolist() for x in shared]
+    return list(zip(map(AnchorRows, *map(array, fields)), motion, zip(*columns, strict=True), strict=True))
 
 
 def _of_stream(
-    config: PosteriorConfig, floor: float, packed: Floats, after: Floats, depth: NDArray[Any],
-    valid: NDArray[np.bool_], claimed: NDArray[Any], found: tuple[AnchorRows, Floats | None] | None,
-    common: tuple[float, ...], outputs: NDArray[Any],
-) -> Floats:  # fmt: skip
-    """Write the memory after the frame, and depth, variance, probability of another surface and inlier variance
-    [4, H, W]; returns the scores."""
-    running, (anchors, motion) = Running.of(packed, config), (_NONE, None) if found is None else found
+    config: PosteriorConfig, floor: float, packed: Floats, depth: NDArray[Any], valid: NDArray[np.bool_],
+    claimed: NDArray[Any], found: _Found, outputs: tuple[NDArray[Any], ...], shown: Floats,
+) -> None:  # fmt: skip
+    """Change the memory [SIZE]; write depth, variance, probability of another surface and inlier variance [H, W] to the
+    ``outputs``, and the figures [5] that ``Posterior`` has of a stream."""
     factor, variance, outlier, inlier = outputs
-    if found is None and not running.frames:
+    anchors, motion, shared = found or (_NONE, _UNTESTED, (0.0, 0.0, 0.0))
+    if found is None and packed[0] == 0:
         factor[:], variance[:], inlier[:], outlier[:] = np.where(valid, 1, np.nan), claimed, claimed, np.nan
-        finish(depth, factor, variance, inlier, common, floor)
-        return np.zeros((2, 0))
-    numbers, (rows, cols) = constants(config), (min(SIDE, n) for n in depth.shape)
-    with np.errstate(all="ignore"):  # invalid pixels are not read
-        logs = np.log(depth)
-    grid = grid_of(logs, valid, rows, cols, numbers)
-    expected = running.expected(grid.mean, config)
-    beyond = np.zeros(rows * cols)
-    if motion is not None:
-        anchors, beyond = plausible(anchors, running, depth.shape, (rows, cols), config)
-    of_frame = grid, depth, valid, anchors, running.ratios, expected, running.frames, numbers
-    scene, field, left_out, away, sums, (below, distance, area) = evidence_of(*of_frame)
-    scores, (c, of_surfaces) = np.zeros((2, 0)), surfaces(scene, field.coefficients, running, config)
-    if len(scene.noise):
-        sums[:, CENTRE], sums[:, BETWEEN] = of_surfaces["centre"], of_surfaces["between"]
-        after[:] = running.learnt(sums, grid.mean, field.coefficients, field.covariance, config)
-        z = ndtri(torch.from_numpy(below).clamp_(TAIL, 1 - TAIL)).abs_().numpy()
-        scores = np.stack([z, image_weights(distance, area, away)])
-    elif running.frames and valid.any():
-        after[:] = running.drifted(grid.mean, config)
-    updated = Running.of(after, config)
-    nodes, x, mean, wide = nodes_of(scene, field, left_out, away, updated.ratios, numbers)
-    P = e = np.zeros(rows * cols)
-    if motion is not None:
-        tests = tests_at(motion, depth.shape[0], depth.shape[1], rows, cols)
-        e = mean - c - in_image(x, field.coefficients)
-        P = probability(e, grid.log_depth, nodes[5], tests, beyond, updated.ratios.between, (rows, cols))
-    slopes = updated.slopes - field.coefficients[1:]
-    maps = depth, valid, logs, claimed
-    at_every_pixel(maps, nodes, x, wide, (e, P), away, slopes, field.coefficients, grid, numbers, outputs)
-    np.exp(factor, out=factor)
-    finish(depth, factor, variance, inlier, common, floor)
-    return scores
+        shown[:] = np.nan
+        shown[1] = config.unseen
+    else:
+        with np.errstate(all="ignore"):  # invalid pixels are not read
+            maps = depth, valid, np.log(depth), claimed
+        wrong, numbers = math.isinf(shared[0]), constants(config)
+        of_frame(views(packed), maps, anchors, motion, wrong, priors(config), numbers, outputs, shown)
+        np.exp(factor, out=factor)
+    finish(depth, factor, variance, inlier, (*shared, config.prior_sigma**2), floor)
 
 
 @kernel
-def evidence_of(grid, depth, valid, anchors, ratios, expected, frames, config):
-    """A frame's anchors: the scene, the field, leave-one-out predictions, the distance of every node from evidence
-    (:func:`~ufmstar_torch.posterior.scene.fitted`); and the sums and scores of held-out anchors
-    (:func:`~ufmstar_torch.posterior.learn.sums_of`)."""
-    scene, field, left_out, weight, away = fitted(grid, depth, valid, anchors, ratios, expected, config)
+def of_frame(memory, maps, anchors, motion, wrong, priors, config, outputs, shown):
+    """The frame of one stream.
+
+    Args:
+        memory: :class:`~ufmstar_torch.posterior.running.Memory`; changed.
+        maps: depth, valid, log of the depth, claimed variance [H, W].
+        anchors: :class:`AnchorRows`.
+        motion: [M, 3] tests of motion (``motion.tests_at``); none if no value is finite.
+        wrong: whether the poses were wrong for an unknown time.
+        priors: [4, R] (``running.priors``).
+        config: of the posterior.
+        outputs: [H, W] y, variance, probability and inlier variance (``cells.interpolate``); written.
+        shown: [5] calibration, growth with the distance, and quantiles; written.
+    """
+    depth, valid, logs, _ = maps
+    if wrong:
+        restart(memory, config)
+    ratios, frames = empty(RATIOS, np.float64), memory.frames[0]
+    write_ratios(memory, priors, ratios)
+    grid = grid_of(logs, valid, min(SIDE, depth.shape[0]), min(SIDE, depth.shape[1]), config)
+    before, beyond = expected(memory, grid.mean, config), empty(grid.log_depth.size, np.float64)
+    if tested(motion):
+        anchors, beyond = plausible(anchors, frames, ratios, depth.shape, grid, config)
+    scene, field, left_out, weight, away = fitted(grid, depth, valid, anchors, ratios, before, config)
     sums, scores = sums_of(scene, weight, left_out, ratios, frames, config)
-    return scene, field, left_out, away, sums, scores
+    c = surfaces(scene, field.coefficients, memory, priors, ratios, config, sums)
+    if scene.noise.size:
+        learn(memory, sums, grid.mean, field.coefficients, field.covariance, priors, config)
+        weights = empty(scores.shape[1], np.float64)
+        weigh(scores[1], scores[2], away, weights)
+        adapt(memory.intervals, scores[0], weights)
+    elif frames > 0 and _any(valid):
+        b, covariance = expected(memory, grid.mean, config)
+        drift(memory, grid.mean, b, covariance, config)
+    write_ratios(memory, priors, ratios)
+    nodes, x, mean, wide = _nodes(scene, field, left_out, away, ratios, config)
+    if tested(motion):
+        _add_motion(nodes, x, mean, c, wide, motion, beyond, depth.shape, scene, field.coefficients, ratios, config)
+    slopes = empty(FEATURES - 1, np.float64)
+    for f in range(slopes.size):
+        slopes[f] = memory.slopes[f] - field.coefficients[1 + f]
+    for i in range(away.size):
+        nodes[1, i] += slopes_away(config, x, i, away[i], slopes)
+    divide(nodes[2], nodes[3], nodes[4])
+    interpolate(maps, nodes, field.coefficients, grid, config, outputs)
+    shown[0] = ratios[CALIBRATION] if memory.sums[1, CALIBRATION] > 0 else np.nan
+    shown[1] = ratios[UNSEEN]
+    quantiles(memory.intervals, shown, 2)
 
 
-@kernel
-def nodes_of(scene, field, left_out, away, ratios, config):
+@part
+def _any(valid):
+    for i in range(valid.shape[0]):
+        for j in range(valid.shape[1]):
+            if valid[i, j]:
+                return True
+    return False
+
+
+@part
+def _nodes(scene, field, left_out, away, ratios, config):
     """The nodes of :func:`ufmstar_torch.posterior.cells.interpolate` without motion [6, n], their features [n, F], mean
     of y [n], and its variance on another surface [n]."""
     grid, b, n = scene.grid, field.coefficients, away.size
@@ -270,9 +304,9 @@ def nodes_of(scene, field, left_out, away, ratios, config):
         offset = mean
         for f in range(FEATURES):
             offset -= x[i, f] * b[f]
-        unseen, factor = away[i] * ratios.unseen, inlier_factor(config, ratios, away[i])
-        variance = at_pixels(config, factor, variance, ratios.roughness, unseen, steep[i], share)
-        p = min(ratios.wrong * wrong_factor(config, away[i], scales[i]), MOST_WRONG)
+        unseen, factor = away[i] * ratios[UNSEEN], inlier_factor(config, ratios, away[i])
+        variance = at_pixels(config, factor, variance, ratios[ROUGHNESS], unseen, steep[i], share)
+        p = min(ratios[WRONG] * wrong_factor(config, away[i], scales[i]), MOST_WRONG)
         p, wide = misscaled(config, share, p, elsewhere_variance(config, around[i], unseen))
         means[i], wides[i], nodes[0, i], nodes[1, i] = mean, wide, grid.log_depth[i], offset
         nodes[2, i], nodes[3, i] = second_moments(config, scales[i] * variance, p, offset, wide)
@@ -280,31 +314,28 @@ def nodes_of(scene, field, left_out, away, ratios, config):
     return nodes, x, means, wides
 
 
-@kernel
-def at_every_pixel(maps, nodes, x, wide, motion, away, slopes, b, grid, config, outputs):
-    """Add motion and the mean ``slopes`` [3] of the stream, less the frame's, to the ``nodes`` [6, n], and interpolate
-    them.
+@part
+def _add_motion(nodes, x, mean, c, wide, motion, beyond, size, scene, b, ratios, config):
+    """Add the probability of motion to the ``nodes`` [6, n].
 
     Args:
-        maps: depth, valid, log of the depth, claimed variance [H, W].
-        nodes, x, wide: from :func:`nodes_of`; the first changes.
-        motion: [n] e and probability P (``motion.probability``).
-        away: [n] distance from evidence.
-        slopes: [3].
+        nodes, x, mean, wide: from :func:`_nodes`; the first changes.
+        c: constant of most surfaces.
+        motion: as in :func:`of_frame`.
+        beyond: [n] from ``motion.plausible``.
+        size: H and W.
+        scene: of the frame.
         b: [4] coefficients.
-        grid: of the nodes.
+        ratios: up to this frame.
         config: of the posterior.
-        outputs: [4, H, W] y, variance, probability and inlier variance (``cells.interpolate``).
     """
-    e, P = motion
-    for i in range(away.size):
+    grid, e = scene.grid, empty(mean.size, np.float64)
+    for i in range(e.size):
+        e[i] = mean[i] - c - in_image(x, i, b)
+    tests = tests_at(motion, size[0], size[1], grid.rows, grid.cols)
+    P = probability(e, grid.log_depth, nodes[5], tests, beyond, ratios[BETWEEN], grid.rows, grid.cols)
+    for i in range(e.size):
         if P[i] > 0:
             tail = second_moments(config, nodes[2, i], 1.0, e[i], wide[i])[0]
             nodes[2, i] = (1 - P[i]) * nodes[2, i] + P[i] * tail
             nodes[4, i] = 1 - (1 - nodes[4, i]) * (1 - P[i])
-        nodes[1, i] += slopes_away(config, x, i, away[i], slopes)
-    divide(nodes[2], nodes[3], nodes[4])
-    depth, valid, logs, claimed = maps
-    interpolate(
-        depth, valid, logs, claimed, nodes, b, grid, config, outputs[0], outputs[1], outputs[3], outputs[2]
-    )  # fmt: skip

@@ -17,8 +17,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frames.frame import FrameInput
 from ufmstar_torch.frames.output import FrameStatistics, UncertaintyOutput
 from ufmstar_torch.gaussians.state import UfMStarState
-from ufmstar_torch.posterior.conformal import normal_where_missing
-from ufmstar_torch.posterior.correct import correct
+from ufmstar_torch.posterior.distribution import normal_where_missing
 from ufmstar_torch.posterior.recalibrate import Recalibration
 from ufmstar_torch.steps import merge
 from ufmstar_torch.steps.regress import at_pixels
@@ -114,8 +113,14 @@ def corrected(
     if config.posterior is not None and pixels is None:
         network = network_maps(frame, out.maps["features"], config, pixels)
         claimed = total_variance(M, network, frame, config, mapped, pixels, factor).detach()
-        learnt, maps, of_posterior = correct(state.by_stream, frame, claimed, config)
-        quantiles, state, counts = maps.pop("quantiles"), state.with_tensors(learnt), counts | of_posterior
+        from ufmstar_torch.posterior.update import update  # kernels compile when they are first needed
+
+        memory = state.by_stream["posterior"]
+        learnt, found = update(memory, frame, frame.anchors, claimed, config.posterior, config.variance_floor)
+        quantiles, state = found.quantiles, state.with_tensors({"posterior": learnt})
+        maps |= {"depth": found.depth, "variance": found.variance, "posterior_outlier": found.outlier}
+        maps["posterior_inlier_variance"] = found.inlier
+        counts |= {"calibration": found.calibration, "unseen": found.unseen}
     if config.merges_on(frame.depth.device.type):
         state, merged = merge.after_frame(state, frame, config, merging)
         counts |= merged

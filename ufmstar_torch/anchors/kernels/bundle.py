@@ -15,7 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.anchors.kernels.cholesky import factored, inverted, reduced, substituted
-from ufmstar_torch.kernels.compile_cpu import empty, leaf, reordered, reordered_leaf
+from ufmstar_torch.anchors.kernels.epipolar import FAR as FAR_DEPTH
+from ufmstar_torch.anchors.kernels.epipolar import NEAR as NEAR_DEPTH
+from ufmstar_torch.anchors.kernels.epipolar import first_view, off_line, on_lines
+from ufmstar_torch.anchors.kernels.numbers import finite, median
+from ufmstar_torch.kernels.compile_cpu import empty, leaf, reordered, reordered_leaf, reordered_part
 
 # Parameters of a pose's error: a rotation about the camera's axes [rad] and a shift along the world's [m].
 POSE = 6
@@ -36,65 +40,148 @@ _STUDENT, _STEPS, _DEPTH_STEPS = 4.0, 4, 6
 _SHIFT = 1.0
 # Least number of corners for a refinement.
 _ENOUGH = 8
+# [px] Limits of the standard deviations of a position by errors of the poses.
+_LEAST, _LARGEST = 0.003, 20.0
+# Share of the running estimates that remains after a frame.
+_MEMORY = 0.8
+# Least share of the tracks that do not fit the input poses, for them to be taken for tracks of things that move, which
+# the poses would follow; below .2 on recordings of still scenes. Least number of tracks that is judged.
+_MOVING, _FEWEST = 0.25, 8
 
 
-class Refined(NamedTuple):
-    """Refined poses of W views.
+class Learnt(NamedTuple):
+    """Running estimates of the input poses' errors, which :func:`refine` updates.
 
     Attributes:
-        poses: [W, 4, 4] camera-to-world [m].
-        error: [6 W] of the input poses, beyond the shift.
-        covariance: [6 W, 6 W] of ``error``.
-        depth_variance: [N] variance of the corners' inverse depths by it [1/m^2].
+        variance: [2] of a position by a pose's rotation and by its shift [px^2].
+        last_error: [2, 3] of the last pose, as shifts of a position [px].
+        numbers: [5] the number of pose errors in the variance; ``correlated``, ``shared``, the largest recent score and
+            the variance by the time offset, see ``bundle.PoseRefinement``.
     """
 
-    poses: NDArray[np.float64]
-    error: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    depth_variance: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    last_error: NDArray[np.float64]
+    numbers: NDArray[np.float64]
 
 
-def position_variance(views: NDArray[np.int64]) -> NDArray[np.float64]:
-    """[N] variance of a corner's position, seen some ``views`` [N] before the newest [px^2]."""
-    return np.asarray(_TRACKING**2 * (1 + _DRIFT * (views - 1)))
+COUNT, CORRELATED, SHARED, SCORE, BY_OFFSET = range(5)  # of :attr:`Learnt.numbers`
 
 
-def refined(
-    pixel: NDArray[np.float64], seen: NDArray[np.bool_], T_world_cam: NDArray[np.float64], K: NDArray[np.float64],
-    depth: float, shift: NDArray[np.float64], prior: NDArray[np.float64], most: float,
-) -> tuple[Refined | None, float, bool]:  # fmt: skip
-    """Most likely poses of W views.
+@reordered
+def refine(pixel, seen, stated, K, K_inverse, depth, shift, most, learnt, poses, prior, error, covariance):
+    """The most likely poses of W views, and what their errors teach.
 
     Args:
         pixel: [N, W, 2] positions (u, v) of corners; the newest view is the last.
         seen: [N, W] bool, True where the view shows the corner.
-        T_world_cam: [W, 4, 4] input poses, camera-to-world [m].
-        K: [3, 3] [px].
+        stated: [W, 4, 4] input poses, camera-to-world [m].
+        K, K_inverse: [3, 3] [px].
         depth: prior mean of the corners' depths [m]; the prior standard deviation of an inverse depth is 2/depth.
         shift: [W, 6] by which the input poses are corrected first, see :func:`move`.
-        prior: [6 W] precision of the poses' errors.
         most: score, chi-squared with six degrees of freedom, above which the newest pose starts another trajectory.
+        learnt: see :class:`Learnt`.
+        poses: [W, 4, 4] overwritten.
+        prior: [6 W] precision of the poses' errors, overwritten.
+        error, covariance: [6 W] errors of the poses beyond the shift, and [6 W, 6 W], overwritten.
 
     Returns:
-        The poses, None where they cannot be refined; the score of the newest pose, NaN without one; whether the newest
-        pose starts another trajectory.
+        1; 0 = the poses cannot be refined; -1 = the newest pose starts another trajectory.
     """
-    views, poses = len(seen[0]), T_world_cam.copy()
-    error, covariance = np.zeros(POSE * views), np.zeros((POSE * views, POSE * views))
-    by_poses, score = np.zeros(len(pixel)), np.full(1, np.nan)
-    arguments = pixel, seen, poses, K, depth, shift.ravel(), prior, most
-    count = _refine(*arguments, error, covariance, by_poses, score)
-    fine = count > 0 and bool(np.isfinite(poses).all() and np.isfinite(covariance).all())
-    result = Refined(poses, error, covariance, by_poses[:count]) if fine else None
-    return result, float(score[0]), count < 0
+    count, views = seen.shape
+    numbers, unit = learnt.numbers, empty(2, np.float64)  # w [rad] and s [m] that shift a position by a pixel
+    unit[0], unit[1] = 1 / K[0, 0], depth / K[0, 0]
+    for k in range(views):
+        for c in range(POSE):
+            part = 0 if c < 3 else 1
+            prior[POSE * k + c] = 1 / (learnt.variance[part] * unit[part] ** 2)
+            error[POSE * k + c] = 0.0
+        for i in range(4):
+            for j in range(4):
+                poses[k, i, j] = stated[k, i, j]
+    numbers[SHARED] = 0.0
+    score, by_poses, still = empty(1, np.float64), empty(count, np.float64), empty(count, np.bool_)
+    score[0] = np.nan
+    _static(pixel, seen, stated, K, K_inverse, depth, still)
+    tracks = _refine(pixel, seen, still, poses, K, depth, shift, prior, most, error, covariance, by_poses, score)
+    if finite(score[0]):
+        numbers[SCORE] = max(score[0], _MEMORY * numbers[SCORE])
+    if tracks <= 0:
+        return tracks
+    total = 0.0
+    for k in range(views):
+        for i in range(3):
+            for j in range(4):
+                total += abs(poses[k, i, j])
+    for i in range(POSE * views):
+        for j in range(POSE * views):
+            total += abs(covariance[i, j])
+    if not finite(total):
+        return 0
+    numbers[SHARED], numbers[BY_OFFSET] = median(by_poses, tracks), 0.0
+    numbers[COUNT] += 1
+    share, first, product = max(1 - _MEMORY, 1 / (numbers[COUNT] + 1)), POSE * (views - 1), 0.0  # at first the mean
+    for part in range(2):
+        # How many of 3 components the images determine.
+        determined = square = 0.0
+        for c in range(3):
+            i = first + 3 * part + c
+            off = error[i] / unit[part]
+            square += off * off
+            determined += 1 - covariance[i, i] / unit[part] ** 2 / learnt.variance[part]
+            product += off * learnt.last_error[part, c] / 3
+            learnt.last_error[part, c] = off
+            numbers[BY_OFFSET] += (shift[views - 1, 3 * part + c] / unit[part]) ** 2 / 3
+        variance = learnt.variance[part] + share * (square - determined * learnt.variance[part]) / max(determined, 1.0)
+        learnt.variance[part] = min(max(variance, _LEAST**2 / 2), _LARGEST**2 / 2)
+    numbers[CORRELATED] = max(_MEMORY * numbers[CORRELATED] + (1 - _MEMORY) * product, 0.0)
+    return 1
 
 
-@reordered
-def _refine(pixel, seen, poses, K, depth, shift, prior, most, error, covariance, by_poses, score):
+@reordered_part
+def _static(pixel, seen, stated, K, K_inverse, depth, still):
+    """Which tracks [N] refine the poses: the largest group that fits them between its first view and the newest. All,
+    where few do not fit: their Student-t weights suffice."""
+    count, last, tracks = len(seen), seen.shape[1] - 1, 0
+    track, distance = empty(count, np.int64), empty(count, np.float64)
+    newest, size = empty((count, 2), np.float64), empty(2, np.float64)
+    size[0], size[1] = 2 * K[0, 2], 2 * K[1, 2]
+    for n in range(count):
+        still[n] = True
+        first = first_view(seen[n])
+        if not seen[n, last] or first == last:
+            continue
+        off, _, _ = off_line(
+            pixel[n, last],
+            pixel[n, first],
+            stated[last],
+            stated[first],
+            K,
+            K_inverse,
+            NEAR_DEPTH * depth,
+            FAR_DEPTH * depth,
+        )
+        distance[tracks] = off / (_TRACKING * np.sqrt(1 + _DRIFT * (last - 1 - first)))
+        newest[tracks, 0], newest[tracks, 1] = pixel[n, last, 0], pixel[n, last, 1]
+        track[tracks] = n
+        tracks += 1
+    if tracks < _FEWEST:
+        return
+    fits, weight, order = empty(tracks, np.bool_), empty(tracks, np.float64), empty(tracks, np.int64)
+    on_lines(distance[:tracks], newest, size, 1.0, fits, weight, order)
+    fitting = 0
+    for i in range(tracks):
+        fitting += fits[i]
+    if fitting <= (1 - _MOVING) * tracks:
+        for i in range(tracks):
+            still[track[i]] = fits[i]
+
+
+@reordered_part
+def _refine(pixel, seen, still, poses, K, depth, shift, prior, most, error, covariance, by_poses, score):
     """Number of corners that refined the poses; 0 = they cannot be refined, -1 = the newest starts a trajectory."""
     views = seen.shape[1]
     ray, precision = empty((len(seen), views, 2), np.float64), empty((len(seen), views - 1), np.float64)
-    tracks = _tracks(pixel, seen, K, ray, precision)
+    tracks = _tracks(pixel, seen, still, K, ray, precision)
     if tracks < _ENOUGH:
         return 0
     size, start = POSE * views, 1 / depth
@@ -104,7 +191,10 @@ def _refine(pixel, seen, poses, K, depth, shift, prior, most, error, covariance,
     h, weighted = empty((tracks, size), np.float64), empty((tracks, size), np.float64)
     derivative = empty((2, 2, POSE), np.float64)
     block, other, x = empty((POSE, POSE), np.float64), empty((POSE, POSE), np.float64), empty(POSE, np.float64)
-    move(shift, poses)
+    for k in range(views):
+        for c in range(POSE):
+            b[POSE * k + c] = shift[k, c]
+    move(b, poses)
     between(poses, rotation, translation, to_view)
     inverse_depths(ray, precision, rotation, translation, start, _STUDENT, _DEPTH_STEPS, rho)
     for step in range(_STEPS):
@@ -139,6 +229,7 @@ def _refine(pixel, seen, poses, K, depth, shift, prior, most, error, covariance,
             rho[n] = min(max(rho[n] + change, FAR * start), NEAR * start)
     inverted(A, covariance)
     for n in range(tracks):
+        by_poses[n] = 0.0
         for i in range(size):
             total = 0.0
             for j in range(size):
@@ -148,15 +239,15 @@ def _refine(pixel, seen, poses, K, depth, shift, prior, most, error, covariance,
 
 
 @leaf
-def _tracks(pixel, seen, K, ray, precision):
-    """Write x and y on the plane at depth 1, and the precision in the earlier views, of the corners that the newest
-    view and another one show; return their number."""
+def _tracks(pixel, seen, still, K, ray, precision):
+    """Write x and y on the plane at depth 1, and the precision in the earlier views, of the still corners that the
+    newest view and another one show; return their number."""
     views, tracks = seen.shape[1], 0
     for n in range(len(seen)):
         others = 0
         for k in range(views - 1):
             others += seen[n, k]
-        if not seen[n, views - 1] or others == 0:
+        if not (still[n] and seen[n, views - 1]) or others == 0:
             continue
         for k in range(views):
             ray[tracks, k, 0] = (pixel[n, k, 0] - K[0, 2]) / K[0, 0]

@@ -65,8 +65,8 @@ class Views(NamedTuple):
 
     def first(self, count: int) -> Views:
         """The first ``count`` keyframes."""
-        slot, share, H, b, noise = (column[:count] for column in self[1:])
-        return Views(self.image, slot, share, H, b, noise)
+        numbers = self.slot[:count], self.share[:count]
+        return Views(self.image, *numbers, self.H[:count], self.b[:count], self.noise[:count])
 
 
 class Search(NamedTuple):

@@ -1,43 +1,128 @@
-"""Distances of matches from the epipolar lines of their poses, for ``anchors.epipolar``; on the CPU (numba)."""
+"""Distances of matches between two posed views from their epipolar lines; on the CPU (numba)."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import reordered
+from ufmstar_torch.kernels.compile_cpu import reordered_leaf
 
+# Least depth of a projected point, as a share of the median depth; the depth of nearer points is raised to it.
+NEAREST = 1e-3
+# Range of a scene's depths over the median, in which corners' points must lie. The upper limit is far above the median,
+# which is inaccurate at first.
+NEAR, FAR = 1 / 50, 10.0
 # Limit of the inverse depth, as a share of that at which a point reaches the earlier camera's focal plane.
 _AHEAD = 0.98
+# Cells of the image per axis; matches of each cell have the same total weight.
+_CELLS = 6
+# The standard deviation of most matches is that by the quantile _MOST of their distances, _MOST_QUANTILE of a standard
+# normal one. Farther than _FARTHEST times it from their lines are matches on things that move, which leave their lines
+# as a group.
+_MOST, _MOST_QUANTILE, _FARTHEST = 0.3, 0.3853, 6.0
 
 
-@reordered
-def from_lines(position, before, T, T_before, K, K_inverse, nearest, farthest, least, distance, rho, baseline):
-    """Write the results of ``anchors.epipolar.off_lines``. ``nearest`` and ``farthest`` are inverse depths, and the
-    depth of a projected point is at least ``least``."""
-    for n in range(len(position)):
-        u, v, P = before[n, 0], before[n, 1], T_before[n]
-        x = K_inverse[0, 0] * position[n, 0] + K_inverse[0, 1] * position[n, 1] + K_inverse[0, 2]
-        y = K_inverse[1, 1] * position[n, 1] + K_inverse[1, 2]
-        wx, wy = T[0, 0] * x + T[0, 1] * y + T[0, 2], T[1, 0] * x + T[1, 1] * y + T[1, 2]
-        wz = T[2, 0] * x + T[2, 1] * y + T[2, 2]
-        sx, sy, sz = T[0, 3] - P[0, 3], T[1, 3] - P[1, 3], T[2, 3] - P[2, 3]
-        baseline[n] = np.sqrt(sx * sx + sy * sy + sz * sz)
-        # The ray and the shift in the earlier camera, then in its pixels.
-        xz, bz = P[0, 2] * wx + P[1, 2] * wy + P[2, 2] * wz, P[0, 2] * sx + P[1, 2] * sy + P[2, 2] * sz
-        xy, by = P[0, 1] * wx + P[1, 1] * wy + P[2, 1] * wz, P[0, 1] * sx + P[1, 1] * sy + P[2, 1] * sz
-        xx, bx = P[0, 0] * wx + P[1, 0] * wy + P[2, 0] * wz, P[0, 0] * sx + P[1, 0] * sy + P[2, 0] * sz
-        xx, bx = K[0, 0] * xx + K[0, 1] * xy + K[0, 2] * xz, K[0, 0] * bx + K[0, 1] * by + K[0, 2] * bz
-        xy, by = K[1, 1] * xy + K[1, 2] * xz, K[1, 1] * by + K[1, 2] * bz
-        # The point must lie in front of the earlier camera, too: 1/z < x_z/-b_z.
-        most = _AHEAD * xz / max(-bz, 1e-12) if bz < 0 else np.inf
-        near, far = min(nearest, most), min(farthest, most)
-        near_z, far_z = max(xz + near * bz, least), max(xz + far * bz, least)
-        start_u, start_v = (xx + near * bx) / near_z, (xy + near * by) / near_z
-        du, dv = (xx + far * bx) / far_z - start_u, (xy + far * by) / far_z - start_v
-        share = ((u - start_u) * du + (v - start_v) * dv) / max(du * du + dv * dv, 1e-12)
-        share = min(max(share, 0.0), 1.0)
-        off_u, off_v = u - start_u - share * du, v - start_v - share * dv
-        distance[n] = np.sqrt(off_u * off_u + off_v * off_v)
-        speed_u, speed_v = bx - u * bz, by - v * bz
-        square = max(speed_u * speed_u + speed_v * speed_v, 1e-12)
-        rho[n] = ((u * xz - xx) * speed_u + (v * xz - xy) * speed_v) / square
+@reordered_leaf
+def off_line(position, before, T, P, K, K_inverse, nearest, farthest):
+    """The distance of a match from the segment of the epipolar line between two depths.
+
+    Without parallax, the segment is a point. A match that moved in the wrong direction, or not at all, lies beyond an
+    end of it.
+
+    Args:
+        position, before: [2] (u, v) in the present view and in an earlier one [px].
+        T, P: [4, 4] camera-to-world of the present view and of the earlier one [m].
+        K, K_inverse: [3, 3] [px].
+        nearest, farthest: range of the depths [m].
+
+    Returns:
+        Distance [px], inverse depth of the nearest point on the whole line [1/m], baseline [m].
+    """
+    u, v = before[0], before[1]
+    x = K_inverse[0, 0] * position[0] + K_inverse[0, 1] * position[1] + K_inverse[0, 2]
+    y = K_inverse[1, 1] * position[1] + K_inverse[1, 2]
+    wx, wy = T[0, 0] * x + T[0, 1] * y + T[0, 2], T[1, 0] * x + T[1, 1] * y + T[1, 2]
+    wz = T[2, 0] * x + T[2, 1] * y + T[2, 2]
+    sx, sy, sz = T[0, 3] - P[0, 3], T[1, 3] - P[1, 3], T[2, 3] - P[2, 3]
+    # The ray and the shift in the earlier camera, then in its pixels.
+    xz, bz = P[0, 2] * wx + P[1, 2] * wy + P[2, 2] * wz, P[0, 2] * sx + P[1, 2] * sy + P[2, 2] * sz
+    xy, by = P[0, 1] * wx + P[1, 1] * wy + P[2, 1] * wz, P[0, 1] * sx + P[1, 1] * sy + P[2, 1] * sz
+    xx, bx = P[0, 0] * wx + P[1, 0] * wy + P[2, 0] * wz, P[0, 0] * sx + P[1, 0] * sy + P[2, 0] * sz
+    xx, bx = K[0, 0] * xx + K[0, 1] * xy + K[0, 2] * xz, K[0, 0] * bx + K[0, 1] * by + K[0, 2] * bz
+    xy, by = K[1, 1] * xy + K[1, 2] * xz, K[1, 1] * by + K[1, 2] * bz
+    # The point must lie in front of the earlier camera, too: 1/z < x_z/-b_z.
+    most = _AHEAD * xz / max(-bz, 1e-12) if bz < 0 else np.inf
+    near, far = min(1 / nearest, most), min(1 / farthest, most)
+    near_z, far_z = max(xz + near * bz, NEAREST), max(xz + far * bz, NEAREST)
+    start_u, start_v = (xx + near * bx) / near_z, (xy + near * by) / near_z
+    du, dv = (xx + far * bx) / far_z - start_u, (xy + far * by) / far_z - start_v
+    share = ((u - start_u) * du + (v - start_v) * dv) / max(du * du + dv * dv, 1e-12)
+    share = min(max(share, 0.0), 1.0)
+    off_u, off_v = u - start_u - share * du, v - start_v - share * dv
+    speed_u, speed_v = bx - u * bz, by - v * bz
+    square = max(speed_u * speed_u + speed_v * speed_v, 1e-12)
+    rho = ((u * xz - xx) * speed_u + (v * xz - xy) * speed_v) / square
+    return np.sqrt(off_u * off_u + off_v * off_v), rho, np.sqrt(sx * sx + sy * sy + sz * sz)
+
+
+@reordered_leaf
+def on_lines(distance, pixel, size, least, fits, weight, order):
+    """The largest group of matches that lie on their epipolar lines: those nearer than six standard deviations of the
+    nearest 30 %, by area.
+
+    Args:
+        distance: [N] from the lines, over the standard deviation of tracking or in pixels.
+        pixel: [N, 2] (u, v).
+        size: width and height of the image [px].
+        least: of the standard deviation, in the unit of ``distance``.
+        fits: [N] True in the group, overwritten.
+        weight: [N] by area, overwritten, as a moving object may have most of the corners.
+        order: [N] buffer.
+    """
+    for n in range(len(distance)):
+        column = min(max(int(pixel[n, 0] * _CELLS / size[0]), 0), _CELLS - 1)
+        order[n] = min(max(int(pixel[n, 1] * _CELLS / size[1]), 0), _CELLS - 1) * _CELLS + column
+    for n in range(len(distance)):
+        count = 0
+        for m in range(len(distance)):
+            count += order[m] == order[n]
+        weight[n], fits[n] = 1 / count, True
+    sigma = max(weighted_quantile(distance, weight, fits, _MOST, order) / _MOST_QUANTILE, least)
+    for n in range(len(distance)):
+        fits[n] = distance[n] <= _FARTHEST * sigma
+
+
+@reordered_leaf
+def weighted_quantile(values, weight, chosen, share, order):
+    """The quantile ``share`` of the chosen values [N], at least one, with weights [N]; ``order`` is a buffer [N]."""
+    count, total = 0, 0.0
+    for n in range(len(values)):
+        if chosen[n]:
+            order[count] = n
+            count += 1
+            total += weight[n]
+    gap = 1
+    while gap < count // 3:
+        gap = 3 * gap + 1
+    while gap > 0:  # Shell's sort
+        for i in range(gap, count):
+            n, j = order[i], i
+            while j >= gap and values[order[j - gap]] > values[n]:
+                order[j] = order[j - gap]
+                j -= gap
+            order[j] = n
+        gap //= 3
+    below = 0.0
+    for i in range(count):
+        below += weight[order[i]]
+        if below >= share * total:
+            return values[order[i]]
+    return values[order[count - 1]]
+
+
+@reordered_leaf
+def first_view(seen):
+    """Index of the first view [W] that shows a corner; W if none does."""
+    for k in range(len(seen)):
+        if seen[k]:
+            return k
+    return len(seen)

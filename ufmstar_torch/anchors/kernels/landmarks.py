@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.anchors.kernels.check import CERTAIN
 from ufmstar_torch.anchors.kernels.dense import cells, steepest
-from ufmstar_torch.anchors.kernels.order import MEDIAN_SQUARE, median
+from ufmstar_torch.anchors.kernels.numbers import MEDIAN_SQUARE, median
 from ufmstar_torch.anchors.kernels.windows import (
     COUNT,
     FARTHEST,

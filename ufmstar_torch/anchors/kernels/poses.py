@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.anchors.kernels.cholesky import factored, inverted
 from ufmstar_torch.anchors.kernels.dense import ACROSS, ACROSS_NOISE, ALONG, NOISE, SLOPE, SPEED, VALUE
-from ufmstar_torch.anchors.kernels.order import MEDIAN_SQUARE, median
+from ufmstar_torch.anchors.kernels.numbers import MEDIAN_SQUARE, finite, median
 from ufmstar_torch.kernels.compile_cpu import empty, leaf, reordered, reordered_leaf
 from ufmstar_torch.kernels.cpu.sample import smallest
 
@@ -131,7 +131,7 @@ def correct(pixel, accepted, measured, views, K, K_inverse, depth, trusted, memo
             return
     for i in range(size):
         for j in range(size):
-            if not np.isfinite(covariance[i, j]):  # never store NaN
+            if not finite(covariance[i, j]):  # never store NaN
                 return
     learn_poses(error, covariance, shares, depth, K[0, 0], memory, errors)
     if trusted:

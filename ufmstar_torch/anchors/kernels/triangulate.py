@@ -7,12 +7,11 @@ on the point: Cov X = sigma^2 (J^T J)^-1. ``tests/oracle_triangulate.py`` is the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.gaussians.camera import inverse_intrinsics
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, part
 
 # From the rays' nearest point the reprojection error converges quadratically; three steps reach rounding on all but the
@@ -26,8 +25,7 @@ DAMPING = 1e-12
 # NumPy's error model: divisions are not tested for zero, and degenerate geometry gives a covariance that is not finite.
 
 
-@dataclass(frozen=True, eq=False)
-class Triangulated:
+class Triangulated(NamedTuple):
     """N points in world coordinates.
 
     Attributes:
@@ -55,16 +53,9 @@ def triangulate(
         K: [3, 3] [px].
     """
     n = len(pixel)
-    point, covariance = np.empty((n, 3)), np.empty((n, 3, 3))
-    error, ahead = np.empty(n), np.empty(n, dtype=np.bool_)
-    origin = T_world_cam[:, :3, 3].mean(0)
-    centre, rotation = T_world_cam[:, :3, 3] - origin, T_world_cam[:, :3, :3]
-    scale = np.diag([0.0, 0.0, 1.0])
-    scale[:2, :2] = K[:2, :2]
-    to_image = np.ascontiguousarray(scale @ rotation.transpose(0, 2, 1))
-    to_ray = np.ascontiguousarray(rotation @ inverse_intrinsics(scale))
-    _tracks(pixel - K[:2, 2], seen, to_image, to_ray, centre, DAMPING, STEPS, point, covariance, error, ahead)
-    return Triangulated(point + origin, covariance, error, ahead)
+    result = Triangulated(np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n), np.empty(n, dtype=np.bool_))
+    _tracks(pixel, seen, T_world_cam, K, DAMPING, STEPS, *result)
+    return result
 
 
 # Tracks that are computed at once: a few vectors of any processor. Rows of a buffer: the points, the normal equations
@@ -74,10 +65,11 @@ _X, _Y, _Z, _N00, _N01, _N02, _N11, _N12, _N22, _R0, _R1, _R2, _SQUARES, _FRONT 
 
 
 @kernel
-def _tracks(pixel, seen, to_image, to_ray, centre, damping, steps, point, covariance, error, ahead):
-    """Pixels [N, W, 2] are counted from the principal point. ``to_image`` [W, 3, 3] takes an offset from a camera to
-    (u z, v z, z) in its image, ``to_ray`` [W, 3, 3] a pixel (u, v, 1) to the direction of its ray."""
+def _tracks(pixel, seen, T, K, damping, steps, point, covariance, error, ahead):
     views = seen.shape[1]
+    to_image, to_ray = empty((views, 3, 3), np.float64), empty((views, 3, 3), np.float64)
+    centre, origin = empty((views, 3), np.float64), empty(3, np.float64)
+    _cameras(T, K, to_image, to_ray, centre, origin)
     obs, work, inverse = (
         empty((views, 3 * _LANES), np.float64),
         empty(14 * _LANES, np.float64),
@@ -88,7 +80,7 @@ def _tracks(pixel, seen, to_image, to_ray, centre, damping, steps, point, covari
         for w in range(views):
             for lane in range(_LANES):
                 n = first + min(lane, count - 1)
-                u, v = (pixel[n, w, 0], pixel[n, w, 1]) if seen[n, w] else (0.0, 0.0)
+                u, v = (pixel[n, w, 0] - K[0, 2], pixel[n, w, 1] - K[1, 2]) if seen[n, w] else (0.0, 0.0)
                 obs[w, lane], obs[w, _LANES + lane], obs[w, 2 * _LANES + lane] = u, v, 1.0 if seen[n, w] else 0.0
         _nearest(obs, to_ray, centre, work)
         for step in range(steps + 1):
@@ -108,10 +100,30 @@ def _tracks(pixel, seen, to_image, to_ray, centre, damping, steps, point, covari
             for w in range(views):
                 shown += seen[n, w]
             for i in range(3):
-                point[n, i] = work[i * _LANES + lane]
+                point[n, i] = work[i * _LANES + lane] + origin[i]
             error[n] = (work[_SQUARES + lane] / max(2 * shown, 1)) ** 0.5
             ahead[n] = work[_FRONT + lane] > 0
             _inverse(work, lane, damping, covariance[n])
+
+
+@part
+def _cameras(T, K, to_image, to_ray, centre, origin):
+    """Of views with poses [W, 4, 4], whose pixels are counted from the principal point: ``to_image`` [W, 3, 3] takes an
+    offset from a camera to (u z, v z, z) in its image, ``to_ray`` [W, 3, 3] a pixel (u, v, 1) to the direction of its
+    ray; ``centre`` [W, 3] counts from their mean, the ``origin`` [3]."""
+    fx, fy, skew = K[0, 0], K[1, 1], K[0, 1]
+    for i in range(3):
+        total = 0.0
+        for w in range(len(T)):
+            total += T[w, i, 3]
+        origin[i] = total / len(T)
+    for w in range(len(T)):
+        for i in range(3):
+            centre[w, i] = T[w, i, 3] - origin[i]
+            to_image[w, 0, i] = fx * T[w, i, 0] + skew * T[w, i, 1]
+            to_image[w, 1, i], to_image[w, 2, i] = fy * T[w, i, 1], T[w, i, 2]
+            to_ray[w, i, 0] = T[w, i, 0] / fx
+            to_ray[w, i, 1], to_ray[w, i, 2] = T[w, i, 1] / fy - T[w, i, 0] * (skew / (fx * fy)), T[w, i, 2]
 
 
 @part
