@@ -25,9 +25,10 @@ from ufmstar_torch.kernels.cpu import fuse as fuse_cpu
 from ufmstar_torch.kernels.cpu import regress as regress_cpu
 from ufmstar_torch.kernels.cpu import rigid as rigid_cpu
 from ufmstar_torch.kernels.cpu import segment as segment_cpu
-from ufmstar_torch.kernels.cpu import stream as stream_cpu
+from ufmstar_torch.kernels.cpu.regress_cull import Seen
 from ufmstar_torch.kernels.select import select_frame, select_kernels
 from ufmstar_torch.steps.correspond import Correspondence
+from ufmstar_torch.steps.regress import Regression
 from ufmstar_torch.steps.step import REFERENCE, Kernels
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"  # must be set before triton is imported
@@ -131,7 +132,7 @@ def _corresponding(previous, current, intrinsics, size, config):
     thresholds = (config.eta, config.eta_occlusion, config.near_plane, gaussian.PIXEL_VARIANCE)
     for b in range(previous.streams):
         mixtures = [value for m in (previous, current) for value in (_by_field(m, b), m.capacity)]
-        c, k, beta = compiled(correspond_cpu.matches)(*mixtures, intrinsics[b].double().numpy(), *size, thresholds)
+        (c, k), beta = compiled(correspond_cpu.matches)(*mixtures, intrinsics[b].double().numpy(), *size, thresholds)
         match[b, c, k], overlap[b, c, k] = True, torch.from_numpy(beta)
         assert np.array_equal(np.stack([c, k], 1), match[b].nonzero().numpy())
     return Correspondence(match, overlap)
@@ -155,14 +156,13 @@ def _fused(previous, current, pairs, view, config, *, rounds=None):
 
 
 def _floored(cov, floor):
-    out, mean = cov.clone(), torch.zeros(*cov.shape[:-2], 3, dtype=cov.dtype)
-    mean[..., 2] = floor.sqrt()  # a camera whose pixel is 1 wide at depth 1
-    arrays = (value.numpy() for value in (mean.view(-1, 3), out.view(-1, 3, 3), torch.ones_like(floor).view(-1)))
-    stream_cpu.lift(*arrays, 0.0, 1.0, 1.0, 0.0)
+    out, work = cov.clone(), np.empty(fuse_cpu.WORK)
+    for one, least in zip(out.view(-1, 3, 3).numpy(), floor.flatten().tolist(), strict=True):
+        compiled(fuse_cpu.floor_covariance)(one, least, work)
     return out
 
 
-def seen(m: GaussianMixture, features: int | None = None) -> list[regress_cpu.Seen]:
+def seen(m: GaussianMixture, features: int | None = None) -> list[Seen]:
     """The occupied slots of each stream as arguments of the compiled regression; ``features``: that many zero
     features."""
     out = []
@@ -172,10 +172,11 @@ def seen(m: GaussianMixture, features: int | None = None) -> list[regress_cpu.Se
         components = np.zeros((rigid_cpu.FIELDS, rigid_cpu.padded(len(rows))))
         components[:, : len(rows)] = rows.T
         feature_rows = m.features[b][at].double().numpy() if features is None else np.zeros((len(rows), features))
-        out.append(regress_cpu.Seen(components, m.disagreement[b][at].double().numpy(), feature_rows))
+        out.append(Seen(components, m.disagreement[b][at].double().numpy(), feature_rows))
     return out
 
 
 def _regressed(m, depth, intrinsics, valid, config, pixels=None):
-    positive = torch.where(valid, depth, 0)
-    return regress_cpu.regress_maps(seen(m), positive, intrinsics, config, pixels)
+    positive, K = torch.where(valid, depth, 0).numpy(), intrinsics.double().numpy()
+    M, features = regress_cpu.regression(seen(m), positive, K, config, None if pixels is None else pixels.numpy())
+    return Regression(torch.from_numpy(M), torch.from_numpy(np.moveaxis(features, 1, -1)))

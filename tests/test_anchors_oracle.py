@@ -19,7 +19,7 @@ from ufmstar_torch.anchors.evidence import Evidence, inliers
 from ufmstar_torch.anchors.kernels import learn as anchors_cpu
 from ufmstar_torch.anchors.learn import Learnt, learn
 from ufmstar_torch.frames.frame import check_frame
-from ufmstar_torch.kernels.cpu.regress import regress_maps, views_of
+from ufmstar_torch.kernels.cpu.regress import regression, views_of
 from ufmstar_torch.steps.regress import distribute
 
 pytestmark = pytest.mark.numerics
@@ -169,11 +169,13 @@ def test_what_was_learnt_may_be_small_and_is_moved_by_the_streams(sparse):
     walked(torch.tensor(depths[0])[None], torch.tensor(poses[0]), torch.tensor(K))
     seen = seen_of(walked.mixture, features=3)
     seen[0].features[:] = 1e-32, 0.5, 1.0
-    pixels = torch.arange(0, HEIGHT * WIDTH, 7)[None] if sparse else None
+    pixels = np.arange(0, HEIGHT * WIDTH, 7)[None] if sparse else None
     depth = torch.tensor(depths[0], dtype=torch.float32)[None].nan_to_num(0, posinf=0).clamp_min(0)
-    arguments = seen, depth, torch.tensor(K)[None], ANCHORED, pixels, None
-    plain = regress_maps(*arguments).features
-    moved = regress_maps(*arguments, np.array([[0.25, -0.125]])).features
+    arguments = seen, depth.numpy(), K[None], ANCHORED, pixels, None
+    plain, moved = (
+        torch.from_numpy(np.moveaxis(regression(*arguments, shift)[1], 1, -1))
+        for shift in (None, np.array([[0.25, -0.125]]))
+    )
     offset = torch.tensor([0.25, -0.125, 0.0])
     torch.testing.assert_close(moved, plain + offset, rtol=5e-7, atol=5e-8, equal_nan=True)
     fine = plain[~plain[..., 0].isnan()]
@@ -207,7 +209,7 @@ def test_the_compiled_lesson_is_the_references_own(n, dtype, tolerance):
         anchored = replace(frame, anchors=anchors)
         a = learn(a.tensors(), mixture, anchored, config, distribute)
         components = seen_of(mixture, features=3)
-        views = views_of(components, frame.depth, frame.intrinsics, config, dtype)
+        views = views_of(components, frame.depth.numpy(), frame.intrinsics.numpy(), config, dtype)
         b = anchors_cpu.learn_in_view(b.tensors(), mixture.capacity, components, views, anchored, config)
         slow, fast = a.evidence, b.evidence
         assert torch.equal(a.used, b.used)

@@ -29,7 +29,7 @@ from ufmstar_torch.eval.commands import live as live_command
 from ufmstar_torch.eval.run import rerun_log
 from ufmstar_torch.eval.sequences import live as sources
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.eval.sequences.live import PoseFile, growing_folder, json_lines, replay
+from ufmstar_torch.eval.sequences.live import LONGEST_LINE, PoseFile, growing_folder, json_lines, replay
 from ufmstar_torch.eval.tour import export_tour
 from ufmstar_torch.files.write import hold
 from ufmstar_torch.frames.prediction import NetworksInTurn
@@ -189,25 +189,39 @@ def test_lines_of_json(tmp_path):
     np.testing.assert_array_equal(file.image, image)
     np.testing.assert_array_equal(both.image, image)
     np.testing.assert_array_equal(both.T_world_cam, np.eye(4))
-    assert file.intrinsics.tolist() == [5, 5, 4, 4]
+    assert file.intrinsics.tolist() == [[5, 0, 4], [0, 5, 4], [0, 0, 1]]
+
+
+def test_an_unfinished_last_line_and_names_that_no_file_has_are_left_out(tmp_path, caplog):
+    """As of a program that is killed; a line without an end is refused."""
+    lines = ['\ufeff{"stamp": 1, "pose": [1, 2, 3, 0, 0, 0, 1], "intrinsics": [9, 9, 4, 4]}\n']
+    lines += [json.dumps({"stamp": 2, "image": name}) + "\n" for name in (5000 * "a" + ".png", "\0.png", "")]
+    assert [event.stamp for event in json_lines([*lines, '{"stamp": 3, "pose": [1, 2'], tmp_path)] == [1]
+    assert "line 5 is unfinished and left out" in caplog.text
+    assert "3 images could not be read" in caplog.text
+    with pytest.raises(ValueError, match="line 1: it is longer than"):
+        list(json_lines(["0" * LONGEST_LINE], tmp_path))
 
 
 @pytest.mark.parametrize(
     ("line", "text"),
     [
-        ("{", "line 1: no JSON: {"),
+        ("{\n", "line 1: no JSON: {"),
         ("[1]", "line 1: expected"),
         ('{"stamp": 1}', "line 1: a stamp and a pose or an image"),
         ('{"stamp": 1, "poses": []}', "line 1: expected"),
         ('{"stamp": "now", "pose": [1, 2, 3, 0, 0, 0, 1]}', "line 1: a stamp is a finite number .*'now'"),
         ('{"stamp": 1, "pose": [1, 2, 3]}', r"line 1: a pose has 7 \(x y z qx qy qz qw\) or 12"),
         ('{"stamp": 1, "pose": [1, 2, 3, 0, 0, 0, 2]}', "line 1: pose: the quaternion's norm is 2"),
-        ('{"stamp": 1, "pose": [[1, 2], [3]]}', "line 1: "),
+        ('{"stamp": 1, "pose": [[1, 2], [3]]}', "line 1: a pose has 7"),
+        ('{"stamp": 1, "pose": {"x": 1}}', "line 1: a pose has 7"),
         (
             '{"stamp": 1, "image": "none.png"}',
             "line 1: an image needs intrinsics, in its line, an earlier",
         ),
         ('{"intrinsics": [1, 2]}', "line 1: intrinsics are fx, fy, cx, cy"),
+        ('{"intrinsics": "9 9 4 4"}', "line 1: intrinsics are fx, fy, cx, cy"),
+        ('{"intrinsics": [0, 9, 4, 4]}', "line 1: intrinsics must be a finite 3x3 matrix with positive focal lengths"),
         ('{"stamp": 1, "image": "data:;base64,%", "intrinsics": [9, 9, 4, 4]}', "line 1: "),
         *(
             (f'{{"stamp": {stamp}, "pose": [1, 2, 3, 0, 0, 0, 1]}}', "line 1: .*(finite|too large)")
@@ -324,7 +338,7 @@ def test_intrinsics_hold_for_later_lines_and_images_may_be_missing(tmp_path, cap
     ]
     events = list(json_lines(map(json.dumps, lines), tmp_path))
     assert [(event.stamp, event.image is not None) for event in events] == [(1, True), (3, False), (4, True), (5, True)]
-    assert [event.intrinsics[0] for event in events] == [9, 9, 8, 8]
+    assert [event.intrinsics[0, 0] for event in events] == [9, 9, 8, 8]
     assert "line 3: the image is left out: " in caplog.text
     assert "2 images could not be read" in caplog.text
 

@@ -12,8 +12,8 @@ import torch
 from test_posterior import MODEL, K, checked, scene
 
 from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig
-from ufmstar_torch.anchors import Anchors, landmark_source, motion
-from ufmstar_torch.anchors.motion import LANDMARK, LINE, SEARCH, MotionTests, located, moves
+from ufmstar_torch.anchors import Anchors, landmark_source
+from ufmstar_torch.anchors.motion import LANDMARK, LINE, SEARCH, MotionTest, MotionTests, located, moves
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.kernels.compile_cpu import kernel
@@ -30,7 +30,7 @@ def searches(failing, seed=0):
     rng = np.random.default_rng(seed)
     row, column = np.indices((12, 16)).reshape(2, -1)
     pixel = (np.stack([column, row], 1) + rng.uniform(0.1, 0.9, (192, 2))) * CELL
-    return motion.Tested.of((pixel, SEARCH, pixel[:, 0] < failing * CELL))
+    return [MotionTest(SEARCH, pixel, pixel[:, 0] < failing * CELL, np.ones(192, bool))]
 
 
 # --- tests in images -----------------------------------------------------------------------------------------
@@ -47,9 +47,9 @@ def test_a_region_whose_tests_fail_moves_and_one_whose_tests_pass_does_not():
 def test_the_log_ratio_is_the_weighted_sum_of_the_tests_log_ratios():
     tests = MotionTests(0.8)
     pixel = np.array([[45.0, 45.0], [45.0, 45.0], [45.0, 45.0]])
-    parts = [(pixel[:1], SEARCH, np.array([True])), (pixel[:1], LANDMARK, np.array([True])),
-             (pixel[:1], LINE, np.array([False]))]  # fmt: skip
-    ratios = tests.log_ratios(motion.Tested.of(*parts), SHAPE, CELL)
+    parts = [MotionTest(kind, pixel[:2], np.array([kind != LINE, True]), np.array([True, False]))
+             for kind in (SEARCH, LANDMARK, LINE)]  # fmt: skip
+    ratios = tests.log_ratios(parts, SHAPE, CELL)
     failing = (0.8 * 50 * np.array([0.4, 0.06, 0.06]) + [1, 1, 0]) / (0.8 * 50 + 1)
     fails = np.log((failing + (1 - failing) * [0.4, 0.4, 0.1]) / failing)
     expected = 0.22 * fails[0] + 0.43 * fails[1] + 0.87 * np.log(0.9)
@@ -66,8 +66,8 @@ def test_where_tests_fail_everywhere_nothing_moves_more_than_elsewhere():
 
 
 def test_without_a_test_nothing_is_known():
-    nothing = motion.Tested.of((np.zeros((0, 2)), SEARCH, np.zeros(0, bool)))
-    assert not MotionTests(0.8).log_ratios(nothing, SHAPE, CELL).any()
+    nothing = MotionTest(SEARCH, np.zeros((0, 2)), np.zeros(0, bool), np.zeros(0, bool))
+    assert not MotionTests(0.8).log_ratios([nothing], SHAPE, CELL).any()
 
 
 def test_the_state_of_the_tests_goes_on_to_the_bit():

@@ -16,9 +16,8 @@ from ufmstar_torch.anchors.check import check_anchors
 from ufmstar_torch.frames.frame import check_frame
 from ufmstar_torch.kernels.compile_cpu import kernel
 from ufmstar_torch.posterior import field
-from ufmstar_torch.posterior.config import constants
 from ufmstar_torch.posterior.moments import divide, second_moments
-from ufmstar_torch.posterior.running import FEATURES, RATIOS, SIZE, priors, views, write_ratios
+from ufmstar_torch.posterior.running import FEATURES, RATIOS, SIZE, constants, priors, views, write_ratios
 from ufmstar_torch.posterior.scene import SIDE, elsewhere_variance
 from ufmstar_torch.posterior.update import update
 

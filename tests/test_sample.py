@@ -21,14 +21,22 @@ def test_the_fast_sample_is_that_of_the_reference(count):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("n", [1, 2, 1000])
 def test_the_fast_statistics_are_those_of_the_reference_to_the_last_bit(n, dtype):
-    values = torch.randn(3, 4, n, generator=torch.Generator().manual_seed(n), dtype=dtype)
+    generator = torch.Generator().manual_seed(n)
+    values = torch.randn(3, 4, n, generator=generator, dtype=dtype)
     values[:, 1, ::2] = torch.nan
     values[:, 2] = torch.nan
-    found, expected = compiled.sample_statistics(values), reference.sample_statistics(values)
-    for name, value in vars(expected).items():
-        other = getattr(found, name)
-        assert other.dtype == value.dtype, name
-        assert torch.equal(other.nan_to_num(-1), value.nan_to_num(-1)), name
+    used, measured = torch.rand(2, 4, n, generator=generator)
+    used[3] = 0
+    arguments = list(values), used > 0.2, measured, torch.tensor([n, 3 * n, n + 1, 0])
+    found, expected = compiled.sample_summary(*arguments), reference.sample_summary(*arguments)
+    assert len(found[0]) == len(expected[0]) == 3
+    torch.testing.assert_close(found[1], expected[1], rtol=4 * torch.finfo(dtype).eps, atol=0, equal_nan=True)
+    pairs = [(found[2], expected[2])]
+    for a, b in zip(found[0], expected[0], strict=True):
+        pairs += [(getattr(a, name), value) for name, value in vars(b).items()]
+    for other, value in pairs:
+        assert other.dtype == value.dtype
+        assert torch.equal(other.nan_to_num(-1), value.nan_to_num(-1))
 
 
 def test_the_mean_of_the_variance_has_the_gradient_of_the_network():

@@ -167,6 +167,12 @@ def test_images_that_show_nothing_are_found(kind):
     assert not bool(ImageCheck().informative(floats, torch.eye(4)))
 
 
+@pytest.mark.parametrize("shape", [(2, 3, 36, 40), (1, 3, 7, 20), (1, 3, 60, 401)])
+def test_bytes_and_floats_of_an_image_have_the_same_cells(shape):
+    image = torch.from_numpy(np.random.default_rng(0).integers(0, 256, shape, np.uint8))
+    torch.testing.assert_close(reduced(image), reduced(image.double() / 255).float(), rtol=1e-6, atol=1e-4)
+
+
 class Guess(torch.nn.Module):
     """Predicts almost the same depth for every image."""
 

@@ -187,7 +187,7 @@ def test_a_cold_start_compiles_all_and_a_warm_one_nothing(tmp_path):
         return json.loads(done.stdout)
 
     cold, warm = run(), run()
-    assert {"scan_rows", "exact"} <= set(cold["names"])
+    assert {"fit", "exact"} <= set(cold["names"])
     assert not warm["names"]
     assert cold["sum"] == warm["sum"]
     for result in (cold, warm):

@@ -171,7 +171,7 @@ class UfMStar(StatefulModule):
         kernels = self._kernels(depth.device.type)[1].sample
         index, used = kernels.pixels(frame.valid, *sample_size(frame.size, pixels, fraction, seed))
         out = self._observe(frame, index, average=require_flag("average", average))
-        return mean_uncertainty(out, used, kernels.statistics)
+        return mean_uncertainty(out, used, kernels.summary)
 
     def warm_up(
         self, size: tuple[int, int], *, streams: int = 1, progress: Callable[[int, int], object] | None = None

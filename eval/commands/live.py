@@ -221,7 +221,8 @@ def _events(options: LiveOptions, K: NDArray[np.float64] | None) -> Iterator[Liv
         return sources.replay(sequence, options.speed)
     scale = 1.0 if opening.pose_scale is None else opening.pose_scale
     if options.source == _STANDARD_INPUT:
-        return sources.json_lines(sys.stdin, ".", opening.poses, scale, K)
+        lines = iter(lambda: sys.stdin.readline(sources.LONGEST_LINE), "")
+        return sources.json_lines(lines, ".", opening.poses, scale, K)
     poses = sources.PoseFile(str(opening.trajectory), opening.poses, scale)
     if options.follow:
         return sources.growing_folder(options.source, poses, options.idle)

@@ -144,13 +144,12 @@ def export_cloud(frames: Iterator[RunFrame], out: Path, voxel: float) -> str:
     Pixels over 2^20 voxels from the first camera, along an axis, are left out and counted. Raises ValueError: no pixel
     is left.
     """
-    origin, far, beyond = None, 0, 0
+    origin, far = None, 0
     keys, sums = np.zeros(0, np.int64), np.zeros((0, 8))
     waiting: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
     coloured = False
     for frame in frames:
         coloured |= frame.image is not None
-        beyond += frame.left_out
         origin = np.floor(frame.T_world_cam[:3, 3] / voxel) if origin is None else origin
         number, values = _voxels(frame, voxel, origin)
         near = (np.abs(number) < _HALF).all(axis=1)
@@ -162,8 +161,8 @@ def export_cloud(frames: Iterator[RunFrame], out: Path, voxel: float) -> str:
     keys, sums = _merged([(keys, sums), *waiting])
     left_out = f"{far} pixels over {_HALF * voxel:.4g} m from the first camera left out (--voxel {voxel:g})" * bool(far)
     if not len(keys):
-        limits = f"all {beyond} pixels exceed the limits of sigma: raise these, or run without --plain" * bool(beyond)
-        raise ValueError(f"{out}: the cloud is empty: {left_out or limits or 'no pixel has a depth'}")
+        reason = left_out or "no pixel has a depth within the limits of sigma: raise these, or run without --plain"
+        raise ValueError(f"{out}: the cloud is empty: {reason}")
     weight, count = sums[:, :1], sums[:, 7:]
     position, colour, sigma = sums[:, 1:4] / weight, sums[:, 4:7] / weight, np.sqrt(count / weight)
     kinds, columns = dict.fromkeys(("x", "y", "z"), "<f8") | {"sigma": "<f4"}, [position, sigma]

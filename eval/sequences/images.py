@@ -47,9 +47,9 @@ def read_color(path: str | Path, content: bytes | None = None) -> np.ndarray:
     """An image of a file, or of its ``content``, as [H, W, 3] uint8 RGB; grey is repeated. 16 bits are scaled by the
     range of the images in the folder (without a folder: of the image), and transparent colours are blended with black.
     Raises FrameError: missing, truncated, corrupt, or an image of floating-point or negative numbers."""
-    if content is None and (plain := _plain_png(Path(path))) is not None:
-        return plain
     try:
+        if content is None and (plain := _plain_png(Path(path))) is not None:
+            return plain
         with Image.open(path if content is None else BytesIO(content)) as image:
             require_pixels("the image", (image.height, image.width))
             if (values := _deep_values(path, image, content)) is not None:

@@ -12,6 +12,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -21,15 +22,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.eval.sequences.attach import stem_times
-from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence, check_intrinsics
 from ufmstar_torch.eval.sequences.images import IMAGE_SUFFIXES, is_hidden, listed_path, read_color
-from ufmstar_torch.eval.sequences.poses import in_metres, parse_pose, poses_from_columns
+from ufmstar_torch.eval.sequences.intrinsics import pinhole
+from ufmstar_torch.eval.sequences.poses import in_metres, numbers, parse_pose, poses_from_columns
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.gaussians.conventions import CONVENTIONS, OURS
 
 _FPS = 30.0  # of a recording without timestamps
 _POLL = 0.01  # [s] interval of polling a folder
 _KEPT = 256  # [bytes] of each end of a file of poses, by which a file that was written anew is recognised
+LONGEST_LINE = 2**28  # characters of JSON; an image of 12 megapixels has 2**26 at most
 _UNREADABLE = 1.0  # [s] largest time to write an image
 
 
@@ -186,15 +189,20 @@ def json_lines(
     ``pose`` has 7 numbers, or the 12 or 16 of a matrix (nested or not). ``image`` is a file, or its content as
     ``"data:;base64,..."``. ``intrinsics`` are fx, fy, cx, cy; they hold for later lines too, and may stand alone in a
     line. Another line has a stamp and at least one of pose and image. Relative files are in ``folder``; poses are as in
-    :class:`PoseFile`. An image that cannot be read is left out; the first one and their number are logged. Raises
-    ValueError: a line has another form, or an image is without intrinsics; the message has its number.
+    :class:`PoseFile`. An image that cannot be read is left out; the first one and their number are logged, and so is a
+    last line that ends in its middle, as of a program that was killed. Raises ValueError: a line has another form or
+    ``LONGEST_LINE`` characters, or an image is without intrinsics; the message has the line's number.
     """
     convert, unreadable, K = CONVENTIONS[convention].convert, 0, intrinsics
     for number, line in enumerate(lines, start=1):
         if not line.strip():
             continue
         try:
-            event = _fields(line)
+            if len(line) >= LONGEST_LINE:
+                raise ValueError(f"it is longer than {LONGEST_LINE:,} characters")
+            if (event := _fields(line)) is None:
+                LOGGER.warning("line %d is unfinished and left out", number)
+                break
             K = _intrinsics(event["intrinsics"]) if "intrinsics" in event else K
             if event.keys() == {"intrinsics"}:
                 continue
@@ -215,12 +223,14 @@ def json_lines(
         LOGGER.warning("%d images could not be read", unreadable)
 
 
-def _fields(line: str) -> dict[str, Any]:
-    """The fields of a line of JSON: intrinsics alone, or a stamp with a pose, an image or both. Raises ValueError:
-    another form."""
+def _fields(line: str) -> dict[str, Any] | None:
+    """The fields of a line of JSON: intrinsics alone, or a stamp with a pose, an image or both; None for an unfinished
+    line. Raises ValueError: another form."""
     try:
-        event = json.loads(line)
+        event = json.loads(line.lstrip("\ufeff"))  # the mark that Windows adds
     except json.JSONDecodeError:
+        if line.startswith("{") and not line.endswith("\n"):
+            return None
         raise ValueError(f"no JSON: {line.strip():.60}") from None
     if not isinstance(event, dict) or event.keys() - {"stamp", "pose", "image", "intrinsics"}:
         raise ValueError('expected {"stamp": s, "pose": [...], "image": "file", "intrinsics": [...]}')
@@ -234,17 +244,20 @@ def _fields(line: str) -> dict[str, Any]:
 
 
 def _intrinsics(values: Any) -> NDArray[np.float64]:
-    numbers = np.array(values, dtype=np.float64)
-    if numbers.shape not in ((4,), (3, 3)) or not np.isfinite(numbers).all():
-        raise ValueError(f"intrinsics are fx, fy, cx, cy [px], got {values!r:.60}")
-    return numbers
+    error = f"intrinsics are fx, fy, cx, cy [px], got {values!r:.60}"
+    of_matrix = isinstance(values, list) and len(values) == 3
+    K = numbers(values, (3, 3), error) if of_matrix else pinhole(*numbers(values, (4,), error))
+    check_intrinsics("intrinsics", K, None)
+    return K
 
 
 def _pose(values: Any, convert: Callable[[np.ndarray], np.ndarray], scale: float) -> NDArray[np.float64]:
-    numbers = np.array(values, dtype=np.float64).ravel()
-    if len(numbers) not in (7, 12, 16):
-        raise ValueError(f"a pose has 7 (x y z qx qy qz qw) or 12 (3x4) or 16 (4x4) numbers, got {values}")
-    return in_metres(convert(poses_from_columns(numbers[None], ["pose"])[0]), scale)
+    row = np.zeros(0)
+    with suppress(TypeError, ValueError, OverflowError):
+        row = np.array(values, dtype=np.float64).ravel()
+    if len(row) not in (7, 12, 16):
+        raise ValueError(f"a pose has 7 (x y z qx qy qz qw) or 12 (3x4) or 16 (4x4) numbers, got {values!r:.60}")
+    return in_metres(convert(poses_from_columns(row[None], ["pose"])[0]), scale)
 
 
 def _image(text: Any, folder: Path) -> NDArray[np.uint8]:

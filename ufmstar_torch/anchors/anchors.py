@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.frames.arguments import require_float, require_mask
-from ufmstar_torch.gaussians.camera import focal_and_centre
 from ufmstar_torch.gaussians.fixed_order import apply
 
 _UNCHECKED = torch.empty(0)
@@ -133,12 +132,9 @@ class Anchors:
         pixel = require_float("anchors.pixel", self.pixel).detach().double()
         if pixel.dim() != 3 or pixel.shape[2] != 2:
             raise ValueError(f"anchors.pixel must be [B, N, 2], got {tuple(pixel.shape)}")
-        (fx, fy, cx, cy), (fx_to, fy_to, cx_to, cy_to) = (
-            focal_and_centre(K.detach().double().to(pixel.device)) for K in (K_from, K_to)
-        )
-        scale = torch.stack([fx_to / fx, fy_to / fy], -1)[..., None, :]
-        offset = torch.stack([cx_to, cy_to], -1)[..., None, :] - scale * torch.stack([cx, cy], -1)[..., None, :]
-        motion = self.motion
+        (f, c), (f_to, c_to) = (_focal_and_centre(K, pixel.device) for K in (K_from, K_to))
+        scale = f_to / f
+        offset, motion = c_to - scale * c, self.motion
         if motion is not None:
             motion = torch.cat([motion[..., :2] * scale + offset, motion[..., 2:]], -1)
         return replace(self, pixel=pixel * scale + offset, motion=motion)
@@ -149,6 +145,12 @@ class Anchors:
             return self
         moved = {name: value.to(device) for name, value in vars(self).items() if value is not None}
         return replace(self, **moved)
+
+
+def _focal_and_centre(K: Tensor, device: torch.device) -> tuple[Tensor, Tensor]:
+    """The focal lengths and the principal point [..., 1, 2] of intrinsics [..., 3, 3] [px], float64."""
+    K = K.detach().to(device, torch.float64)[..., :2, :]
+    return K[..., :2].diagonal(dim1=-2, dim2=-1)[..., None, :], K[..., None, :, 2]
 
 
 def require_anchors(anchors: object) -> Anchors:

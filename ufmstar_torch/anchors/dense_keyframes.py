@@ -127,4 +127,6 @@ def halved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Average blocks of two by two pixels; an odd last row or column is dropped."""
     cv2 = opencv()
     height, width = image.shape[0] // 2, image.shape[1] // 2
+    if height == 0 or width == 0:
+        return np.zeros((height, width), np.uint8)
     return np.asarray(cv2.resize(image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
@@ -79,26 +79,40 @@ class Landmarks:
         Raises:
             ValueError: more landmarks than ``capacity``.
         """
-        n = len(self.depth)
-        rows = n if capacity is None else capacity
-        if rows < n:
-            raise ValueError(f"capacity must be at least the number of landmarks, {n}, got {capacity}")
-
-        def padded(values: NDArray) -> Tensor:
-            full = np.zeros((1, rows, *values.shape[1:]))
-            full[0, :n] = values
-            return torch.from_numpy(full).to(intrinsics.device)
-
-        # NumPy: each torch operation takes several times as long after a network.
-        valid = torch.from_numpy(np.arange(rows)[None] < n).to(intrinsics.device)
-        frame = torch.from_numpy(np.array([[self.pose_error], [self.shared], [self.scale]])).to(intrinsics.device)
-        motion = None if self.motion is None else torch.from_numpy(self.motion[None]).to(intrinsics.device)
-        moving = torch.tensor([self.moving], device=intrinsics.device)
-        error, shared, scale = frame
-        values = padded(self.pixel), padded(self.depth), padded(self.variance)
-        result, K = Anchors(*values, valid, error, shared, scale, motion, moving), intrinsics.reshape(3, 3)
+        result, K = batched([self], intrinsics.device, capacity), intrinsics.reshape(3, 3)
         same = K.is_cpu and np.array_equal(K.numpy(), K_camera)
         return result if same else result.moved(torch.as_tensor(K_camera), K)
+
+
+def batched(landmarks: Sequence[Landmarks], device: torch.device, capacity: int | None = None) -> Anchors:
+    """The anchors [B, N] of B streams in the pixels of their images, padded and masked.
+
+    Args:
+        landmarks: of each stream.
+        device: of the anchors.
+        capacity: N; None = the largest number of landmarks.
+
+    Raises:
+        ValueError: more landmarks than ``capacity``.
+    """
+    b, n = len(landmarks), max(len(one.depth) for one in landmarks)
+    rows = n if capacity is None else capacity
+    if rows < n:
+        raise ValueError(f"capacity must be at least the number of landmarks, {n}, got {capacity}")
+    # NumPy: each torch operation takes several times as long after a network.
+    pixel, (depth, variance), valid = np.zeros((b, rows, 2)), np.zeros((2, b, rows)), np.zeros((b, rows), np.bool_)
+    tested = [one.motion for one in landmarks if one.motion is not None]
+    motion = np.full((b, max(map(len, tested)), 3), np.nan) if tested else None
+    for i, one in enumerate(landmarks):
+        n = len(one.depth)
+        pixel[i, :n], depth[i, :n], variance[i, :n], valid[i, :n] = one.pixel, one.depth, one.variance, True
+        if motion is not None and one.motion is not None:
+            motion[i, : len(one.motion)] = one.motion
+    error, shared, scale = np.array([(one.pose_error, one.shared, one.scale) for one in landmarks]).T.copy()
+    moving = np.array([one.moving for one in landmarks])
+    fields = (torch.from_numpy(x).to(device) for x in (pixel, depth, variance, valid, error, shared, scale))
+    tests = None if motion is None else torch.from_numpy(motion).to(device)
+    return Anchors(*fields, motion=tests, moving=torch.from_numpy(moving).to(device))
 
 
 class LandmarkSource(Protocol):

@@ -14,11 +14,12 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.dense import DenseEvidence
-from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, LandmarkSource, OtherCameraError
+from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, LandmarkSource, OtherCameraError, batched
 from ufmstar_torch.anchors.saved_state import SavedState
 from ufmstar_torch.anchors.sources import landmark_source
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.frames.frame import FRAME_FAULTS
+from ufmstar_torch.kernels.cpu.calls import array
 
 _LOG = logging.getLogger("ufmstar_torch")
 _CAUSES = (
@@ -34,7 +35,6 @@ SourceLike = Literal["corners", "dense"] | Path | LandmarkSource
 # Successive images that contradict their poses, or have a time offset, before a warning; a blurred one affects several.
 _SUCCESSIVE = 8
 _LARGEST_LAG = 0.5  # [images] time offset of the poses up to which there is no warning
-_FIELDS = ("pixel", "depth", "variance", "valid", "pose_error", "shared", "scale", "moving")
 
 
 class StreamLandmarks:
@@ -108,22 +108,23 @@ class StreamLandmarks:
         """
         b, replaced = len(self._sources) if image is None else len(image), self._sources
         images = None if image is None else as_bytes(image).permute(0, 2, 3, 1).contiguous().cpu().numpy()
-        T = pose.detach().double().expand(b, 4, 4).cpu().numpy()
-        K = intrinsics.detach().double().expand(b, 3, 3).cpu()
+        T, K = (
+            np.array(np.broadcast_to(array(x), (b, size, size)), np.float64) for x, size in ((pose, 4), (intrinsics, 3))
+        )
         self._require(b)
         before, faults = self._snapshots(), [0] * b
         if rotation_tolerance is not None:
             from ufmstar_torch.kernels.cpu.check import camera_faults  # kernels compile when they are first needed
 
             size = (torch.inf, torch.inf) if images is None else images.shape[1:3]
-            faults = camera_faults(T, K.numpy(), size, rotation_tolerance)
+            faults = camera_faults(T, K, size, rotation_tolerance)
         if not skip and (faulty := [f"stream {i}: {FRAME_FAULTS[fault]}" for i, fault in enumerate(faults) if fault]):
             raise ValueError("; ".join(faulty))
         try:
             result = [
                 Landmarks.skipped(FRAME_FAULTS[fault])
                 if fault
-                else self._updated(source, None if images is None else images[i], T[i], K[i].numpy())
+                else self._updated(source, None if images is None else images[i], T[i], K[i])
                 for i, (source, fault) in enumerate(zip(self._sources, faults, strict=True))
             ]
         except BaseException:
@@ -134,7 +135,7 @@ class StreamLandmarks:
         self._before, self._replaced, self.last = before, replaced, result
         for stream, landmarks in enumerate(result):
             self._warn(stream, landmarks)
-        return _batched(result, K, pose.device if image is None else image.device)
+        return batched(result, pose.device if image is None else image.device)
 
     def _warn(self, stream: int, landmarks: Landmarks) -> None:
         """Log once that a stream's poses are late, or contradict its images, in several successive images."""
@@ -216,28 +217,6 @@ class StreamLandmarks:
         for i in streams:
             source = self._sources[i]
             (source.restore if isinstance(source, SavedState) else source.load_state)(snapshots[i])
-
-
-def _batched(landmarks: Sequence[Landmarks], K: Tensor, device: torch.device) -> Anchors:
-    """The anchors [B, N] of all streams, padded and masked, in pixels of the images with intrinsics K [B, 3, 3]."""
-    capacity = max(len(one.depth) for one in landmarks)
-    by_stream = [one.anchors(K[i].numpy(), K[i], capacity) for i, one in enumerate(landmarks)]
-    if len(by_stream) == 1:
-        return by_stream[0].to(device)
-    fields = {name: torch.cat([getattr(anchors, name) for anchors in by_stream]) for name in _FIELDS}
-    return Anchors(**fields, motion=_padded([anchors.motion for anchors in by_stream])).to(device)
-
-
-def _padded(motion: Sequence[Tensor | None]) -> Tensor | None:
-    """[B, M, 3] of all streams, NaN where a stream has fewer; None if no stream has any."""
-    found = [m[0] for m in motion if m is not None]
-    if not found:
-        return None
-    result = found[0].new_full((len(motion), max(map(len, found)), 3), torch.nan)
-    for stream, m in enumerate(motion):
-        if m is not None:
-            result[stream, : m.shape[1]] = m[0]
-    return result
 
 
 def as_bytes(image: Tensor) -> Tensor:

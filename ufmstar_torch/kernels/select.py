@@ -78,7 +78,7 @@ def select_frame(name: str, device_type: str) -> FrameKernels:
         return FrameKernels(
             check_cpu.check_values,
             learn.check_anchor_values,
-            SampleKernels(sample_cpu.sample_pixels, sample_cpu.sample_statistics),
+            SampleKernels(sample_cpu.sample_pixels, sample_cpu.sample_summary),
             MergeKernels(merge_cpu.close_pairs, merge_cpu.evidence),
         )
     check = check_values

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
-from typing import Any, ClassVar
-
-import numpy as np
+from typing import ClassVar
 
 from ufmstar_torch.runtime.checked import Checked, number
 
@@ -96,13 +93,3 @@ class PosteriorConfig(Checked):
     def prior_variance(self) -> tuple[float, float, float, float]:
         """The variances of the coefficients b before the first anchor."""
         return (self.prior_sigma**2, self.slope_sigma**2, self.tilt_sigma**2, self.tilt_sigma**2)
-
-
-# A pointer to the numbers: compiled code with an argument for each of them would take longer to compile.
-_RECORD = np.dtype((np.record, [(name, np.float64) for name in PosteriorConfig.__annotations__]))
-
-
-@functools.lru_cache(maxsize=4)  # a posterior has the same config in every frame
-def constants(config: PosteriorConfig) -> Any:
-    """The settings and constants of a config as numbers by name, for compiled code."""
-    return np.array(tuple(float(getattr(config, name)) for name in _RECORD.names), _RECORD)[()]

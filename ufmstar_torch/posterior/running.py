@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -46,7 +46,17 @@ RATIOS = 9
 AMPLITUDE, ROUGHNESS, NOISE, UNSEEN, WRONG, INLIER, BETWEEN, CENTRE, CALIBRATION = range(RATIOS)
 
 
+# A pointer to the numbers: compiled code with an argument for each of them would take longer to compile.
+_RECORD = np.dtype((np.record, [(name, np.float64) for name in PosteriorConfig.__annotations__]))
+
+
 @functools.lru_cache(maxsize=4)  # a posterior has the same config in every frame
+def constants(config: PosteriorConfig) -> Any:
+    """The settings and constants of a config as numbers by name, for compiled code."""
+    return np.array(tuple(float(getattr(config, name)) for name in PosteriorConfig.__annotations__), _RECORD)[()]
+
+
+@functools.lru_cache(maxsize=4)
 def priors(config: PosteriorConfig) -> Floats:
     """[4, R] value and weight [anchors] of each ratio's prior, and the limits of the ratio. The calibration has no
     prior."""

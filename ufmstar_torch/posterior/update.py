@@ -85,7 +85,7 @@ from ufmstar_torch.frames.frame import FrameInput
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, part
 from ufmstar_torch.kernels.cpu.calls import array, each
 from ufmstar_torch.posterior.cells import finish, interpolate, steepness
-from ufmstar_torch.posterior.config import PosteriorConfig, constants
+from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.conformal import adapt, quantiles, weigh
 from ufmstar_torch.posterior.distribution import LEVELS
 from ufmstar_torch.posterior.field import at
@@ -101,6 +101,7 @@ from ufmstar_torch.posterior.running import (
     UNSEEN,
     WRONG,
     Floats,
+    constants,
     drift,
     expected,
     learn,

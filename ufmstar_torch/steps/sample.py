@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -15,6 +15,8 @@ from ufmstar_torch.frames.output import MeanUncertainty, SampleStatistics, Uncer
 from ufmstar_torch.gaussians.fixed_order import total
 from ufmstar_torch.steps.regress import HALF
 
+# The statistics of each map, the standard error of the mean of the first, and the share of measured pixels, [B] each.
+Summary: TypeAlias = tuple[list[SampleStatistics], Tensor, Tensor]
 _MAPS = ("variance", "disagreement", "aleatoric", "epistemic", "anchored", "depth")
 
 
@@ -23,43 +25,41 @@ class SampleKernels(NamedTuple):
 
     Attributes:
         pixels: see :func:`sample_pixels`.
-        statistics: see :func:`sample_statistics`; without gradients.
+        summary: see :func:`sample_summary`; without gradients.
     """
 
     pixels: Callable[[Tensor, int, int], tuple[Tensor, Tensor]]
-    statistics: Callable[[Tensor], SampleStatistics]
+    summary: Callable[[Sequence[Tensor], Tensor, Tensor, Tensor], Summary]
 
 
 def mean_uncertainty(
     out: UncertaintyOutput,
     used: Tensor,
-    statistics: Callable[[Tensor], SampleStatistics] | None = None,
+    summary: Callable[[Sequence[Tensor], Tensor, Tensor, Tensor], Summary] | None = None,
 ) -> MeanUncertainty:
     """Averages of V, M, A, E and B over the sampled pixels.
 
     Args:
         out: at the sampled pixels [B, n].
         used: [B, n] True for the pixels to average.
-        statistics: an implementation of :func:`sample_statistics` for values without a graph.
+        summary: an implementation of :func:`sample_summary` for values without a graph.
     """
     maps = {**out.maps, "depth": out.depth, "variance": out.variance}
     sampled = {name: value for name in _MAPS if (value := maps.get(name)) is not None}
-    values = torch.where(used, torch.stack(list(sampled.values())), torch.nan)
-    each = sample_statistics(values) if statistics is None or values.requires_grad else statistics(values)
-    columns = zip(*(value.unbind() for value in vars(each).values()), strict=True)
-    by_map = dict(zip(sampled, (SampleStatistics(*column) for column in columns), strict=True))
-    count, variance = used.sum(1), by_map["variance"]
-    # finite population correction: a sample of all pixels has no error
-    unsampled = 1 - count / out.statistics.valid_pixels.clamp_min(1)
+    if summary is None or out.variance.requires_grad:
+        summary = sample_summary
+    valid_pixels, measured = out.statistics.counts["valid_pixels"], maps["measured"]
+    each, standard_error, share = summary(list(sampled.values()), used, measured, valid_pixels)
+    by_map = dict(zip(sampled, each, strict=True))
     return MeanUncertainty(
-        total=variance,
+        total=by_map["variance"],
         disagreement=by_map["disagreement"],
         aleatoric=by_map.get("aleatoric"),
         epistemic=by_map.get("epistemic"),
         anchored=by_map.get("anchored"),
         depth=by_map["depth"],
-        standard_error=(variance.variance / variance.pixels * unsampled).sqrt(),
-        measured=((out.measured >= HALF) & used).sum(1) / count,
+        standard_error=standard_error,
+        measured=share,
         statistics=out.statistics,
     )
 
@@ -115,6 +115,25 @@ def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]
     return index, torch.gather(flat, 1, index)
 
 
+def sample_summary(maps: Sequence[Tensor], used: Tensor, measured: Tensor, valid_pixels: Tensor) -> Summary:
+    """Statistics of maps over a sample of pixels, see :class:`MeanUncertainty`.
+
+    Args:
+        maps: [B, n] each, the first one V.
+        used: [B, n] True for the pixels to average.
+        measured: [B, n] share that is measured.
+        valid_pixels: [B].
+    """
+    values = torch.where(used, torch.stack(list(maps)), torch.nan)
+    columns = zip(*(value.unbind() for value in vars(sample_statistics(values)).values()), strict=True)
+    each = [SampleStatistics(*column) for column in columns]
+    count = used.sum(1)
+    # finite population correction: a sample of all pixels has no error
+    unsampled = 1 - count / valid_pixels.clamp_min(1)
+    standard_error = (each[0].variance / each[0].pixels * unsampled).sqrt()
+    return each, standard_error, ((measured >= HALF) & used).sum(1) / count
+
+
 def sample_statistics(values: Tensor) -> SampleStatistics:
     """Statistics of maps over a sample of pixels.
 
@@ -141,4 +160,4 @@ def random_order(pixels: int, seed: int) -> Tensor:
     return torch.randperm(pixels, generator=torch.Generator().manual_seed(seed))
 
 
-REFERENCE = SampleKernels(sample_pixels, sample_statistics)
+REFERENCE = SampleKernels(sample_pixels, sample_summary)

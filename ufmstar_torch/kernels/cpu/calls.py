@@ -36,6 +36,8 @@ def array(value: Tensor) -> NDArray[Any]:
 
 def each(function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
     """The results of ``function`` for every tuple of arguments, on as many threads as torch may use."""
+    if len(arguments) == 1:
+        return [function(*arguments[0])]
     threads = min(torch.get_num_threads(), len(arguments))
     if threads <= 1:
         return [function(*one) for one in arguments]

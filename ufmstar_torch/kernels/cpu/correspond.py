@@ -21,7 +21,7 @@ def matches(fields, n, fields_c, n_c, K, height, width, thresholds):
     The n components k and the n_c components c are in the camera frame, by field [13, n and more] (``rigid``).
 
     Returns:
-        c [P], k [P] and the overlap beta_ck [P] of every pair, in increasing c and then k.
+        c and k [2, P] and the overlap beta_ck [P] of every pair, in increasing c and then k.
     """
     eta, eta_occl, near, widening = thresholds
     image, image_c = empty((6, n), np.float64), empty((6, n_c), np.float64)
@@ -30,24 +30,32 @@ def matches(fields, n, fields_c, n_c, K, height, width, thresholds):
     count_c = _project(fields_c, n_c, K, height, width, near, widening, index_c, image_c)
     limit, limit_occl = _limit(eta), _limit(eta_occl)
     members, overlap = empty(count, np.int64), empty(count, np.float64)
-    c, k, beta = empty(64, np.int64), empty(64, np.int64), empty(64, np.float64)
-    pairs = 0
+    found, beta, pairs = empty((2, 64), np.int64), empty(64, np.float64), 0
     for i in range(count_c):
         m = _overlapping(image_c, i, image, count, eta, limit, members, overlap)
         for a in range(m):
             if _hidden(image, members, m, a, eta_occl, limit_occl):
                 continue
-            if pairs == c.size:
-                c, k, beta = _longer(c), _longer(k), _longer(beta)
-            c[pairs], k[pairs], beta[pairs] = index_c[i], index[members[a]], overlap[a]
+            if pairs == beta.size:
+                found, beta = _resized(found, pairs, 2 * pairs), _longer(beta)
+            found[0, pairs], found[1, pairs], beta[pairs] = index_c[i], index[members[a]], overlap[a]
             pairs += 1
-    return c[:pairs], k[:pairs], beta[:pairs]
+    return _resized(found, pairs, pairs), beta[:pairs]
 
 
 @part
 def _limit(eta):
     """The squared distance beyond which the overlap is below eta, with a margin for rounding."""
     return -8 * math.log(eta) * (1 + 1e-9) + 1e-9
+
+
+@part
+def _resized(pairs, n, room):
+    """The first n pairs [2, ...], with room for more."""
+    out = empty((2, room), np.int64)
+    for i in range(n):
+        out[0, i], out[1, i] = pairs[0, i], pairs[1, i]
+    return out
 
 
 @part

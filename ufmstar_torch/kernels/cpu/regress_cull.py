@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, reordered_leaf
 from ufmstar_torch.kernels.cpu.regress_vectors import TERMS, bounds
 from ufmstar_torch.kernels.cpu.rigid import COVARIANCE, WEIGHT, padded
 
@@ -41,13 +41,13 @@ WHITENED, PEAK = 7, 6
 
 
 class Settings(NamedTuple):
-    """Settings of the sum over the components in view.
+    """Settings of the sum over the components of a mixture.
 
     Attributes:
         prior_weight, prior_mean: of the prior.
         epsilon: share of the denominator that culling may leave out.
         least: log2 of the least threshold.
-        among: number of all components, of which the view has some.
+        among: number of all components, of which a view has some.
     """
 
     prior_weight: float
@@ -57,13 +57,22 @@ class Settings(NamedTuple):
     among: int
 
 
+class Seen(NamedTuple):
+    """A stream's mixture: n components by field [13, n and more] in the camera's frame (``rigid``), their
+    disagreement [n] and features [n, F]."""
+
+    components: NDArray[np.float64]
+    disagreement: NDArray[np.float64]
+    features: NDArray[np.float64]
+
+
 class View(NamedTuple):
     """The components that can matter in an image.
 
     Attributes:
         slot: [n] of the components in the mixture.
         fields: [n, 10] mean, whitening and log2 of the peak.
-        packed: [10, n and more] the same by field, in the depth's dtype.
+        packed: [10, n and more] the same by field, padded (``rigid.padded``), in the depth's dtype.
         terms: [n, TERMS] of the sum, in the depth's dtype.
         settings: of the sum.
     """
@@ -75,42 +84,61 @@ class View(NamedTuple):
     settings: Settings
 
 
-@kernel
-def in_view(components, m, features, K, depth, farthest, prior_weight, prior_mean, epsilon):
-    """The components that can matter in an image, a :class:`View`.
+def in_view(
+    seen: Seen, depth: NDArray[np.floating], K: NDArray[np.float64], prior: tuple[float, float], epsilon: float
+) -> View:
+    """The components that can matter in an image.
 
     Args:
-        components: in the camera's frame by field [13, n and more] (``rigid``).
-        m, features: of the n components [n], [n, F].
+        seen: the mixture.
         depth: [H, W], not positive where invalid.
-        farthest: the largest depth.
-        prior_weight, prior_mean, epsilon: see :class:`Settings`.
+        K: [3, 3].
+        prior: its weight and mean.
+        epsilon: share of the denominator that culling may leave out.
     """
+    n, dtype = len(seen.disagreement), depth.dtype
+    slot, fields, packed = np.empty(n, np.int64), np.empty((n, FIELDS)), np.empty((FIELDS, padded(n)), dtype)
+    terms = np.empty((n, TERMS), dtype)
+    settings = Settings(*prior, epsilon, math.log2(_PRIOR * prior[0]), n)
+    count = _in_view(*seen, K, depth, settings, slot, fields, packed, terms)
+    return View(slot[:count], fields[:count], packed, terms[:count], settings)
+
+
+@kernel
+def _in_view(components, m, features, K, depth, settings, index, fields, packed, constants):
+    """Write the first four of a :class:`View`; return the number of its components."""
     height, width = depth.shape
     n = m.size
     whitened = empty((WHITENED, components.shape[1]), np.float64)
-    index, every = empty(n, np.int64), empty(n, np.int64)
+    every = empty(n, np.int64)
     whiten(components, n, whitened)
     for k in range(n):
         every[k] = k
         for i in range(6):
             whitened[i, k] *= _SCALE
         whitened[PEAK, k] = (math.log(whitened[PEAK, k]) - HALF_LOG_TWO_PI_CUBED) * _LOG2_E
-    packed = empty((FIELDS, padded(n)), depth.dtype)
     _pack(components, whitened, every, n, packed)
-    z = farthest
+    z = 0.0
+    for v in range(height):
+        z = max(z, np.float64(_largest(depth[v])))
     left, top = (0 - K[0, 2]) / K[0, 0] * z, (0 - K[1, 2]) / K[1, 1] * z
     right, bottom = (width - 1 - K[0, 2]) / K[0, 0] * z, (height - 1 - K[1, 2]) / K[1, 1] * z
     box = min(left, 0.0), min(top, 0.0), 0.0, max(right, 0.0), max(bottom, 0.0), z
-    settings = Settings(prior_weight, prior_mean, epsilon, math.log2(_PRIOR * prior_weight), n)
     work = empty(8 + packed.shape[1], depth.dtype)
     # Blocks divide their threshold by n. A larger divisor makes this one lower in spite of rounding of the boxes.
     chosen = cull(packed, n, n + n // 64 + 1, box, settings, work, index)
-    fields, constants = empty((chosen, FIELDS), np.float64), empty((chosen, TERMS), depth.dtype)
-    _terms(components, whitened, index, m, features, fields, constants)
-    packed = empty((FIELDS, padded(chosen)), depth.dtype)
+    _terms(components, whitened, index, chosen, m, features, fields, constants)
     _pack(components, whitened, index, chosen, packed)
-    return View(index[:chosen], fields, packed, constants, settings)
+    return chosen
+
+
+@reordered_leaf
+def _largest(values):
+    """The largest of the values, at least 0."""
+    most = values.dtype.type(0)
+    for i in range(values.size):
+        most = max(most, values[i])
+    return most
 
 
 @leaf
@@ -129,9 +157,9 @@ def _pack(components, whitened, index, n, packed):
 
 
 @leaf
-def _terms(components, whitened, index, m, features, fields, constants):
+def _terms(components, whitened, index, count, m, features, fields, constants):
     """Write the fields [n, 10] of the chosen components, and the terms of the sum."""
-    for i in range(fields.shape[0]):
+    for i in range(count):
         k = index[i]
         for j in range(3):
             fields[i, j] = components[j, k]

@@ -90,8 +90,8 @@ def exact(depth, K, view, features, shift, out, out_f, first, shares):
     """Regress every ``shares``-th block of one stream, from block ``first`` on.
 
     Reads depth [H, W], K [3, 3], the ``view`` of :func:`in_view` and features [K, F]. Writes out [H, W] and out_f
-    [F, H, W], which are NaN and stay so where the depth is not positive. ``shift`` [2] is added to the two features
-    before the last, of three or more.
+    [F, H, W], NaN where the depth is not positive. ``shift`` [2] is added to the two features before the last, of three
+    or more.
     """
     tiles, lists, sums = _scratch(view, out_f.shape[0], shift)
     grid = tiles.grid
@@ -154,6 +154,7 @@ def _blocks(depth, K, view, features, tiles, lists, sums, out, out_f, first, sha
                 seen[tile] = _placed((u + half - K[0, 2]) / K[0, 0], (v + half - K[1, 2]) / K[1, 1], tiles, tile)
             any_seen |= seen[tile]
         if not any_seen:
+            _clear(v0, u0, _BLOCK, out, out_f)
             continue
         count = cull(
             packed, view.slot.size, view.settings.among, _union(tiles.boxes, seen), view.settings, work, in_block
@@ -163,12 +164,15 @@ def _blocks(depth, K, view, features, tiles, lists, sums, out, out_f, first, sha
                 near[i, j] = packed[i, in_block[j]]
         pad(near, count)
         for tile in range(_TILES):
-            if seen[tile]:
-                chosen = cull(near, count, count, _box(tiles.boxes, tile), view.settings, work, in_tile)
-                for j in range(chosen):
-                    in_tile[j] = in_block[in_tile[j]]
-                _average(PIXELS, tiles, tile, in_tile, chosen, view, features, sums)
-                _write(sums, v0 + tile // _SIDE * TILE, u0 + tile % _SIDE * TILE, out, out_f)
+            v, u = v0 + tile // _SIDE * TILE, u0 + tile % _SIDE * TILE
+            if not seen[tile]:
+                _clear(v, u, TILE, out, out_f)
+                continue
+            chosen = cull(near, count, count, _box(tiles.boxes, tile), view.settings, work, in_tile)
+            for j in range(chosen):
+                in_tile[j] = in_block[in_tile[j]]
+            _average(PIXELS, tiles, tile, in_tile, chosen, view, features, sums)
+            _write(sums, v, u, out, out_f)
 
 
 @leaf
@@ -211,6 +215,10 @@ def _at_pixels(depth, K, pixels, begin, order, view, features, tiles, lists, sum
             for i in range(count, PIXELS):  # the last one again
                 grid[0, i], grid[1, i], z[i] = grid[0, count - 1], grid[1, count - 1], z[count - 1]
             if not _placed((u0 - K[0, 2]) / K[0, 0], (v0 - K[1, 2]) / K[1, 1], tiles, 0):
+                for i in range(count):
+                    out[order[low + i]] = np.nan
+                    for g in range(last + 1):
+                        out_f[g, order[low + i]] = np.nan
                 continue
             box, settings = _box(tiles.boxes, 0), view.settings
             chosen = cull(view.packed, view.slot.size, settings.among, box, settings, lists.work, retained)
@@ -310,6 +318,16 @@ def _write(sums, v0, u0, out, out_f):
     _copy(averages[_TOTAL], v0, u0, out)
     for g in range(out_f.shape[0]):
         _copy(others[g] if g < others.shape[0] else averages[_LAST + last - g], v0, u0, out_f[g])
+
+
+@leaf
+def _clear(v0, u0, side, out, out_f):
+    """Set the maps to NaN in a square."""
+    for v in range(v0, min(v0 + side, out.shape[0])):
+        for u in range(u0, min(u0 + side, out.shape[1])):
+            out[v, u] = np.nan
+            for g in range(out_f.shape[0]):
+                out_f[g, v, u] = np.nan
 
 
 @leaf

@@ -7,8 +7,7 @@ All threads that torch may use segment the rows of an image; one thread fuses th
 from __future__ import annotations
 
 import functools
-import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,11 +18,12 @@ from torch import Tensor
 from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.kernels.cpu.calls import array, each, shares_of_stream
-from ufmstar_torch.kernels.cpu.segment_image import join_rows, write_gaussians, write_labels
-from ufmstar_torch.kernels.cpu.segment_rows import SEGMENT, SEGMENT_INT, scan_rows
+from ufmstar_torch.kernels.cpu.segment_image import fit, write_labels
+from ufmstar_torch.kernels.cpu.segment_rows import SEGMENT, SEGMENT_INT
 
 Maps = NDArray[np.floating[Any]]
 _LIGHTER = 4  # a pixel takes a fraction of its regression's time: fewer threads pay off
+_NO_FLOOR = 0.0, -1.0, -1.0
 _PRUNE = {"none": 0, "both": 1, "either": 2}
 
 
@@ -51,50 +51,59 @@ def segment(
     depth: Tensor, intrinsics: Tensor, limits: SPGFConfig, features: Tensor | None = None
 ) -> tuple[GaussianMixture, Tensor]:
     """As :func:`ufmstar_torch.steps.segment.segment`, for CPU tensors, float64 inside."""
-    fields, labels = gaussians(array(depth), array(intrinsics), limits, None if features is None else array(features))
-    return GaussianMixture(*map(torch.from_numpy, fields)), labels()
+    z, K = array(depth), np.asarray(array(intrinsics), np.float64)
+    fields, labels = gaussians(z, K, limits, None if features is None else array(features))
+    return GaussianMixture(*(torch.from_numpy(field.astype(z.dtype)) for field in fields)), torch.from_numpy(labels())
 
 
 def gaussians(
-    z: Maps, intrinsics: Maps, config: SPGFConfig, features: Maps | None = None
-) -> tuple[tuple[Maps, ...], Callable[[], Tensor]]:
-    """The fields of the mixture of :func:`segment`, and a function that writes the labels."""
+    z: Maps,
+    intrinsics: NDArray[np.float64],
+    config: SPGFConfig,
+    features: Maps | None = None,
+    floor: tuple[float, float, float] = _NO_FLOOR,
+) -> tuple[tuple[Maps, ...], Callable[[], NDArray[np.int64]]]:
+    """The fields of the mixture of :func:`segment`, float64 with the values of the depth's dtype, and a function that
+    computes the labels. ``floor``: near plane, variance of a pixel and share of the trace, below which no eigenvalue of
+    a covariance is (``steps.step``)."""
     streams, height, width = z.shape
-    limits = _limits(config)
-    room = height * config.segments_per_row(width)
+    room = height * max(1, width // (config.sparse + 1))
     spans, runs = np.empty((streams, height, 4), np.int64), np.empty((streams, height * width, 2), np.int32)
     table, table_int = np.empty((streams, room, SEGMENT)), np.empty((streams, room, SEGMENT_INT), np.int64)
     shares = shares_of_stream(streams, height * width // _LIGHTER)
-    rows = [height * i // shares for i in range(shares + 1)]
-    scans, joins = [], []
-    for b, K in enumerate(intrinsics.tolist()):
-        fx, fy, cx, cy = K[0][0], K[1][1], K[0][2], K[1][2]
-        slope = config.slope(min(fx, fy))
-        bins = _depth_bins(0.5 * min(width / fx, height / fy), limits)
-        tables = spans[b], table[b], table_int[b]
-        for first, last in itertools.pairwise(rows):
-            scans.append((z[b], fx, fy, cx, cy, slope, *bins, limits, first, last, *tables, runs[b]))
-        joins.append((width, fy, cy, slope, bins[0], limits, *tables))
-    each(scan_rows, scans)
-    joined = each(join_rows, joins)
 
-    def labels() -> Tensor:
+    def arguments(b: int, first: int, last: int, joined: bool) -> tuple[Any, ...]:
+        (fx, _, _), (_, fy, _), _ = intrinsics[b].tolist()
+        thresholds, tables = _thresholds(config, width, height, fx, fy), (spans[b], table[b], table_int[b], runs[b])
+        return z[b], intrinsics[b], *thresholds, first, last, joined, *tables, floor
+
+    if shares > 1:
+        rows = [(height * i // shares, height * (i + 1) // shares) for i in range(shares)]
+        each(fit, [arguments(b, *part, False) for b in range(streams) for part in rows])
+    scanned = height if shares > 1 else 0
+    fits = each(fit, [arguments(b, scanned, height, True) for b in range(streams)])
+
+    def labels() -> NDArray[np.int64]:
         out = np.empty(z.shape, np.int64)
-        for b, (*_, slot) in enumerate(joined):
+        for b, (*_, slot) in enumerate(fits):
             write_labels(spans[b], runs[b], slot, out[b])
-        return torch.from_numpy(out)
+        return out
 
-    dtype = z.dtype
-    k = max(1, *(retained.size for retained, *_ in joined))
-    mean, covariance = np.zeros((streams, k, 3), dtype), np.zeros((streams, k, 3, 3), dtype)
-    weight = np.zeros((streams, k), dtype)
-    for b, fit in enumerate(joined):
-        write_gaussians(*fit[:3], mean[b], covariance[b], weight[b])
-    means = np.empty((streams, k, 0), dtype)
+    mean, covariance, weight = (_padded([fit[i] for fit in fits]) for i in range(3))
+    none, means = np.zeros_like(weight), np.empty((*weight.shape, 0))
     if features is not None:
-        means = _feature_means(features, labels().numpy(), weight)
-    not_compared = *(np.zeros((streams, k), dtype) for _ in range(3)), np.zeros((streams, k, 5), dtype)
-    return (mean, covariance, weight, *not_compared, means), labels
+        means = _feature_means(features, labels(), weight.astype(z.dtype)).astype(np.float64)
+    return (mean, covariance, weight, none, none, none, np.zeros((*weight.shape, 5)), means), labels
+
+
+def _padded(values: Sequence[Maps]) -> Maps:
+    """[B, K, ...] of values [k, ...] by stream, zeros behind them; K is at least 1."""
+    if len(values) == 1 and len(values[0]) > 0:
+        return values[0][None]
+    out = np.zeros((len(values), max(1, *map(len, values)), *values[0].shape[1:]))
+    for padded, value in zip(out, values, strict=True):
+        padded[: len(value)] = value
+    return out
 
 
 def _feature_means(features: np.ndarray, labels: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -108,9 +117,12 @@ def _feature_means(features: np.ndarray, labels: np.ndarray, weight: np.ndarray)
     return out
 
 
-@functools.lru_cache(maxsize=16)
-def _limits(c: SPGFConfig) -> _Limits:
-    return _Limits(
+@functools.lru_cache(maxsize=64)  # a camera's focal length does not change
+def _thresholds(
+    c: SPGFConfig, width: int, height: int, fx: float, fy: float
+) -> tuple[float, tuple[Maps, Maps], _Limits]:
+    """The slope, the depth bins and the other thresholds for a camera."""
+    limits = _Limits(
         noise_floor=float(c.noise_floor),
         noise_thresh=float(c.noise_thresh),
         line_thresh=float(c.line_thresh),
@@ -127,9 +139,9 @@ def _limits(c: SPGFConfig) -> _Limits:
         min_pixels=c.min_pixels,
         min_rows=c.min_rows,
     )
+    return c.slope(min(fx, fy)), _depth_bins(0.5 * min(width / fx, height / fy), limits), limits
 
 
-@functools.lru_cache(maxsize=16)  # a camera's focal length does not change
 def _depth_bins(s: float, limits: _Limits) -> tuple[np.ndarray, np.ndarray]:
     """Squared length and far edge of every depth bin [m^2, m]."""
     lengths2, edges = np.empty(limits.depth_bins), np.empty(limits.depth_bins)

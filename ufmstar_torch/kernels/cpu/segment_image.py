@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, part
+from ufmstar_torch.kernels.cpu.fuse import WORK, floor_covariance
 from ufmstar_torch.kernels.cpu.segment_rows import (
     CXX,
     CXZ,
@@ -23,6 +24,7 @@ from ufmstar_torch.kernels.cpu.segment_rows import (
     UR,
     ZERO,
     N,
+    scan_rows,
     segments_of_row,
 )
 
@@ -34,12 +36,24 @@ _GAUSSIAN, _GAUSSIAN_INT = 19, 7
 
 
 @kernel
-def join_rows(width, fy, cy, slope, lengths2, limits, spans, table, table_int):
-    """Fuse the segments of all rows of an image, from the first row to the last.
+def fit(z, K, slope, bins, limits, first, last, joined, spans, table, table_int, runs, floor):
+    """Scan the rows of an image z [H, W] from ``first`` to ``last`` (:func:`scan_rows`); then, if ``joined``, fuse the
+    segments of all rows, from the first row to the last.
 
-    Returns the indices of the retained Gaussians in emission order, the values and integers of all Gaussians, and for
-    each segment index in ``runs`` (see :func:`scan_rows`) the slot of its Gaussian, -1 for none.
+    Args:
+        K: [3, 3].
+        bins: squared lengths and far edges of the depth bins.
+        spans, table, table_int, runs: of :func:`scan_rows`.
+        floor: near plane, variance of a pixel, and share of the trace, of :func:`_write_gaussians`.
+
+    Returns:
+        Mean [n, 3], covariance [n, 3, 3] and weight [n] of the retained Gaussians in emission order, and for each
+        segment index in ``runs`` the slot of its Gaussian, -1 for none; without a Gaussian unless ``joined``.
     """
+    fx, fy, cx, cy, lengths2, width = K[0, 0], K[1, 1], K[0, 2], K[1, 2], bins[0], z.shape[1]
+    scan_rows(z, fx, fy, cx, cy, slope, lengths2, bins[1], limits, first, last, spans, table, table_int, runs)
+    if not joined:
+        return empty((0, 3), np.float64), empty((0, 3, 3), np.float64), empty(0, np.float64), empty(0, np.int64)
     height, most = spans.shape[0], segments_of_row(width, limits)
     member = empty(table.shape[0], np.int64)  # segment -> Gaussian
     active, interval = empty(2 * most, np.int64), empty((2, 2 * most), np.int64)
@@ -59,7 +73,9 @@ def join_rows(width, fy, cy, slope, lengths2, limits, spans, table, table_int):
     for v in range(height):
         for i in range(spans[v, 0], spans[v, 1]):
             slot[i + 1] = position[member[i]]
-    return retained[:n], gaussians, whole, slot
+    mean, covariance, weight = empty((n, 3), np.float64), empty((n, 3, 3), np.float64), empty(n, np.float64)
+    _write_gaussians(retained, gaussians, whole, min(fx, fy), floor, z.dtype.type, mean, covariance, weight)
+    return mean, covariance, weight, slot
 
 
 @kernel
@@ -229,18 +245,24 @@ def _prune(whole, created, limits, emitted, retained, position):
     return n
 
 
-@kernel
-def write_gaussians(retained, gaussians, whole, mean, covariance, weight):
-    """Write the retained Gaussians to the mixture's slots; a single pixel has no sample covariance (zeros)."""
-    for i in range(retained.size):
-        g = gaussians[retained[i]]
+@part
+def _write_gaussians(retained, gaussians, whole, focal, floor, real, mean, covariance, weight):
+    """Write the retained Gaussians, rounded to the depth's dtype; a single pixel has no sample covariance (zeros).
+
+    The eigenvalues of the covariances are lifted to the floor of a segment (``step``): the variance across one pixel,
+    and a share of the trace for storage.
+    """
+    near, widening, share = floor
+    work = empty(WORK, np.float64)
+    for i in range(weight.size):
+        g, S = gaussians[retained[i]], covariance[i]
         n = whole[retained[i], N]
-        weight[i] = n
+        weight[i] = real(n)
         scatter = 0
         for r in range(3):
-            mean[i, r] = g[_M + r]
+            mean[i, r] = real(g[_M + r])
             for c in range(r, 3):
-                value = g[_C + scatter] / (n - 1) if n > 1 else 0.0
-                covariance[i, r, c] = value
-                covariance[i, c, r] = value
+                S[r, c] = S[c, r] = real(g[_C + scatter] / (n - 1)) if n > 1 else 0.0
                 scatter += 1
+        across = max(mean[i, 2], near) / focal
+        floor_covariance(S, max(across * across * widening, share * (S[0, 0] + S[1, 1] + S[2, 2])), work)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
+from ufmstar_torch.kernels.compile_cpu import empty, leaf, part
 
 # First value of counters: a plain 0 has another type in numba, which would compile the functions called with it twice.
 ZERO: Any = np.int64(0)
@@ -42,7 +42,7 @@ class _Open(NamedTuple):
     dzz: float
 
 
-@kernel
+@part
 def scan_rows(z, fx, fy, cx, cy, slope, lengths2, edges, limits, first, last, spans, table, table_int, runs):
     """Scanline segmentation of the rows from ``first`` to ``last``, each on its own.
 

@@ -7,9 +7,9 @@ streams nor that of threads changes a bit.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,44 +26,21 @@ from ufmstar_torch.gaussians.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.gaussians.state import UfMStarState
 from ufmstar_torch.kernels.cpu.calls import array, each
-from ufmstar_torch.kernels.cpu.regress import Seen, View, fill_and_smooth, regress_maps, views_of
-from ufmstar_torch.kernels.cpu.rigid import COVARIANCE, FIELDS, WEIGHT, padded
+from ufmstar_torch.kernels.cpu.regress import regress_maps, views_of
+from ufmstar_torch.kernels.cpu.regress_cull import Seen, View
+from ufmstar_torch.kernels.cpu.rigid import FIELDS, padded
 from ufmstar_torch.kernels.cpu.segment import gaussians
-from ufmstar_torch.kernels.cpu.stream import join, lift, match
+from ufmstar_torch.kernels.cpu.stream import COMPONENTS, COUNTS, DROPPED, NEW, SINGLE_VIEW, UNMEASURED, join, match
 from ufmstar_torch.steps.disagree import overlap_disagreement
-from ufmstar_torch.steps.fuse import make_room
-from ufmstar_torch.steps.regress import at_pixels, distribute, memory_for, with_pixels
+from ufmstar_torch.steps.fuse import Room, make_room
+from ufmstar_torch.steps.regress import distribute, memory_for
 from ufmstar_torch.steps.step import StepObserver, step_output, unobserved
 
-Floats = NDArray[np.floating[Any]]
-_NAMES = tuple(field.name for field in fields(GaussianMixture))
-_COUNTS: tuple[str, ...] = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels")
-_COUNTS += ("unmeasured", "single_view")
-
-
-class _Pairs(NamedTuple):
-    """The result of :func:`match` for a stream."""
-
-    c: NDArray[np.int64]
-    k: NDArray[np.int64]
-    overlap: NDArray[np.float64]
-    new: NDArray[np.bool_]
-    segments: int
-    matched: int
-    created: int
-    occupied: int
-    fields: NDArray[np.float64]
-
-
-class _Joined(NamedTuple):
-    """The mixture after the fusion by field, and in the form for the regression; the sums over anchors by name; the
-    numbers of new and of dropped components."""
-
-    mixture: dict[str, Tensor]
-    seen: list[Seen]
-    sums: dict[str, Tensor]
-    new: list[int]
-    dropped: list[int]
+_MIXTURE = tuple(field.name for field in fields(GaussianMixture))
+_STREAM = ("T_world_first", "started", "frames", "skipped")
+_EPSILON = {dtype: torch.finfo(dtype).eps for dtype in (torch.float32, torch.float64)}
+_Arrays = tuple[NDArray[Any], ...]
+_Match = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_], int]  # the result of ``match``
 
 
 def step(
@@ -77,201 +54,158 @@ def step(
 ) -> tuple[UfMStarState, UncertaintyOutput]:
     """As :func:`ufmstar_torch.steps.step.step`, for CPU tensors."""
     stage = unobserved if observer is None else observer.stage
-    segments = _segment(frame, array(frame.intrinsics), config, state.covariance.dtype)
+    depth, K = array(frame.depth), array(frame.intrinsics)
+    camera, counts = (array(frame.fault), array(frame.T_world_cam), K), np.zeros((len(COUNTS), len(depth)), np.int64)
+    informative = None if frame.informative is None else array(frame.informative)
+    segments = _segment(frame, depth if informative is None else array(frame.informative_depth), K, config, state)
     current_cam = GaussianMixture(*map(torch.from_numpy, segments))
     stage("segment")
 
-    cameras, pairs = _match(state, frame, segments, config)
+    slots = tuple([array(getattr(state, name)) for name in _MIXTURE])
+    before = tuple([array(getattr(state, name)) for name in _STREAM])
+    after = tuple([np.empty_like(value) for value in before])
+    thresholds = config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE
+    arguments = camera, before, after, slots[:3], segments[:3], frame.size, thresholds, counts
+    matched = each(match, [(b, *arguments) for b in range(len(depth))])
     stage("correspond")
 
     columns = 0 if config.anchors is None else COLUMNS
-    joined = _join(state, frame, segments, cameras[0], pairs, config, columns)
+    updated, seen = _join(state, frame, camera, after[0], slots, segments, matched, counts, config, columns)
     stage("fuse")
 
     learnt, views, shift = None, None, None
     if columns:
-        learnt, views = _learn(state, joined, frame, config, torch.from_numpy(cameras[0]))
+        learnt, views = _learn({**state.by_stream, **updated}, seen, frame, config, torch.from_numpy(after[0]))
         shift = None if views is None else array(learnt.stream)  # which the regression then adds
+    elif config.regression == "exact":
+        views = views_of(seen, depth, K, config)
     stage("append")
 
-    result = regress_maps(joined.seen, frame.depth, frame.intrinsics, config, pixels, views, shift)
-    measured, disagreement = result.features[..., -1], result.disagreement
-    if frame.informative is not None:
-        measured = measured * frame.informative.view(-1, *[1] * (measured.dim() - 1)).to(measured.dtype)
-    features, expected, _ = result.features.split([result.features.shape[-1] - columns - 1, columns, 1], -1)
-    residual = None if learnt is None else expected if shift is not None else learnt.residual(expected)
+    smoothed = array(memory_for(state.smoothed, frame.size)) if smooth and config.ema_alpha < 1 else None
+    shown, regressed, memory, counts[UNMEASURED] = regress_maps(
+        seen, depth, K, config, None if pixels is None else array(pixels), views=views, shift=shift,
+        informative=informative, smoothed=smoothed,
+    )  # fmt: skip
     stage("regress")
 
-    smoothed, alpha, previous = state.smoothed, config.ema_alpha if smooth else 1.0, disagreement
-    if alpha < 1:
-        smoothed = memory_for(smoothed, frame.size)
-        previous = at_pixels(smoothed, pixels)
-    after, disagreement, unmeasured = fill_and_smooth(
-        disagreement, measured, at_pixels(frame.depth, pixels), previous, config, alpha
-    )
-    if alpha < 1:
-        smoothed = with_pixels(smoothed, pixels, after)
-    names = ("T_world_first", "started", "frames", "skipped")
-    stream_fields = dict(zip(names, map(torch.from_numpy, cameras), strict=True))
-    of_anchors = {} if learnt is None else learnt.tensors()
-    changed = {**joined.mixture, **joined.sums, **of_anchors, **stream_fields, "smoothed": smoothed}
-    updated = state.with_tensors(changed)
-    maps = {"disagreement": disagreement, "measured": measured, "features": features}
-    counts = _counts(frame, pairs, joined, unmeasured)
-    out = step_output(frame, maps, residual, pixels, current_cam, counts, learnt)
+    parts = regressed.swapaxes(1, -1) if pixels is not None else regressed.transpose(0, 2, 3, 1)
+    last = parts.shape[-1] - 1
+    of_maps = shown, parts[..., last], parts[..., : last - columns]
+    maps = dict(zip(("disagreement", "measured", "features"), map(torch.from_numpy, of_maps), strict=True))
+    residual = None
+    if learnt is not None:
+        residual = torch.from_numpy(parts[..., last - columns : last])
+        residual = residual if shift is not None else learnt.residual(residual)
+    changed = dict(zip(_STREAM, map(torch.from_numpy, after), strict=True)) | updated
+    if memory is not None:
+        changed["smoothed"] = torch.from_numpy(memory)
+    if learnt is not None:
+        changed |= learnt.tensors()
+    counted = dict(zip(COUNTS, torch.from_numpy(counts).unbind(), strict=True))
+    out = step_output(frame, maps, residual, pixels, current_cam, counted, learnt)
     stage("average")
-    return updated, out
+    return state.with_tensors(changed), out
 
 
 def _segment(
-    frame: FrameInput, intrinsics: Floats, config: UfMStarConfig, stored: torch.dtype
-) -> tuple[NDArray[Any], ...]:
+    frame: FrameInput, depth: NDArray[Any], K: NDArray[np.float64], config: UfMStarConfig, state: UfMStarState
+) -> _Arrays:
     """Step 2: the fields of C_i in the camera frame, float64, with the covariances lifted to the reference's floor."""
-    limits = config.segment.scaled_to(*frame.size)
     features = None if frame.features is None else array(frame.features)
-    mixture, _ = gaussians(array(frame.informative_depth), intrinsics, limits, features)
-    segments = tuple(value.astype(np.float64) for value in mixture)
-    epsilon = 8 * torch.finfo(stored).eps
-    for K, *written in zip(intrinsics.tolist(), *segments[:3], strict=True):
-        lift(*written, config.near_plane, min(K[0][0], K[1][1]), PIXEL_VARIANCE, epsilon)
-    return segments
-
-
-def _match(
-    state: UfMStarState, frame: FrameInput, segments: Sequence[NDArray[Any]], config: UfMStarConfig
-) -> tuple[tuple[NDArray[Any], ...], list[_Pairs]]:
-    """Step 3: the state's T_world_first, started, frames and skipped after the frame, and the pairs of each stream."""
-    valid, poses, cameras = array(frame.fault) == 0, array(frame.T_world_cam), array(frame.intrinsics)
-    first_before, started, frames, skipped = map(
-        array, (state.T_world_first, state.started, state.frames, state.skipped)
-    )
-    first = np.empty_like(first_before)
-    mixture = tuple(array(value) for value in (state.mean, state.covariance, state.weight))
-    thresholds = (config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE)
-    calls = [
-        (
-            (bool(valid[b]), poses[b], cameras[b]), bool(started[b]), first_before[b], first[b],
-            tuple(value[b] for value in mixture), tuple(value[b] for value in segments[:3]),
-            frame.size, thresholds,
-        )
-        for b in range(len(valid))
-    ]  # fmt: skip
-    after = first, started | valid, frames + valid, skipped + ~valid
-    return after, [_Pairs(*pairs) for pairs in each(match, calls)]
+    floor = config.near_plane, PIXEL_VARIANCE, 8 * _EPSILON[state.covariance.dtype]
+    return gaussians(depth, K, config.segment.scaled_to(*frame.size), features, floor)[0]
 
 
 def _join(
-    state: UfMStarState,
-    frame: FrameInput,
-    segments: Sequence[NDArray[Any]],
-    first: Floats,
-    pairs: Sequence[_Pairs],
-    config: UfMStarConfig,
-    columns: int,
-) -> _Joined:
-    """Step 4, and the mixture in the form for the regression, with ``columns`` for anchors; ``first`` is
-    camera-to-world of the first cameras."""
-    slots = tuple(array(getattr(state, name)) for name in _NAMES)
-    needed = max(pair.occupied + pair.created for pair in pairs)
-    capacity = slots[0].shape[1]
-    while capacity < needed:
+    state: UfMStarState, frame: FrameInput, camera: _Arrays, first: NDArray[np.float64], slots: _Arrays,
+    segments: _Arrays, matched: Sequence[_Match], counts: NDArray[np.int64], config: UfMStarConfig, columns: int,
+) -> tuple[dict[str, Tensor], list[Seen]]:  # fmt: skip
+    """Step 4: the mixture after the frame with the sums over anchors, by name; and the mixture in the form for the
+    regression, with ``columns`` for anchors. ``first`` is camera-to-world of the first cameras."""
+    b, capacity = slots[2].shape
+    totals = [occupied + int(counts[NEW, i]) for i, (*_, occupied) in enumerate(matched)]
+    while capacity < max(totals):
         capacity *= 2
-    updated = tuple(_extended(value, capacity) for value in slots)
-    epsilon = float(np.finfo(slots[1].dtype).eps)
-    settings = config.overlap_weighted, epsilon, config.view_baseline or 0.0, config.near_plane
-    poses, current = array(frame.T_world_cam), (*segments[:3], segments[_NAMES.index("features")])
-    members = np.zeros(len(poses)) if frame.member is None else array(frame.member)
-    calls = [
-        (
-            poses[b], first[b], members[b], tuple(value[b] for value in updated),
-            tuple(value[b] for value in current), pair[:3],
-            _distance(b, pair, segments, config), pair.new, pair.occupied,
-            settings, columns + 1,
-        )
-        for b, pair in enumerate(pairs)
-    ]  # fmt: skip
-    mixture = dict(zip(_NAMES, map(torch.from_numpy, updated), strict=True))
-    seen = [Seen(*one) for one in each(join, calls)]
-    sums = dict(state.by_component)
-    unlimited = _Joined(mixture, seen, sums, [p.created for p in pairs], [0] * len(seen))
+    updated = tuple([_extended(value, capacity) for value in slots])
+    settings = (
+        config.overlap_weighted, _EPSILON[state.covariance.dtype], config.view_baseline or 0.0, config.near_plane
+    )  # fmt: skip
+    members = np.zeros(b) if frame.member is None else array(frame.member)
+    features = slots[-1].shape[2] + columns + 1
+    seen = [Seen(np.empty((FIELDS, padded(n))), np.empty(n), np.empty((n, features))) for n in totals]
+    current, common = (*segments[:3], segments[-1]), (settings, counts)
+    distances = _distances(state, frame, first, segments, matched, config)
+    each(join, [
+        (i, camera, first, members, updated, current, matched[i], distances[i], *common, seen[i])
+        for i in range(b)
+    ])  # fmt: skip
+    mixture, sums = dict(zip(_MIXTURE, map(torch.from_numpy, updated), strict=True)), dict(state.by_component)
     limit = config.max_components
     if limit is None or capacity <= limit:
-        return unlimited
+        return mixture | sums, seen
     position = relative_pose(frame.T_world_cam, torch.from_numpy(first))[1]
-    return _within_limit(unlimited, [pair.occupied for pair in pairs], position, limit)
+    before = torch.tensor([occupied for *_, occupied in matched])
+    room = make_room(GaussianMixture(**mixture), sums, before, torch.zeros_like(before), position, limit)
+    return _within_limit(room, before, seen, limit, counts)
 
 
 def _extended(value: NDArray[Any], capacity: int) -> NDArray[Any]:
     """A copy of slots [B, K, ...], followed by empty ones up to the capacity."""
-    out = np.empty((value.shape[0], capacity, *value.shape[2:]), value.dtype)
     occupied = value.shape[1]
-    out[:, :occupied], out[:, occupied:] = value, 0
+    if occupied == capacity:
+        return value.copy()
+    out = np.zeros((len(value), capacity, *value.shape[2:]), value.dtype)
+    out[:, :occupied] = value
     return out
 
 
-def _within_limit(joined: _Joined, old: Sequence[int], position: Tensor, limit: int) -> _Joined:
-    """At most ``limit`` components and slots (``steps.fuse.make_room``); the first ``old`` components of
-    each stream were in the mixture before."""
-    before = torch.tensor(old)
-    coming = torch.zeros_like(before)
-    room = make_room(GaussianMixture(**joined.mixture), joined.sums, before, coming, position, limit)
-    seen = []
-    for one, source, components in zip(joined.seen, array(room.slot), room.mixture.components.tolist(), strict=True):
-        retained = source[:components]
+def _within_limit(
+    room: Room, before: Tensor, seen: Sequence[Seen], limit: int, counts: NDArray[np.int64]
+) -> tuple[dict[str, Tensor], list[Seen]]:
+    """The results of :func:`_join` with at most ``limit`` components and slots, of which ``before`` [B] were in the
+    mixture before the frame; changes the counts."""
+    mixture, retained = room.mixture, []
+    for one, source, components in zip(seen, array(room.slot), mixture.components.tolist(), strict=True):
+        chosen = source[:components]
         by_field = np.zeros((FIELDS, padded(components)))
-        by_field[:, :components] = one.components[:, retained]
-        seen.append(Seen(by_field, one.disagreement[retained], one.features[retained]))
-    return _Joined(
-        {name: value[:, :limit].contiguous() for name, value in room.mixture.tensors().items()},
-        seen,
-        {name: value[:, :limit].contiguous() for name, value in room.sums.items()},
-        (room.mixture.components - before + room.dropped).tolist(),
-        room.dropped.tolist(),
-    )
+        by_field[:, :components] = one.components[:, chosen]
+        retained.append(Seen(by_field, one.disagreement[chosen], one.features[chosen]))
+    single_view = (mixture.valid & (mixture.views == 0)).sum(1)
+    new, removed = mixture.components - before + room.dropped, array(room.dropped)
+    counts[DROPPED] += removed + counts[NEW] - array(new)
+    counts[NEW], counts[COMPONENTS], counts[SINGLE_VIEW] = array(new), array(mixture.components), array(single_view)
+    tensors = mixture.tensors() | dict(room.sums)
+    return {name: value[:, :limit].contiguous() for name, value in tensors.items()}, retained
 
 
 def _learn(
-    state: UfMStarState, joined: _Joined, frame: FrameInput, config: UfMStarConfig, first: Tensor
+    tensors: Mapping[str, Tensor], seen: Sequence[Seen], frame: FrameInput, config: UfMStarConfig, first: Tensor
 ) -> tuple[Learnt, list[View] | None]:
     """Learn from the frame's anchors, and write the columns for the regression to the features before the last. The
     views are those of the exact regression, which are built here already."""
-    capacity, tensors = joined.mixture["weight"].shape[1], {**state.by_stream, **joined.sums}
     if config.regression == "exact":
-        views = views_of(joined.seen, frame.depth, frame.intrinsics, config, state.covariance.dtype)
-        return learn_in_view(tensors, capacity, joined.seen, views, frame, config), views
-    mixture = GaussianMixture(**joined.mixture).to(torch.float64)
+        dtype, depth, K = tensors["covariance"].dtype, array(frame.depth), array(frame.intrinsics)
+        views = views_of(seen, depth, K, config, dtype)
+        return learn_in_view(tensors, tensors["weight"].shape[1], seen, views, frame, config), views
+    mixture = GaussianMixture(**{name: tensors[name] for name in _MIXTURE}).to(torch.float64)
     mixture_cam = mixture.rigid(*relative_pose(first, frame.T_world_cam))
     learnt = learn(tensors, mixture_cam, frame, config, distribute, inliers)
-    for one, values in zip(joined.seen, array(learnt.beyond), strict=True):
+    for one, values in zip(seen, array(learnt.beyond), strict=True):
         one.features[:, -COLUMNS - 1 : -1] = values[: len(one.disagreement)]
     return learnt, None
 
 
-def _distance(b: int, pair: _Pairs, segments: Sequence[Floats], config: UfMStarConfig) -> NDArray[np.float64]:
-    """The overlap disagreement [P] of the pairs of a stream, or [0] where the step uses W2^2."""
+def _distances(
+    state: UfMStarState, frame: FrameInput, first: NDArray[np.float64], segments: _Arrays, matched: Sequence[_Match],
+    config: UfMStarConfig,
+) -> list[NDArray[np.float64]]:  # fmt: skip
+    """The overlap disagreement [P] of the pairs of each stream, or [0] where the step uses W2^2."""
     if config.disagreement != "overlap":
-        return np.empty(0)
-    mean, covariance = pair.fields[:COVARIANCE, pair.k].T, pair.fields[COVARIANCE:WEIGHT, pair.k].T.reshape(-1, 3, 3)
-    both = segments[0][b][pair.c], segments[1][b][pair.c], mean, covariance
-    return overlap_disagreement(*map(torch.from_numpy, both)).numpy()
-
-
-def _counts(
-    frame: FrameInput, pairs: Sequence[_Pairs], joined: _Joined, unmeasured: Sequence[int]
-) -> dict[str, Tensor]:
-    """Count the step's statistics [B]; ``unmeasured`` holds the pixels that no two views compare."""
-    totals = np.zeros((len(_COUNTS), len(pairs)), np.int64)
-    valid, views = array(frame.valid), array(joined.mixture["views"])
-    for b, (pair, one, new, removed) in enumerate(zip(pairs, joined.seen, joined.new, joined.dropped, strict=True)):
-        totals[:, b] = (
-            len(one.disagreement),
-            pair.segments,
-            pair.matched,
-            pair.c.size,
-            new,
-            removed + pair.segments - pair.matched - new,  # too many, or too near
-            np.count_nonzero(valid[b]),
-            unmeasured[b],
-            np.count_nonzero(views[b, : len(one.disagreement)] == 0),
-        )
-    return dict(zip(_COUNTS, map(torch.from_numpy, totals), strict=True))
+        return [np.empty(0)] * len(matched)
+    motion = relative_pose(torch.from_numpy(first), frame.T_world_cam)
+    mixture = state.mixture.to(torch.float64).rigid(*motion)
+    mean, covariance = map(torch.from_numpy, segments[:2])
+    return [
+        overlap_disagreement(mean[b, c], covariance[b, c], mixture.mean[b, k], mixture.covariance[b, k]).numpy()
+        for b, (c, k) in enumerate(torch.from_numpy(pairs) for pairs, *_ in matched)
+    ]
