@@ -267,17 +267,6 @@ def test_a_video_of_a_variable_rate_has_its_frames_and_times(tmp_path, suffix):
     assert video.read(5).shape == (64, 96, 3)
 
 
-def test_a_truncated_video_has_the_frames_that_can_be_decoded(tmp_path, capfd):
-    images = [RNG.integers(0, 255, (48, 64, 3), dtype=np.uint8) for _ in range(8)]
-    layouts.write_video(tmp_path / "cut.avi", images)
-    layouts.truncate(tmp_path / "cut.avi", 0.6)
-    video = Video(tmp_path / "cut.avi")
-    assert 2 <= len(video) < 8
-    assert len(video.times()) == len(video)
-    np.testing.assert_array_equal(video.read(len(video) - 2), images[len(video) - 2])
-    capfd.readouterr()  # FFmpeg complains on stderr
-
-
 # ---- KITTI's calib.txt
 
 

@@ -131,6 +131,15 @@ def test_a_full_disk_does_not_hide_an_interruption(frames, tmp_path, monkeypatch
     assert "the weights so far cannot be written: No space left" in caplog.text
 
 
+@pytest.fixture
+def interruptible():
+    """Ctrl-C interrupts, also in a job that a shell has put into the background, where it is ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_signals_end_the_command_and_leave_the_last_epoch(ufmstar, frames, tmp_path, number, monkeypatch):
     """Lightning would end the program with exit code 0 after SIGTERM, without weights."""

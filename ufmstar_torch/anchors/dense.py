@@ -26,7 +26,7 @@ from ufmstar_torch.anchors.dense_keyframes import Keyframes, halved
 from ufmstar_torch.anchors.dense_memory import Memory
 from ufmstar_torch.anchors.dense_poses import PoseErrors
 from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, OtherCameraError, checked, opencv
-from ufmstar_torch.anchors.motion import LANDMARK, LINE, OFF_LINE, SEARCH, MotionTests, Tested, located, moves
+from ufmstar_torch.anchors.motion import LANDMARK, LINE, OFF_LINE, SEARCH, MotionTest, MotionTests, located, moves
 from ufmstar_torch.anchors.saved_state import POSITIVE, SavedState
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.runtime.checked import Checked, number
@@ -261,7 +261,7 @@ class DenseEvidence(SavedState):
         cell: int,
         compared: tuple[Views, Views] | None,
         trusted: bool,
-    ) -> tuple[Depths, int, bool, Tested, int]:
+    ) -> tuple[Depths, int, bool, list[MotionTest], int]:
         """Measure visible landmarks again where the camera has moved, and new pixels in the cells without a landmark.
 
         Also updates the running estimates.
@@ -275,7 +275,7 @@ class DenseEvidence(SavedState):
 
         sighted = self._memory.sighted(small, T, K, cell)
         count, searched = len(sighted.slot), len(sighted.searched)
-        tests = [(sighted.compared, LANDMARK, sighted.hidden)]
+        tests = [MotionTest(LANDMARK, sighted.compared, sighted.hidden, np.ones(len(sighted.hidden), np.bool_))]
         if compared is None:
             measured = np.zeros(searched, np.int64), np.zeros(searched, np.bool_), *np.zeros((2, searched))
             searched = disagree = 0
@@ -287,12 +287,11 @@ class DenseEvidence(SavedState):
             arguments = matches, compared[0], K, self._depth, trusted
             rho, variance, off_line = self._errors.corrected(pixel, accepted, *arguments)
             measured = matches.agreed, accepted, rho, variance
-            seen, on_line = matches.shown > 1, np.isfinite(off_line)
-            tests.append((pixel[seen], SEARCH, ~accepted[seen]))
-            tests.append((pixel[on_line], LINE, off_line[on_line] > OFF_LINE))
+            tests.append(MotionTest(SEARCH, pixel, ~accepted, matches.shown > 1))
+            tests.append(MotionTest(LINE, pixel, off_line > OFF_LINE, np.isfinite(off_line)))
         found, refuted, self._depth = self._memory.settle(sighted, small, T, K, self._depth, measured, trusted)
         depths = Depths(sighted.pixel[:found], sighted.rho[:found], sighted.variance[:found])
-        return depths, count + searched, trusted, Tested.of(*tests), disagree + refuted
+        return depths, count + searched, trusted, tests, disagree + refuted
 
     def _coarse(
         self,
@@ -354,9 +353,15 @@ def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], ND
     """Reduce an image to at most ``width``; return [3, 3] the mapping of the pixels of ``gray`` to its pixels, too."""
     if gray.shape[1] <= width:
         return gray, np.eye(3)
-    cv2 = opencv()
     size = (width, max(round(gray.shape[0] * width / gray.shape[1]), 1))
-    small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+    if gray.shape[0] % size[1] == 0 and gray.shape[1] % size[0] == 0:
+        cv2 = opencv()
+        small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+    else:
+        from ufmstar_torch.anchors.kernels.reduce import reduce  # compiles when it is first needed
+
+        small = np.empty(size[::-1], np.uint8)
+        reduce(gray, small)
     along, down = size[0] / gray.shape[1], size[1] / gray.shape[0]
     scale = np.array([[along, 0, 0.5 * along - 0.5], [0, down, 0.5 * down - 0.5], [0, 0, 1]])
     return np.asarray(small, dtype=np.uint8), scale

@@ -17,6 +17,7 @@ The constants are fitted to tours with moving things (eight tours of 60 frames, 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -28,31 +29,23 @@ KINDS = SEARCH, LANDMARK, LINE = range(3)
 # By kind: c_k, weight, and the first F_k, which counts as _FIRST tests.
 _CAUGHT, _WEIGHT = np.array([0.4, 0.4, 0.1]), np.array([0.22, 0.43, 0.87])
 _FAILING, _FIRST = np.array([0.4, 0.06, 0.06]), 50.0
-_LEAST, _MOST = 0.02, 0.98  # limits of F_k
-_WINDOW = 1.5  # standard deviation of the window [cells]
-_CERTAIN = 1.9  # log ratio from which a surface counts as moving: motion is then more probable, by the prior odds
 OFF_LINE = 9.0  # squared distance of a match from its line, over its variance, from which the test fails
 
 
-class Tested(NamedTuple):
-    """N tests of one image.
+class MotionTest(NamedTuple):
+    """N tests of one kind in an image.
 
     Attributes:
+        kind: of ``KINDS``.
         pixel: [N, 2] (u, v).
-        kind: [N] of ``KINDS``.
         failed: [N] bool.
+        used: [N] bool, False where there was no test.
     """
 
+    kind: int
     pixel: NDArray[np.float64]
-    kind: NDArray[np.int64]
     failed: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, *parts: tuple[NDArray[np.float64], int, NDArray[np.bool_]]) -> Tested:
-        """Tests by kind: pixels [n, 2], kind, and [n] whether they failed."""
-        kinds = [np.full(len(pixel), kind) for pixel, kind, _ in parts]
-        pixels, failed = [pixel for pixel, *_ in parts], [failed for *_, failed in parts]
-        return cls(np.concatenate(pixels), np.concatenate(kinds), np.concatenate(failed))
+    used: NDArray[np.bool_]
 
 
 class MotionTests(SavedState):
@@ -73,42 +66,36 @@ class MotionTests(SavedState):
         self._count = np.full(len(KINDS), _FIRST)
         self._failed = _FAILING * _FIRST
 
-    def log_ratios(self, tested: Tested, size: tuple[int, int], cell: int) -> NDArray[np.float64]:
+    def log_ratios(self, tests: Iterable[MotionTest], size: tuple[int, int], cell: int) -> NDArray[np.float64]:
         """[R, C] log likelihood ratio of motion against rest in each cell, 0 without a test; updates F_k.
 
         Args:
-            tested: of the image.
+            tests: of the image.
             size: (H, W) of the image [px].
             cell: side of a cell [px].
         """
-        count = np.bincount(tested.kind, minlength=len(KINDS))
-        self._count = self._memory * self._count + count
-        self._failed = self._memory * self._failed + np.bincount(tested.kind, tested.failed, len(KINDS))
-        failing = (self._failed / np.maximum(self._count, 1e-9)).clip(_LEAST, _MOST)
-        fails = _WEIGHT * np.log((failing + (1 - failing) * _CAUGHT) / failing)
-        passes = _WEIGHT * np.log(1 - _CAUGHT)
-        rows, cols = -(-size[0] // cell), -(-size[1] // cell)
-        column, row = (tested.pixel / cell).astype(np.int64).clip(0, [cols - 1, rows - 1]).T
-        value = np.where(tested.failed, fails[tested.kind], passes[tested.kind])
-        cells = np.bincount(row * cols + column, value, rows * cols).reshape(rows, cols)
-        around: NDArray[np.float64] = _window(rows) @ cells @ _window(cols)
-        return around
+        from ufmstar_torch.anchors.kernels.motion import combine, tally  # compiles when it is first needed
+
+        shape = -(-size[0] // cell), -(-size[1] // cell)
+        counts, ratios = np.zeros((len(KINDS), 2, *shape)), np.empty(shape)
+        for kind, pixel, failed, used in tests:
+            tally(pixel, failed, used, cell, counts[kind])
+        combine(counts, self._count, self._failed, self._memory, _CAUGHT, _WEIGHT, ratios)
+        return ratios
 
 
 def moves(ratios: NDArray[np.float64], pixel: NDArray[np.float64], cell: int) -> NDArray[np.bool_]:
     """Which pixels [N, 2] lie in a cell that moves, from the log ratios [R, C] of the cells."""
-    column, row = (pixel / cell).astype(np.int64).T
-    return ratios[row.clip(0, len(ratios) - 1), column.clip(0, ratios.shape[1] - 1)] > _CERTAIN
+    from ufmstar_torch.anchors.kernels.motion import mark  # compiles when it is first needed
+
+    result = np.empty(len(pixel), np.bool_)
+    mark(ratios, pixel, cell, result)
+    return result
 
 
 def located(ratios: NDArray[np.float64], cell: int) -> NDArray[np.float64]:
     """[R C, 3] the centre (u, v) of every cell [px], and its log ratio [R, C]."""
-    row, column = np.indices(ratios.shape)
-    centres = ((x + 0.5) * cell - 0.5 for x in (column, row))
-    return np.stack([*centres, ratios], -1).reshape(-1, 3)
-
-
-def _window(count: int) -> NDArray[np.float64]:
-    """[count, count] Gaussian weights between cells."""
-    position = np.arange(count) / _WINDOW
-    return np.exp(-np.square(position[:, None] - position) / 2)
+    result = np.empty((*ratios.shape, 3))
+    result[..., 0], result[..., 2] = (np.arange(ratios.shape[1]) + 0.5) * cell - 0.5, ratios
+    result[..., 1] = ((np.arange(ratios.shape[0]) + 0.5) * cell - 0.5)[:, None]
+    return result.reshape(-1, 3)

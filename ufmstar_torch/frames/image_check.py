@@ -67,7 +67,7 @@ def _means_of_bytes(image: NDArray[np.uint8]) -> NDArray[np.float32]:
         end = grey.shape[axis] // _CELL * _CELL
         lines = [grey[(slice(None),) * axis + (slice(first, end, _CELL),)] for first in range(_CELL)]
         grey = lines[0] + lines[1] + lines[2]
-    return grey / np.float32(image.shape[1] * _CELL**2)
+    return np.divide(grey, image.shape[1] * _CELL**2, dtype=np.float32)
 
 
 def shows_something(grey: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from ufmstar_torch.anchors.check import FARTHEST_OFF
-from ufmstar_torch.kernels.compile_cpu import empty, kernel, part, reordered_leaf
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, part, reordered_leaf
 
 # Upper limit of |y|: anchors that are off by more are not valid.
 LARGEST = math.log(FARTHEST_OFF)
@@ -150,38 +150,52 @@ def interpolate(maps, nodes, coefficients, grid, config, outputs):
     """
     depth, valid, logs, claimed = maps
     y, variance, outlier, inlier = outputs
-    b, rows, cols, width = coefficients, grid.rows, grid.cols, depth.shape[1]
-    left, right = empty((rows, 6, width), np.float64), empty((rows, 6, width), np.float64)
+    b, cols, width = coefficients, grid.cols, depth.shape[1]
+    lines, before = empty((2, 2, 6, width), np.float64), empty(width, np.int64)
     across, base = empty(width, np.float64), empty(width, np.float64)
     for j in range(width):
         u = (j + 0.5) / width
         position = min(max(u * cols - 0.5, 0.0), cols - 1.0)
-        before = min(int(position), max(cols - 2, 0))
-        after = min(before + 1, cols - 1)
-        across[j], base[j] = position - before, b[0] - b[1] * grid.mean + b[2] * (2 * u - 1)
-        for row in range(rows):
-            for k in range(6):
-                left[row, k, j], right[row, k, j] = nodes[k, row * cols + before], nodes[k, row * cols + after]
-    limits = config.edge_contrast**2, LARGEST
-    _pixels(depth, valid, logs, claimed, left, right, across, base, (b[1], b[3]), limits, y, variance, inlier, outlier)
+        before[j] = min(int(position), max(cols - 2, 0))
+        across[j], base[j] = position - before[j], b[0] - b[1] * grid.mean + b[2] * (2 * u - 1)
+    columns, limits = (across, base, before), (config.edge_contrast * config.edge_contrast, LARGEST)
+    _pixels(
+        depth, valid, logs, claimed, nodes, grid.rows, cols, lines, columns, b, limits, y, variance, inlier, outlier
+    )
+
+
+@leaf
+def _fill(nodes, row, cols, before, line):
+    """Write the nodes of a row before and after each column of pixels [2, 6, W]."""
+    for k in range(6):
+        for j in range(before.size):
+            i = row * cols + before[j]
+            line[0, k, j], line[1, k, j] = nodes[k, i], nodes[k, min(i + 1, row * cols + cols - 1)]
 
 
 @reordered_leaf
-def _pixels(depth, valid, logs, claimed, left, right, across, base, slopes, limits, y, spread, inlier, outlier):
+def _pixels(
+    depth, valid, logs, claimed, nodes, rows, cols, lines, columns, b, limits, y, spread, inlier, outlier
+):  # fmt: skip
     """As :func:`interpolate`.
 
-    ``left`` and ``right`` [R, 6, W] are the nodes before and after each column, ``across`` the weight of the one after.
+    ``columns`` are the weight of the node after each column, b . x without the parts that vary along the column, and
+    the node before it. ``lines`` [2, 2, 6, W] hold the two rows of nodes around a row of pixels (:func:`_fill`).
     The ratios of the four weights s/(1 + D^2) are those of s times the other three denominators.
     """
-    height, rows, width = logs.shape[0], left.shape[0], across.size
+    height, width, filled = logs.shape[0], logs.shape[1], -1
+    across, base, before = columns
     contrast2, largest = limits
-    by_depth, by_row = slopes
+    by_depth, by_row = b[1], b[3]
     for i in range(height):
         v = (i + 0.5) / height
         position = min(max(v * rows - 0.5, 0.0), rows - 1.0)
         top = min(int(position), max(rows - 2, 0))
         fv, bottom = position - top, min(top + 1, rows - 1)
-        n0, n1, n2, n3 = left[top], right[top], left[bottom], right[bottom]
+        while filled < bottom:
+            filled += 1
+            _fill(nodes, filled, cols, before, lines[filled % 2])
+        n0, n1, n2, n3 = lines[top % 2, 0], lines[top % 2, 1], lines[bottom % 2, 0], lines[bottom % 2, 1]
         depths, used, gs, Vs = depth[i], valid[i], logs[i], claimed[i]
         ys, variances, inliers, outliers = y[i], spread[i], inlier[i], outlier[i]
         for j in range(width):
