@@ -110,9 +110,9 @@ def batched(landmarks: Sequence[Landmarks], device: torch.device, capacity: int 
             motion[i, : len(one.motion)] = one.motion
     error, shared, scale = np.array([(one.pose_error, one.shared, one.scale) for one in landmarks]).T.copy()
     moving = np.array([one.moving for one in landmarks])
-    fields = (torch.from_numpy(x).to(device) for x in (pixel, depth, variance, valid, error, shared, scale))
+    tensors = [torch.from_numpy(x).to(device) for x in (pixel, depth, variance, valid, error, shared, scale, moving)]
     tests = None if motion is None else torch.from_numpy(motion).to(device)
-    return Anchors(*fields, motion=tests, moving=torch.from_numpy(moving).to(device))
+    return Anchors(*tensors[:7], tests, tensors[7])
 
 
 class LandmarkSource(Protocol):

@@ -219,14 +219,16 @@ def _of_stream(
     else:
         with np.errstate(all="ignore"):  # invalid pixels are not read
             maps = depth, valid, np.log(depth), claimed
-        wrong, numbers = math.isinf(shared[0]), constants(config)
-        of_frame(views(packed), maps, anchors, motion, wrong, priors(config), numbers, outputs, shown)
+        memory = views(packed)
+        if math.isinf(shared[0]):
+            restart(memory, config)
+        of_frame(memory, maps, anchors, motion, priors(config), constants(config), outputs, shown)
         np.exp(factor, out=factor)
     finish(depth, factor, variance, inlier, (*shared, config.prior_sigma**2), floor)
 
 
 @kernel
-def of_frame(memory, maps, anchors, motion, wrong, priors, config, outputs, shown):
+def of_frame(memory, maps, anchors, motion, priors, config, outputs, shown):
     """The frame of one stream.
 
     Args:
@@ -234,15 +236,12 @@ def of_frame(memory, maps, anchors, motion, wrong, priors, config, outputs, show
         maps: depth, valid, log of the depth, claimed variance [H, W].
         anchors: :class:`AnchorRows`.
         motion: [M, 3] tests of motion (``motion.tests_at``); none if no value is finite.
-        wrong: whether the poses were wrong for an unknown time.
         priors: [4, R] (``running.priors``).
         config: of the posterior.
         outputs: [H, W] y, variance, probability and inlier variance (``cells.interpolate``); written.
         shown: [5] calibration, growth with the distance, and quantiles; written.
     """
     depth, valid, logs, _ = maps
-    if wrong:
-        restart(memory, config)
     ratios, frames = empty(RATIOS, np.float64), memory.frames[0]
     write_ratios(memory, priors, ratios)
     grid = grid_of(logs, valid, min(SIDE, depth.shape[0]), min(SIDE, depth.shape[1]), config)
