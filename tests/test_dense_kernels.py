@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import oracle_dense
 import pytest
@@ -12,6 +13,7 @@ from ufmstar_torch.anchors.dense_keyframes import Keyframes, halved
 from ufmstar_torch.anchors.kernels import dense as dense_cpu
 from ufmstar_torch.anchors.kernels.dense import ACROSS, Search, Views, free_pixels, measure
 from ufmstar_torch.anchors.kernels.landmarks import Columns, Sighted, settle, sight
+from ufmstar_torch.anchors.kernels.reduce import reduce
 
 K = np.array([[90.0, 0, 47.5], [0, 90.0, 35.5], [0, 0, 1]])
 SEARCH = Search(start=0.5, low=-0.01, high=2.0, sigmas=3.5, least_score=0.85, rival=1.2, match=1.0)
@@ -148,6 +150,14 @@ def test_a_view_that_might_show_the_match_outside_of_it_is_no_first_one(scene):
     assert found[whole].mean() > 0.5
     both = views([plane(0, MOVED[0]), first.image[0]], [MOVED[0], moved], np.eye(4))
     assert (measure(image, pixel, both, SEARCH).agreed[~whole] > 1).any(), "a depth from another view is verified there"
+
+
+@pytest.mark.parametrize("size", [(360, 540), (97, 333), (375, 1242), (2, 330), (300, 321), (700, 320)])
+def test_a_reduced_image_is_that_of_opencv_to_the_bit(size):
+    image = np.random.default_rng(0).integers(0, 256, size).astype(np.uint8)
+    small = np.empty((max(round(size[0] * 0.6), 1), 160 if size[1] > 320 else 319), np.uint8)
+    reduce(image, small)
+    np.testing.assert_array_equal(small, cv2.resize(image, small.shape[::-1], interpolation=cv2.INTER_AREA))
 
 
 def test_no_contrast_no_depth():

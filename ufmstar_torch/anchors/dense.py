@@ -353,9 +353,15 @@ def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], ND
     """Reduce an image to at most ``width``; return [3, 3] the mapping of the pixels of ``gray`` to its pixels, too."""
     if gray.shape[1] <= width:
         return gray, np.eye(3)
-    cv2 = opencv()
     size = (width, max(round(gray.shape[0] * width / gray.shape[1]), 1))
-    small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+    if gray.shape[0] % size[1] == 0 and gray.shape[1] % size[0] == 0:
+        cv2 = opencv()
+        small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+    else:
+        from ufmstar_torch.anchors.kernels.reduce import reduce  # compiles when it is first needed
+
+        small = np.empty(size[::-1], np.uint8)
+        reduce(gray, small)
     along, down = size[0] / gray.shape[1], size[1] / gray.shape[0]
     scale = np.array([[along, 0, 0.5 * along - 0.5], [0, down, 0.5 * down - 0.5], [0, 0, 1]])
     return np.asarray(small, dtype=np.uint8), scale
