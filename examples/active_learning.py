@@ -3,6 +3,7 @@
 Two rounds label the images with the largest mean variance, or random images. Another walk is the test set.
 """
 
+import sys
 from copy import deepcopy
 from importlib.resources import files
 from typing import Any
@@ -56,6 +57,7 @@ def main(seeds: int = 4, frames: int = 160, labels: int = 12, steps: int = 60) -
     for seed in range(200_001, 200_001 + seeds):
         pool, held_back = (walk(seed, path, frames, start) for path in (0, 1))
         for name, rows in results.items():
+            print(f"walk {seed}: {name}", file=sys.stderr, flush=True)
             network, chosen, rng, errors = start, list[int](), np.random.default_rng(seed), DepthAccuracy()
             for _ in range(0 if name == "before" else 2):
                 score = np.array(scores(network, pool, PARTS[name]) if name in PARTS else rng.random(frames))

@@ -4,6 +4,7 @@ Compares ``TrainDecision`` with random selection of as many images, with all ima
 the last includes the first eight images.
 """
 
+import sys
 from copy import deepcopy
 from importlib.resources import files
 from typing import Any
@@ -49,6 +50,7 @@ def main(walks: int = 4, frames: int = 64, cost: float = 0.06) -> dict[str, list
     start: Any = load_trained(str(files("ufmstar_torch.models").joinpath("weights", "demo.safetensors")))[0]
     results: dict[str, list[tuple[int, float]]] = {name: [] for name in ("decided", "random", "all", "none")}
     for seed in range(301, 301 + walks):
+        print(f"tour {seed}", file=sys.stderr, flush=True)
         tour = tour_sequence(seed, frames=4 * frames, style="mixed")
         each: Any = ((f, start.preprocess(f.image, f.intrinsics)) for f in (tour[4 * i] for i in range(frames)))
         images = [[x, *map(torch.from_numpy, (f.depth[None], f.T_world_cam)), K] for f, (x, K) in each]

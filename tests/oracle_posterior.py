@@ -146,15 +146,32 @@ def update(state, depth, claimed, pixel, g, variance, motion=None):
     another [H, W].
     """
     logs = nodes(depth)
-    prior = joint_prior(logs, state)
+    prior, beyond = joint_prior(logs, state), np.zeros(logs.shape)
+    if motion is not None:
+        (pixel, g, variance), beyond = plausible(state, depth, logs, pixel, g, variance)
     seen = observed(state, depth, logs, pixel, g, variance)
     fit = fitted(state, logs, *prior, seen)
     after = learnt(state, logs, *prior, seen, fit)
-    offset, alone, spread, p, share = at_nodes(state, after, depth.shape, logs, seen, fit, motion)
+    offset, alone, spread, p, share = at_nodes(state, after, depth.shape, logs, seen, fit, motion, beyond)
     b = fit.mean[:4]
     posterior, variance, outlier = read(depth, np.nan_to_num(claimed), logs, b, offset, spread, p, share)
     _, inlier, _ = read(depth, 0 * depth, logs, b, offset, alone, p, share)
     return after, posterior, variance, inlier, outlier
+
+
+def plausible(state, depth, logs, pixel, g, variance):
+    """The anchors (pixel, depth, variance) whose log ratio lies within 9.92 scales, or log 6, of that of most;
+    all, if these are not half of them; and the share of the others at every node."""
+    y = [math.log(one / depth[round(v), round(u)]) for one, (u, v) in zip(g, pixel, strict=True)]
+    far = np.abs(y - np.float64(ratio(state, "centre"))) > max(9.92 * ratio(state, "between") ** 0.5, math.log(6))
+    if not state["frames"] or far.mean() > 0.5:
+        far[:] = False
+    count, beyond = np.zeros((2, *logs.shape))
+    for (u, v), one in zip(pixel, far, strict=True):
+        r, c = int((v + 0.5) / depth.shape[0] * logs.shape[0]), int((u + 0.5) / depth.shape[1] * logs.shape[1])
+        count[r, c] += 1
+        beyond[r, c] += one
+    return (pixel[~far], g[~far], variance[~far]), beyond / np.maximum(count, 1)
 
 
 def observed(state, depth, logs, pixel, g, variance):
@@ -217,7 +234,7 @@ def learnt(state, logs, mean0, Q, seen, fit):
     return after
 
 
-def at_nodes(state, after, size, logs, seen, fit, motion):
+def at_nodes(state, after, size, logs, seen, fit, motion, beyond):
     """Offset of log depth, relative variances on the evidence's surface and in all, probability of another surface, and
     distance, at the nodes."""
     mean, C, n = fit.mean, fit.C, logs.size
@@ -238,7 +255,7 @@ def at_nodes(state, after, size, logs, seen, fit, motion):
     spread = [second_moment(*each) for each in zip(p, spread, offset, wide, strict=True)]
     if motion is not None:
         e = offset + mean[0] + X[:, 1] * mean[1] - after["most"]
-        P = moving(motion, size, logs, e, share, ratio(after, "between"))
+        P = moving(motion, size, logs, e, share, ratio(after, "between"), beyond)
         elsewhere_ = [second_moment(1.0, 0.1, *each) for each in zip(e, wide, strict=True)]
         p, spread = 1 - (1 - p) * (1 - P), (1 - P) * np.array(spread) + P * np.array(elsewhere_)
     alone, spread = np.array(alone), np.array(spread)
@@ -272,7 +289,7 @@ def surfaces(state, node, y, noise):
     return c, (c * n, n), (square, n)
 
 
-def moving(motion, size, logs, e, share, between):
+def moving(motion, size, logs, e, share, between, beyond):
     """Probability of motion at the nodes."""
     rows, cols = logs.shape
     e, share, P = e.reshape(logs.shape), share.reshape(logs.shape), []
@@ -283,6 +300,7 @@ def moving(motion, size, logs, e, share, between):
             normal_density = math.exp(-f * f / v / 2) / math.sqrt(2 * math.pi * v)
             student = (1 + f * f / between / 2) ** -1.5 / (2 * math.sqrt(2) * math.sqrt(between))
             ratios[r, c] = max(1 - share[r, c], 0) * math.log(normal_density / student)
+            ratios[r, c] += beyond[r, c] * (50 - ratios[r, c])
             sides[r, c] = max(1 - share[r, c], 0) * math.log(1.9 if f > 0 else 0.1)
     for r in range(rows):
         for c in range(cols):

@@ -295,6 +295,7 @@ def test_hostile_maps_add_up_to_what_loops_say(dtype: torch.dtype) -> None:
     for name, total in expected.items():
         assert float(sums[f"metrics.{name}"]) == pytest.approx(total, rel=1e-12), name
     judged, found = int(sums["metrics.ECEQuantile.pixels"]), metrics.compute()
+    assert found["nll"] == pytest.approx(expected["NLL.total"] / expected["NLL.pixels"], rel=1e-12)
     for name, kind in (("left_out_share", "DepthAccuracy"), ("nll_left_out_share", "NLL")):
         used = expected[f"{kind}.pixels"] / expected["DepthAccuracy.with_truth"]
         assert found[name] == pytest.approx(1 - used, rel=1e-12)

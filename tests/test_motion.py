@@ -178,6 +178,7 @@ def test_values_with_motion_against_the_oracle():
     state, packed = oracle.start(), torch.zeros(1, SIZE, dtype=torch.float64)
     for seed, value in enumerate((2.0, 1.0)):
         depth, _, claimed, *anchors = scene(seed, (12, 16), 40)
+        anchors[1][:4] *= 12  # a ratio that no surface has; in the first frame the ratio of most surfaces is unknown
         motion = points(value, region=(7, 9))
         state, *expected = oracle.update(state, depth, claimed, *anchors, motion=motion)
         frame, rows = checked(depth, *anchors)
@@ -196,12 +197,12 @@ def test_a_ratio_that_no_other_surface_has_is_explained_by_motion_and_a_usual_on
     n = 28 * 28
     offset, logs, zero = np.zeros((28, 28)), np.zeros((28, 28)), np.zeros(n)
     offset[8:20, 8:16], logs[8:20, 8:16] = 0.7, -0.8
-    arguments = offset.ravel(), logs.ravel(), zero, zero
+    arguments = offset.ravel(), logs.ravel(), zero, zero, zero
     P = probability(*arguments, 0.05**2, 28, 28).reshape(28, 28)
     assert P[10:18, 10:14].min() > 0.4
     assert P[offset == 0].max() < 0.1, "the depth edge bounds the region"
     assert probability(*arguments, 0.5**2, 28, 28).max() < 0.15, "in this stream surfaces differ that much"
-    far = probability(offset.ravel(), logs.ravel(), zero + 1, zero, 0.05**2, 28, 28)
+    far = probability(offset.ravel(), logs.ravel(), zero + 1, zero, zero, 0.05**2, 28, 28)
     assert far.max() < 0.06, "without evidence there is nothing to explain"
 
 
@@ -210,12 +211,55 @@ def test_motion_that_passes_the_tests_makes_a_surface_look_farther():
     e, logs, zero = np.zeros((28, 28)), np.zeros((28, 28)), np.zeros(n)
     e[8:20, 8:16], logs[8:20, 8:16] = 0.7, -0.8
     inside, passed = (e > 0).ravel(), np.full(n, -4.0)
-    P = probability(e.ravel(), logs.ravel(), zero, passed, 0.05**2, 28, 28)
-    nearer = probability(-e.ravel(), logs.ravel(), zero, passed, 0.05**2, 28, 28)
+    P = probability(e.ravel(), logs.ravel(), zero, passed, zero, 0.05**2, 28, 28)
+    nearer = probability(-e.ravel(), logs.ravel(), zero, passed, zero, 0.05**2, 28, 28)
     assert P[inside].max() > 0.3
     assert nearer[inside].max() < P[inside].max() / 2
-    P, nearer = (probability(x.ravel(), logs.ravel(), zero, zero + 3, 0.05**2, 28, 28) for x in (e, -e))
+    P, nearer = (probability(x.ravel(), logs.ravel(), zero, zero + 3, zero, 0.05**2, 28, 28) for x in (e, -e))
     assert nearer[inside].min() > P[inside].min() - 0.1, "tests that fail show motion on either side"
+
+
+def walked_beside(far, frames=6):
+    """The posteriors of a network's frames, and where a board is whose anchors say ``far`` times its distance from the
+    second frame on. The wall behind it has anchors at the image's border only, at the network's depth."""
+    rng, packed = np.random.default_rng(0), torch.zeros(1, SIZE, dtype=torch.float64)
+    board, outs = np.zeros((48, 64), bool), []
+    board[16:32, 24:40] = True
+    depth = np.where(board, 2.0, 3.0)
+    for i in range(frames):
+        pixel = (rng.uniform(0.02, 0.96, (300, 2)) * [64, 48]).round()
+        u, v = pixel.astype(int).T
+        kept = board[v, u] | (np.maximum(np.abs(u / 64 - 0.5), np.abs(v / 48 - 0.5)) > 0.4)
+        pixel, on, z = pixel[kept], board[v, u][kept], depth[v, u][kept] * np.exp(rng.normal(0, 0.05, kept.sum()))
+        z = np.where(on & (i > 0), far, 1.0) * z
+        frame, rows = checked(depth, pixel, z, np.where(on, 0.3, 0.05) ** 2 * z**2)
+        rows = replace(rows, motion=torch.from_numpy(points(-1.0, (48, 64)))[None])
+        packed, out = update(packed, frame, rows, torch.zeros(1, 48, 64, dtype=torch.float64), MODEL)
+        outs.append(out)
+    return depth, board, outs
+
+
+def test_a_thing_that_seems_to_be_at_infinity_does_not_take_the_wall_with_it():
+    """A thing that walks ahead at the camera's speed has no parallax."""
+    depth, board, outs = walked_beside(30.0)
+    ratio = outs[-1].depth[0].numpy() / depth
+    assert np.abs(np.log(ratio[~board])).max() < 0.25
+    assert (outs[-1].outlier[0].numpy()[board] > 0.5).all(), "the thing moves, or its matches are wrong"
+    assert np.median(walked_beside(1.6)[2][-1].depth[0].numpy()[board]) > 1.3 * 2, "a ratio that surfaces may have"
+
+
+def test_a_ratio_that_most_anchors_have_is_never_discarded():
+    """After a change of the network's unit the posterior follows the anchors, whatever the ratio was before."""
+    packed = torch.zeros(1, SIZE, dtype=torch.float64)
+    for i in range(8):
+        depth, _, claimed, pixel, z, variance = scene(i, (36, 48))
+        unit = 1.0 if i < 4 else 1 / 40
+        frame, rows = checked(depth * unit, pixel, z, variance)
+        rows = replace(rows, motion=torch.from_numpy(points(-1.0, (36, 48)))[None])
+        packed, out = update(packed, frame, rows, torch.from_numpy(claimed)[None], MODEL)
+        u, v = pixel.round().astype(int).T
+        error = np.log(out.depth[0].numpy()[v, u] / z)
+    assert np.median(np.abs(error)) < 0.3
 
 
 def approached(frames=12):

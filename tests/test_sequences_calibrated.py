@@ -242,8 +242,9 @@ def test_run_with_a_network_s_scale_says_so(tmp_path, capfd):
     np.testing.assert_allclose(line["T_world_cam"], truth.T_world_cam[3], atol=5e-3)
 
 
-def test_transforms_from_structure_from_motion_have_no_scale(tmp_path):
-    path, _ = written.write_transforms(tmp_path, aabb_scale=16)
+@pytest.mark.parametrize("key", ["aabb_scale", "applied_scale"])
+def test_transforms_from_structure_from_motion_have_no_scale(tmp_path, key):
+    path, _ = written.write_transforms(tmp_path, **{key: 0.3})
     assert not open_sequence(path).metric
     assert not open_sequence(path / "transforms.json").metric
 

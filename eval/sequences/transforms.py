@@ -38,8 +38,8 @@ from ufmstar_torch.gaussians.conventions import CONVENTIONS
 
 FILE, TRAIN = "transforms.json", "transforms_train.json"
 LOOKED_FOR = f"{FILE} or {TRAIN}, or the path of another file *.json"
-# Keys of a file or frame made by structure from motion.
-_NOT_METRIC = ("aabb_scale", "colmap_im_id")
+# Keys of a file or frame made by structure from motion, and the factor by which a program has scaled the poses.
+_NOT_METRIC = ("aabb_scale", "colmap_im_id", "applied_scale")
 # Names in the folder of transforms.json that show that structure from motion computed the poses.
 _FROM_COLMAP = ("sparse_pc.ply", "colmap")
 _SIGMA = "sigma_file_path"  # of a frame of `ufmstar export`

@@ -110,9 +110,10 @@ def batched(landmarks: Sequence[Landmarks], device: torch.device, capacity: int 
             motion[i, : len(one.motion)] = one.motion
     error, shared, scale = np.array([(one.pose_error, one.shared, one.scale) for one in landmarks]).T.copy()
     moving = np.array([one.moving for one in landmarks])
-    fields = (torch.from_numpy(x).to(device) for x in (pixel, depth, variance, valid, error, shared, scale))
-    tests = None if motion is None else torch.from_numpy(motion).to(device)
-    return Anchors(*fields, motion=tests, moving=torch.from_numpy(moving).to(device))
+    fields = {"pixel": pixel, "depth": depth, "variance": variance, "valid": valid, "pose_error": error,
+              "shared": shared, "scale": scale, "motion": motion, "moving": moving}  # fmt: skip
+    tensors = {name: torch.from_numpy(value).to(device) for name, value in fields.items() if value is not None}
+    return Anchors(**tensors)
 
 
 class LandmarkSource(Protocol):

@@ -20,6 +20,11 @@ log ratio of this one-sided density and the symmetric one, times 1 - distance/re
 nodes of similar predicted depth, in a Gaussian window: the network bounds the region that moves. A surface counts as
 still unless there is evidence of motion: the probability of motion is P = max(0, (sigma(l) - c_0)/(1 - c_0)).
 
+An anchor with |y - c| above ``_FARTHEST`` s and log F (``farthest``), by c and s of the frames before, is no evidence:
+a thing that keeps the camera's speed has no parallax, and its anchors, nearly infinitely far, would pull the field of
+the surfaces around. r is ``_BEYOND`` for such anchors, by their share in the node. Where they are the majority, c is
+wrong and all count.
+
 With the probability P, the depth is that of the prediction at the scale of most surfaces: e is normal with the variance
 w (``update``). The stated depth stays that of the evidence, which is right more often than the prediction even where P
 exceeds one half; its variance is the second moment about it. P adds to the probability p of another surface:
@@ -39,6 +44,7 @@ import numpy as np
 from ufmstar_torch.kernels.compile_cpu import empty, leaf, part, reordered_leaf
 from ufmstar_torch.posterior.moments import quantile
 from ufmstar_torch.posterior.running import BETWEEN, CENTRE, after_frame
+from ufmstar_torch.posterior.scene import AnchorRows, node_of
 
 # Standard deviation of log depth that motion adds; probability that motion that passes all tests looks nearer.
 _MOVING, _NEARER = 0.8, 0.05
@@ -49,10 +55,47 @@ _SIGMA, _HALF, _CONTRAST = 1.5, 3, 0.3
 _WIDE = 2 * _HALF + 1
 # Number of nodes that count as one surface in the choice of c, and as one anchor in the estimate of s.
 _SURFACE, _ANCHOR = 40.0, 8.0
+# Largest |y - c| of evidence over s, the 99 % quantile of |t_2|; and the log ratio of motion where all is beyond.
+_FARTHEST, _BEYOND = 9.92, 50.0
 # Standard deviation of c about its running mean; number of first candidates, the lowest of them as a quantile, and
 # number of iterations.
 _CHANGE, _CANDIDATES, _LOWEST, _ITERATIONS = 0.15, 33, 0.02, 8
 _LARGE = 1e100  # limit of a product: a further factor stays in range
+
+
+@part
+def plausible(anchors, frames, ratios, size, grid, config):
+    """The anchors whose ratio a surface that stands still may have, and [R C] the share of the others at every node.
+
+    Args:
+        anchors: :class:`~ufmstar_torch.posterior.scene.AnchorRows`.
+        frames: number of frames with anchors before.
+        ratios: up to the frame before.
+        size: H and W.
+        grid: of the frame.
+        config: of the posterior.
+    """
+    valid, n, far, total = empty(anchors.valid.size, np.bool_), grid.log_depth.size, 0, 0
+    beyond, count = empty(n, np.float64), empty(n, np.float64)
+    for i in range(n):
+        beyond[i] = count[i] = 0.0
+    limit = max(_FARTHEST * math.sqrt(ratios[BETWEEN]), math.log(config.farthest))
+    for k in range(valid.size):
+        y = math.log(anchors.depth[k] / anchors.predicted[k])
+        valid[k] = anchors.valid[k] and abs(y - ratios[CENTRE]) <= limit
+        total += anchors.valid[k]
+        far += anchors.valid[k] and not valid[k]
+    if frames == 0 or 2 * far > total:
+        return anchors, beyond
+    for k in range(valid.size):
+        if anchors.valid[k]:
+            i = node_of((anchors.pixel[k, 0] + 0.5) / size[1], (anchors.pixel[k, 1] + 0.5) / size[0], grid)
+            count[i] += 1
+            beyond[i] += not valid[k]
+    for i in range(n):
+        beyond[i] /= max(count[i], 1.0)
+    rows = AnchorRows(anchors.pixel, anchors.at_pixel, anchors.predicted, anchors.depth, anchors.variance, valid)
+    return rows, beyond
 
 
 @part
@@ -149,7 +192,7 @@ def tests_at(motion, height, width, rows, cols):
         sums[i] = weights[i] = 0.0
     for k in range(motion.shape[0]):
         u, v = (motion[k, 0] + 0.5) / width * cols - 0.5, (motion[k, 1] + 0.5) / height * rows - 0.5
-        if not finite(motion, k):
+        if not _finite(motion, k):
             continue
         for i in range(max(int(v), 0), min(int(v) + 2, rows)):
             for j in range(max(int(u), 0), min(int(u) + 2, cols)):
@@ -161,14 +204,22 @@ def tests_at(motion, height, width, rows, cols):
     return sums
 
 
+@part
+def tested(motion):
+    """True if a point of ``motion`` [M, 3] has no NaN and no infinity."""
+    found = False
+    for k in range(motion.shape[0]):
+        found |= _finite(motion, k)
+    return found
+
+
 @leaf
-def finite(motion, k):
-    """True if the point ``motion[k]`` has no NaN and no infinity."""
+def _finite(motion, k):
     return math.isfinite(motion[k, 0]) and math.isfinite(motion[k, 1]) and math.isfinite(motion[k, 2])
 
 
 @part
-def probability(e, log_depth, away, tests, between, rows, cols):
+def probability(e, log_depth, away, tests, beyond, between, rows, cols):
     """[n] probability P that the surface at a node moves.
 
     Args:
@@ -176,6 +227,7 @@ def probability(e, log_depth, away, tests, between, rows, cols):
         log_depth: [n] of the prediction.
         away: [n] distance from evidence as a share of ``reach``.
         tests: [n] from :func:`tests_at`.
+        beyond: [n] from :func:`plausible`.
         between: s^2, the squared scale of e over still surfaces.
         rows, cols: R and C of the nodes.
     """
@@ -186,7 +238,8 @@ def probability(e, log_depth, away, tests, between, rows, cols):
         square, near = e[i] * e[i], max(1 - away[i], 0.0)
         moving = -(square / variance + math.log(2 * math.pi * variance)) / 2
         still = -1.5 * math.log1p(square / between / 2) - math.log(2 * math.sqrt(2 * between))
-        values[0, i], values[1, i] = near * (moving - still), near * (farther if e[i] > 0 else nearer)
+        values[0, i] = (1 - beyond[i]) * near * (moving - still) + beyond[i] * _BEYOND
+        values[1, i] = near * (farther if e[i] > 0 else nearer)
     _means_around(values, log_depth, rows, cols, window, means)
     P = empty(n, np.float64)
     for i in range(n):

@@ -156,17 +156,11 @@ def after_frame(memory, priors, ratio, above, below, config):
     return min(max(total, priors[2, ratio] * n), priors[3, ratio] * n), n
 
 
-@leaf
-def restart(memory, config):
+def restart(memory: Memory, config: PosteriorConfig) -> None:
     """Return to the initial coefficients and slopes: wrong poses can have corrupted them. The ratios depend on network
     and scene and remain."""
-    for f in range(FEATURES):
-        memory.coefficients[f] = 0.0
-        for g in range(FEATURES):
-            memory.covariance[f, g] = 0.0
-        memory.covariance[f, f] = _prior_variance(f, config) if memory.frames[0] > 0 else 0.0
-    for f in range(SLOPES):
-        memory.slopes[f] = 0.0
+    memory.slopes[:], memory.coefficients[:] = 0, 0
+    memory.covariance[:] = np.diag(config.prior_variance) if memory.frames[0] > 0 else 0
 
 
 @leaf

@@ -117,6 +117,13 @@ def features(log_depth, u, v, x, k):
     x[k, 0], x[k, 1], x[k, 2], x[k, 3] = 1.0, log_depth, 2 * u - 1, 2 * v - 1
 
 
+@leaf
+def node_of(u, v, grid):
+    """The node at u and v from 0 to 1."""
+    column, row = min(max(int(u * grid.cols), 0), grid.cols - 1), min(max(int(v * grid.rows), 0), grid.rows - 1)
+    return row * grid.cols + column
+
+
 @part
 def _scene_of(grid, depth, valid, anchors, ratios, expected, config):
     """The :class:`Scene` of the :class:`AnchorRows` of a frame of depth d [H, W] [m]. ``ratios`` and ``expected``
@@ -132,8 +139,7 @@ def _scene_of(grid, depth, valid, anchors, ratios, expected, config):
         if not anchors.valid[i]:
             continue
         u, v = (anchors.pixel[i, 0] + 0.5) / depth.shape[1], (anchors.pixel[i, 1] + 0.5) / depth.shape[0]
-        column, row = min(max(int(u * grid.cols), 0), grid.cols - 1), min(max(int(v * grid.rows), 0), grid.rows - 1)
-        node[k], log_depth, g = row * grid.cols + column, math.log(anchors.predicted[i]), anchors.depth[i]
+        node[k], log_depth, g = node_of(u, v, grid), math.log(anchors.predicted[i]), anchors.depth[i]
         features(log_depth - grid.mean, u, v, x, k)
         y[k] = math.log(g) - log_depth
         stated[k] = ratios[NOISE] * anchors.variance[i] / (g * g) + config.alone / N

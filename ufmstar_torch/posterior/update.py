@@ -59,9 +59,10 @@ a is the variance of the anchors' y in a Gaussian window: depths differ more bet
 farther the evidence, the more surfaces lie between. v and w are at most ``widest``. Contradictory evidence thus limits
 the certainty of every pixel.
 
-Anchors that matching has measured are wrong on surfaces that move. With the probability P of ``motion``, the depth is
-that of the prediction at the scale of most surfaces: the variance becomes (1 - P) V + P tail, with the tail about
-their ratio instead of b . x, and p includes P.
+Anchors that matching has measured are wrong on surfaces that move. Those whose ratio to the prediction no surface of
+the stream has are left out (``motion.plausible``). With the probability P of ``motion``, the depth is that of the
+prediction at the scale of most surfaces: the variance becomes (1 - P) V + P tail, with the tail about their ratio
+instead of b . x, and p includes P.
 
 A stream whose anchors were all invalid so far has the network's depth with the variance of a node without evidence. A
 stream without anchors has UfM*'s output.
@@ -90,7 +91,7 @@ from ufmstar_torch.posterior.distribution import LEVELS
 from ufmstar_torch.posterior.field import at
 from ufmstar_torch.posterior.learn import sums_of
 from ufmstar_torch.posterior.moments import divide, second_moments
-from ufmstar_torch.posterior.motion import finite, in_image, probability, surfaces, tests_at
+from ufmstar_torch.posterior.motion import in_image, plausible, probability, surfaces, tested, tests_at
 from ufmstar_torch.posterior.running import (
     BETWEEN,
     CALIBRATION,
@@ -218,14 +219,16 @@ def _of_stream(
     else:
         with np.errstate(all="ignore"):  # invalid pixels are not read
             maps = depth, valid, np.log(depth), claimed
-        wrong, numbers = math.isinf(shared[0]), constants(config)
-        of_frame(views(packed), maps, anchors, motion, wrong, priors(config), numbers, outputs, shown)
+        memory = views(packed)
+        if math.isinf(shared[0]):
+            restart(memory, config)
+        of_frame(memory, maps, anchors, motion, priors(config), constants(config), outputs, shown)
         np.exp(factor, out=factor)
     finish(depth, factor, variance, inlier, (*shared, config.prior_sigma**2), floor)
 
 
 @kernel
-def of_frame(memory, maps, anchors, motion, wrong, priors, config, outputs, shown):
+def of_frame(memory, maps, anchors, motion, priors, config, outputs, shown):
     """The frame of one stream.
 
     Args:
@@ -233,19 +236,18 @@ def of_frame(memory, maps, anchors, motion, wrong, priors, config, outputs, show
         maps: depth, valid, log of the depth, claimed variance [H, W].
         anchors: :class:`AnchorRows`.
         motion: [M, 3] tests of motion (``motion.tests_at``); none if no value is finite.
-        wrong: whether the poses were wrong for an unknown time.
         priors: [4, R] (``running.priors``).
         config: of the posterior.
         outputs: [H, W] y, variance, probability and inlier variance (``cells.interpolate``); written.
         shown: [5] calibration, growth with the distance, and quantiles; written.
     """
     depth, valid, logs, _ = maps
-    if wrong:
-        restart(memory, config)
     ratios, frames = empty(RATIOS, np.float64), memory.frames[0]
     write_ratios(memory, priors, ratios)
     grid = grid_of(logs, valid, min(SIDE, depth.shape[0]), min(SIDE, depth.shape[1]), config)
-    before = expected(memory, grid.mean, config)
+    before, beyond = expected(memory, grid.mean, config), empty(grid.log_depth.size, np.float64)
+    if tested(motion):
+        anchors, beyond = plausible(anchors, frames, ratios, depth.shape, grid, config)
     scene, field, left_out, weight, away = fitted(grid, depth, valid, anchors, ratios, before, config)
     sums, scores = sums_of(scene, weight, left_out, ratios, frames, config)
     c = surfaces(scene, field.coefficients, memory, priors, ratios, config, sums)
@@ -259,7 +261,8 @@ def of_frame(memory, maps, anchors, motion, wrong, priors, config, outputs, show
         drift(memory, grid.mean, b, covariance, config)
     write_ratios(memory, priors, ratios)
     nodes, x, mean, wide = _nodes(scene, field, left_out, away, ratios, config)
-    _add_motion(nodes, x, mean, c, wide, motion, depth.shape, scene, field.coefficients, ratios, config)
+    if tested(motion):
+        _add_motion(nodes, x, mean, c, wide, motion, beyond, depth.shape, scene, field.coefficients, ratios, config)
     slopes = empty(FEATURES - 1, np.float64)
     for f in range(slopes.size):
         slopes[f] = memory.slopes[f] - field.coefficients[1 + f]
@@ -312,28 +315,25 @@ def _nodes(scene, field, left_out, away, ratios, config):
 
 
 @part
-def _add_motion(nodes, x, mean, c, wide, motion, size, scene, b, ratios, config):
-    """Add the probability of motion to the ``nodes`` [6, n], unless no value of ``motion`` [M, 3] is finite.
+def _add_motion(nodes, x, mean, c, wide, motion, beyond, size, scene, b, ratios, config):
+    """Add the probability of motion to the ``nodes`` [6, n].
 
     Args:
         nodes, x, mean, wide: from :func:`_nodes`; the first changes.
         c: constant of most surfaces.
         motion: as in :func:`of_frame`.
+        beyond: [n] from ``motion.plausible``.
         size: H and W.
         scene: of the frame.
         b: [4] coefficients.
         ratios: up to this frame.
         config: of the posterior.
     """
-    grid, tested, e = scene.grid, False, empty(mean.size, np.float64)
-    for k in range(motion.shape[0]):
-        tested |= finite(motion, k)
-    if not tested:
-        return
+    grid, e = scene.grid, empty(mean.size, np.float64)
     for i in range(e.size):
         e[i] = mean[i] - c - in_image(x, i, b)
     tests = tests_at(motion, size[0], size[1], grid.rows, grid.cols)
-    P = probability(e, grid.log_depth, nodes[5], tests, ratios[BETWEEN], grid.rows, grid.cols)
+    P = probability(e, grid.log_depth, nodes[5], tests, beyond, ratios[BETWEEN], grid.rows, grid.cols)
     for i in range(e.size):
         if P[i] > 0:
             tail = second_moments(config, nodes[2, i], 1.0, e[i], wide[i])[0]

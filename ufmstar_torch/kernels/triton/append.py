@@ -15,9 +15,9 @@ from ufmstar_torch.gaussians.state import UfMStarState
 from ufmstar_torch.kernels.triton.launch import launch, power_of_two
 from ufmstar_torch.kernels.triton.matrices import exact, load_symmetric, moved, store_symmetric, turned
 
-# Rows of a frame's counts [8, B] int64.
-COMPONENTS, SEGMENTS, MATCHED, PAIRS, NEW, DROPPED, VALID, UNMEASURED = range(8)
-COUNTS = 8
+# Rows of a frame's counts [7, B] int64.
+COMPONENTS, SEGMENTS, MATCHED, PAIRS, NEW, DROPPED, UNMEASURED = range(7)
+COUNTS = 7
 
 
 @dataclass(frozen=True)

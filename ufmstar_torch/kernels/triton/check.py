@@ -61,20 +61,9 @@ def check_values(
         nearest=DEPTH_RANGE[0], deepest=DEPTH_RANGE[1], max_depth=float(max_depth), largest=LARGEST, chunk=1024,
     )  # fmt: skip
     return FrameInput(
-        safe,
-        T_safe,
-        K_safe,
-        aleatoric,
-        epistemic,
-        features,
-        valid,
-        fault,
-        deviation,
-        counts[0],
-        counts[1],
-        counts[2],
+        safe, T_safe, K_safe, aleatoric, epistemic, features, valid, fault, deviation, counts[0], counts[1], counts[2],
         host_fault,
-    )
+    )  # fmt: skip
 
 
 @triton.jit

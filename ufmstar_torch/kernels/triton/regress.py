@@ -67,7 +67,7 @@ def regress_frame(
         frame: of B streams.
         memory: of the moving average.
         config: of UfM*.
-        counts: [8, B] int64 (``append``), to which valid and unmeasured pixels are added.
+        counts: [7, B] int64 (``append``), to which unmeasured pixels are added.
         smooth: whether to average.
     """
     depth, average = frame.depth.contiguous(), smooth and config.ema_alpha < 1.0
@@ -303,8 +303,7 @@ def _finished(
     if mode == 2:
         value = tl.where(measured_share < half, nan, value)
     tl.store(measured + target, tl.where(usable, measured_share, nan), mask=inside)
-    tl.atomic_add(counts + 6 * streams + b, tl.sum(usable.to(tl.int32), 0))
-    tl.atomic_add(counts + 7 * streams + b, tl.sum((usable & (measured_share < half)).to(tl.int32), 0))
+    tl.atomic_add(counts + 6 * streams + b, tl.sum((usable & (measured_share < half)).to(tl.int32), 0))
     value = tl.where(usable, value, nan)
     if alpha < 1.0:
         newest = value.to(memory.dtype.element_ty)

@@ -139,7 +139,7 @@ def device_step(
     of_step = {
         "components": counts[ends.COMPONENTS], "segments": counts[ends.SEGMENTS], "matched": counts[ends.MATCHED],
         "pairs": counts[ends.PAIRS], "new": counts[ends.NEW], "dropped": counts[ends.DROPPED] + removed,
-        "valid_pixels": counts[ends.VALID], "unmeasured": counts[ends.UNMEASURED],
+        "unmeasured": counts[ends.UNMEASURED],
         "single_view": (mixture.valid & (mixture.views == 0)).sum(1),
     }  # fmt: skip
     updated = state.with_tensors({
