@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ufmstar_torch.anchors.kernels.cholesky import factored, inverted, reduced, substituted
 from ufmstar_torch.anchors.kernels.epipolar import FAR as FAR_DEPTH
 from ufmstar_torch.anchors.kernels.epipolar import NEAR as NEAR_DEPTH
-from ufmstar_torch.anchors.kernels.epipolar import first_view, off_line, on_lines
+from ufmstar_torch.anchors.kernels.epipolar import matched, off_lines, on_lines
 from ufmstar_torch.anchors.kernels.numbers import finite, median
 from ufmstar_torch.kernels.compile_cpu import empty, leaf, reordered, reordered_leaf, reordered_part
 
@@ -141,34 +141,21 @@ def refine(pixel, seen, stated, K, K_inverse, depth, shift, most, learnt, poses,
 def _static(pixel, seen, stated, K, K_inverse, depth, still):
     """Which tracks [N] refine the poses: the largest group that fits them between its first view and the newest. All,
     where few do not fit: their Student-t weights suffice."""
-    count, last, tracks = len(seen), seen.shape[1] - 1, 0
-    track, distance = empty(count, np.int64), empty(count, np.float64)
-    newest, size = empty((count, 2), np.float64), empty(2, np.float64)
+    count, last = len(seen), seen.shape[1] - 1
+    track, first, order = empty(count, np.int64), empty(count, np.int64), empty(count, np.int64)
+    distance, rho, weight = empty(count, np.float64), empty(count, np.float64), empty(count, np.float64)
+    newest, size, fits = empty((count, 2), np.float64), empty(2, np.float64), empty(count, np.bool_)
     size[0], size[1] = 2 * K[0, 2], 2 * K[1, 2]
     for n in range(count):
         still[n] = True
-        first = first_view(seen[n])
-        if not seen[n, last] or first == last:
-            continue
-        off, _, _ = off_line(
-            pixel[n, last],
-            pixel[n, first],
-            stated[last],
-            stated[first],
-            K,
-            K_inverse,
-            NEAR_DEPTH * depth,
-            FAR_DEPTH * depth,
-        )
-        distance[tracks] = off / (_TRACKING * np.sqrt(1 + _DRIFT * (last - 1 - first)))
-        newest[tracks, 0], newest[tracks, 1] = pixel[n, last, 0], pixel[n, last, 1]
-        track[tracks] = n
-        tracks += 1
+    tracks, fitting = matched(seen, track, first), 0
     if tracks < _FEWEST:
         return
-    fits, weight, order = empty(tracks, np.bool_), empty(tracks, np.float64), empty(tracks, np.int64)
+    found, cameras = (track[:tracks], first[:tracks]), (stated, K, K_inverse, NEAR_DEPTH * depth, FAR_DEPTH * depth)
+    off_lines(pixel, *found, *cameras, newest, distance, rho, weight)
+    for i in range(tracks):
+        distance[i] /= _TRACKING * np.sqrt(1 + _DRIFT * (last - 1 - first[i]))
     on_lines(distance[:tracks], newest, size, 1.0, fits, weight, order)
-    fitting = 0
     for i in range(tracks):
         fitting += fits[i]
     if fitting <= (1 - _MOVING) * tracks:

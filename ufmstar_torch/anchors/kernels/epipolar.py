@@ -120,9 +120,28 @@ def weighted_quantile(values, weight, chosen, share, order):
 
 
 @reordered_leaf
-def first_view(seen):
-    """Index of the first view [W] that shows a corner; W if none does."""
-    for k in range(len(seen)):
-        if seen[k]:
-            return k
-    return len(seen)
+def matched(seen, track, first):
+    """Write the tracks that the newest view and an earlier one show, and the first such view, [N] each, from
+    ``seen`` [N, W]; return their number."""
+    count, last = 0, seen.shape[1] - 1
+    for n in range(len(seen)):
+        k = 0
+        while k < last and not seen[n, k]:
+            k += 1
+        if seen[n, last] and k < last:
+            track[count], first[count] = n, k
+            count += 1
+    return count
+
+
+@reordered_leaf
+def off_lines(pixel, track, first, poses, K, K_inverse, nearest, farthest, newest, distance, rho, baseline):
+    """Write the positions of tracks in the newest view [M, 2], and what :func:`off_line` returns for each and its first
+    view [M]; ``pixel`` [N, W, 2] and ``poses`` [W, 4, 4]. As a leaf, it counts no references to slices, which take most
+    of the time to compile."""
+    last = len(poses) - 1
+    for i in range(len(track)):
+        one, other = pixel[track[i], last], pixel[track[i], first[i]]
+        newest[i, 0], newest[i, 1] = one[0], one[1]
+        views = one, other, poses[last], poses[first[i]]
+        distance[i], rho[i], baseline[i] = off_line(*views, K, K_inverse, nearest, farthest)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ufmstar_torch.anchors.kernels.epipolar import FAR, NEAR, NEAREST, first_view, off_line, on_lines, weighted_quantile
+from ufmstar_torch.anchors.kernels.epipolar import FAR, NEAR, NEAREST, matched, off_lines, on_lines, weighted_quantile
 from ufmstar_torch.anchors.kernels.numbers import finite, median
 from ufmstar_torch.kernels.compile_cpu import empty, reordered, reordered_leaf
 
@@ -165,35 +165,37 @@ def compare(pixel, seen, poses, K, K_inverse, size, depth, noise):
         The standard deviation of corners from their epipolar lines [px], negative if there are too few; their median
         baseline [m]; the median inverse depth of those that determine one [1/m], negative if there are too few.
     """
-    last, count = seen.shape[1] - 1, 0
-    track, first = empty(len(seen), np.int64), empty(len(seen), np.int64)
-    for n in range(len(seen)):
-        k = first_view(seen[n])
-        if seen[n, last] and k < last:
-            track[count], first[count] = n, k
-            count += 1
+    last, most = seen.shape[1] - 1, len(seen)
+    track, first, order = empty(most, np.int64), empty(most, np.int64), empty(most, np.int64)
+    distance, rho, baseline = empty(most, np.float64), empty(most, np.float64), empty(most, np.float64)
+    motion, values, weight = empty(most, np.float64), empty(most, np.float64), empty(most, np.float64)
+    fits, newest = empty(most, np.bool_), empty((most, 2), np.float64)
+    count = matched(seen, track, first)
     if count < _ENOUGH:
         return -1.0, 0.0, -1.0
-    distance, rho = empty(count, np.float64), empty(count, np.float64)
-    motion, values, weight = empty(count, np.float64), empty(count, np.float64), empty(count, np.float64)
-    order, fits = empty(count, np.int64), empty(count, np.bool_)
-    newest = empty((count, 2), np.float64)
     for i in range(count):
-        one, other = pixel[track[i], last], pixel[track[i], first[i]]
-        newest[i, 0], newest[i, 1] = one[0], one[1]
-        values[i] = motion[i] = np.sqrt((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2)
+        n, k = track[i], first[i]
+        du, dv = pixel[n, last, 0] - pixel[n, k, 0], pixel[n, last, 1] - pixel[n, k, 1]
+        values[i] = motion[i] = np.sqrt(du * du + dv * dv)
     far = depth * (_MEDIAN_DEPTH if median(values, count) < _STILL else FAR)
-    for i in range(count):
-        views = pixel[track[i], first[i]], poses[last], poses[first[i]]
-        distance[i], rho[i], values[i] = off_line(newest[i], *views, K, K_inverse, NEAR * depth, far)
-    middle = median(values, count)
+    found, cameras = (track[:count], first[:count]), (poses, K, K_inverse, NEAR * depth, far)
+    off_lines(pixel, *found, *cameras, newest, distance, rho, baseline)
+    return _compared(distance[:count], rho[:count], baseline, motion, newest, size, noise, fits, weight, order)
+
+
+@reordered_leaf
+def _compared(distance, rho, baseline, motion, newest, size, noise, fits, weight, order):
+    """The results of :func:`compare`, from the distances [N] of tracks from their lines."""
+    count, determined = len(distance), 0
+    middle = median(baseline, count)
     on_lines(distance, newest, size, noise / 2, fits, weight, order)
     error = weighted_quantile(distance, weight, fits, 0.5, order) / _MEDIAN
-    determined = 0
     for i in range(count):
         fits[i] = rho[i] > 0 and motion[i] > _MOVES
         determined += fits[i]
-    return error, middle, weighted_quantile(rho, weight, fits, 0.5, order) if determined >= _ENOUGH else -1.0
+    if determined < _ENOUGH:
+        return error, middle, -1.0
+    return error, middle, weighted_quantile(rho, weight, fits, 0.5, order)
 
 
 # Errors of a tracked position add up from view to view: the variance of a track of v views is _DRIFT (v - 1) times that
