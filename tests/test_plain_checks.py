@@ -12,7 +12,7 @@ from ufmstar_torch.frames import frame as reference
 from ufmstar_torch.frames.frame import check_frame
 from ufmstar_torch.gaussians.camera import inverse_intrinsics, rotation_deviation
 from ufmstar_torch.kernels.cpu import check
-from ufmstar_torch.posterior.cells import finish
+from ufmstar_torch.posterior.update import finish
 
 K = torch.tensor([[40.0, 0, 31.5], [0, 42.0, 23.5], [0, 0, 1]])
 NAMES = ("pixel", "index", "predicted", "depth", "variance", "valid", "rejected", "contradiction")

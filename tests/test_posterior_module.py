@@ -94,16 +94,6 @@ def test_state_saved_and_loaded_goes_on_to_the_bit():
     assert bool(whole.posterior.any())
 
 
-def test_streams_are_independent():
-    together, alone = UfMStar(CONFIG), UfMStar(CONFIG)
-    for depth, T, anchors in ufm_frames(streams=2):
-        silent = dataclasses.replace(anchors, valid=torch.stack([torch.ones(60), torch.zeros(60)]).bool())
-        both = together(depth, T, K, anchors=silent)
-        one = alone(depth[:1], T, K, anchors=Anchors(anchors.pixel[:1], anchors.depth[:1], anchors.variance[:1]))
-        torch.testing.assert_close(both.depth[:1], one.depth, rtol=1e-5, atol=0, equal_nan=True)
-    assert torch.equal(torch.where(both.valid, depth, 0)[1], both.depth[1].nan_to_num())
-
-
 def test_errors_that_all_anchors_have_in_common_widen_every_pixel():
     """A factor common to all depths, and an error common to their inverses [1/m]."""
     depth, _, _, pixel, g, variance = scene(0)

@@ -31,12 +31,18 @@ def read_text(path: str | Path) -> str:
     """The text of a file, in UTF-8 or, if it begins with its mark, UTF-16. Raises OSError: it cannot be opened;
     ValueError: it is a device or a pipe, which may have no end, is larger than ``MOST_BYTES``, or is no text.
     """
-    path = Path(path)
-    if path.exists() and not (path.is_file() or path.is_dir()):
-        raise ValueError(f"{path} must be a file, got a device or a pipe")
+    path = _no_device(path)
     if path.is_file():
         require_bytes(str(path), path.stat().st_size)
     return decoded(path.read_bytes())
+
+
+def _no_device(path: str | Path) -> Path:
+    """The path. Raises ValueError: it is a device or a pipe."""
+    path = Path(path)
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise ValueError(f"{path} must be a file, got a device or a pipe")
+    return path
 
 
 def decoded(content: bytes) -> str:
@@ -54,9 +60,9 @@ def read_json(path: str | Path) -> Any:
 
 
 def read_settings(path: str | Path) -> Any:
-    """The value of a file of settings. Raises OSError: it cannot be opened; ValueError: it is larger than
-    ``MOST_SETTINGS`` bytes, or neither TOML nor JSON."""
-    path = Path(path)
+    """The value of a file of settings. Raises OSError: it cannot be opened; ValueError: it is a device or a pipe, is
+    larger than ``MOST_SETTINGS`` bytes, or neither TOML nor JSON."""
+    path = _no_device(path)
     with path.open("rb") as file:
         content = file.read(MOST_SETTINGS + 1)
     if len(content) > MOST_SETTINGS:

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from ufmstar_torch.anchors.check import FARTHEST_OFF
-from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, part, reordered_leaf
+from ufmstar_torch.kernels.compile_cpu import empty, leaf, part, reordered_leaf
 
 # Upper limit of |y|: anchors that are off by more are not valid.
 LARGEST = math.log(FARTHEST_OFF)
@@ -215,23 +215,3 @@ def _pixels(
             outliers[j] = p * share if used[j] else np.nan
             variances[j] = max(variance * d * d, unseen * (V if V == V else 0.0)) * share
             inliers[j] = inlier_variance * d * d * share
-
-
-@kernel
-def finish(depth, factor, variance, inlier, common, floor):
-    """Change e^y [H, W] to the depth d e^y, and its variances over e^2y to those [m^2]: at least ``floor``, plus the
-    errors that all anchors of the frame share.
-
-    ``common``: variance of the inverse-depth error, variance of the logarithm of a factor, mean square of rejected
-    anchors' relative errors (``Anchors``), and the limit of the first two, over the squared depth.
-    """
-    shared, scale, contradiction, limit = common
-    for i in range(depth.shape[0]):
-        for j in range(depth.shape[1]):
-            square = np.float64(factor[i, j]) * np.float64(factor[i, j])
-            d = factor[i, j] = depth[i, j] * factor[i, j]
-            V, V1 = variance[i, j] * square, inlier[i, j] * square
-            depth_square = np.float64(d) * np.float64(d)
-            added = depth_square * (contradiction + min(depth_square * shared + scale, limit))
-            variance[i, j] = (floor if floor > V else V) + added
-            inlier[i, j] = (floor if floor > V1 else V1) + added

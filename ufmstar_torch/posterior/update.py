@@ -84,7 +84,7 @@ from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.frames.frame import FrameInput
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, part
 from ufmstar_torch.kernels.cpu.calls import array, each
-from ufmstar_torch.posterior.cells import finish, interpolate, steepness
+from ufmstar_torch.posterior.cells import interpolate, steepness
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.conformal import adapt, quantiles, weigh
 from ufmstar_torch.posterior.distribution import LEVELS
@@ -339,3 +339,23 @@ def _add_motion(nodes, x, mean, c, wide, motion, beyond, size, scene, b, ratios,
             tail = second_moments(config, nodes[2, i], 1.0, e[i], wide[i])[0]
             nodes[2, i] = (1 - P[i]) * nodes[2, i] + P[i] * tail
             nodes[4, i] = 1 - (1 - nodes[4, i]) * (1 - P[i])
+
+
+@kernel
+def finish(depth, factor, variance, inlier, common, floor):
+    """Change e^y [H, W] to the depth d e^y, and its variances over e^2y to those [m^2]: at least ``floor``, plus the
+    errors that all anchors of the frame share.
+
+    ``common``: variance of the inverse-depth error, variance of the logarithm of a factor, mean square of rejected
+    anchors' relative errors (``Anchors``), and the limit of the first two, over the squared depth.
+    """
+    shared, scale, contradiction, limit = common
+    for i in range(depth.shape[0]):
+        for j in range(depth.shape[1]):
+            square = np.float64(factor[i, j]) * np.float64(factor[i, j])
+            d = factor[i, j] = depth[i, j] * factor[i, j]
+            V, V1 = variance[i, j] * square, inlier[i, j] * square
+            depth_square = np.float64(d) * np.float64(d)
+            added = depth_square * (contradiction + min(depth_square * shared + scale, limit))
+            variance[i, j] = (floor if floor > V else V) + added
+            inlier[i, j] = (floor if floor > V1 else V1) + added

@@ -136,15 +136,19 @@ def _pose_fault(T, deviation, tolerance):
     """Code 1 to 4 or 7 of a pose, 0 for none."""
     if not _finite(T):
         return 1
-    if max(abs(T[3, 0]), abs(T[3, 1]), abs(T[3, 2]), abs(T[3, 3] - 1.0)) > tolerance:
-        return 2
+    for j in range(4):
+        if abs(T[3, j] - (1.0 if j == 3 else 0.0)) > tolerance:
+            return 2
     if deviation > tolerance:
         return 3
     x, y = T[0, 1] * T[1, 2] - T[0, 2] * T[1, 1], T[0, 2] * T[1, 0] - T[0, 0] * T[1, 2]
     z = T[0, 0] * T[1, 1] - T[0, 1] * T[1, 0]
     if x * T[2, 0] + y * T[2, 1] + z * T[2, 2] < 0:
         return 4
-    return 7 if max(abs(T[0, 3]), abs(T[1, 3]), abs(T[2, 3])) > FARTHEST else 0
+    for i in range(3):
+        if abs(T[i, 3]) > FARTHEST:
+            return 7
+    return 0
 
 
 @leaf
@@ -155,9 +159,9 @@ def _intrinsics_fault(K, height, width):
         return 5
     if K[0, 1] != 0 or K[1, 0] != 0 or K[2, 0] != 0 or K[2, 1] != 0 or K[2, 2] != 1 or fx <= 0 or fy <= 0:
         return 6
-    if min(fx, fy) < _LEAST_FOCAL or max(fx, fy) > _LARGEST_FOCAL:
+    if fx < _LEAST_FOCAL or fy < _LEAST_FOCAL or fx > _LARGEST_FOCAL or fy > _LARGEST_FOCAL:
         return 8
-    return 9 if min(cx, cy) < -0.5 or cx > width - 0.5 or cy > height - 0.5 else 0
+    return 9 if cx < -0.5 or cy < -0.5 or cx > width - 0.5 or cy > height - 0.5 else 0
 
 
 @kernel
