@@ -232,6 +232,16 @@ def test_a_landmark_is_sighted_where_it_projects_and_not_behind_something(scene)
     assert landmarks.used.tolist() == [False, True, False]
 
 
+def test_a_patch_without_contrast_is_zero_and_never_shown():
+    """Its values are grey levels, so that their product with a window would exceed any correlation."""
+    image = np.full((72, 96), 100, np.uint8)
+    image[36, 48] = 108
+    landmarks = stored(image, np.array([[48.0, 36.0]]))
+    assert not landmarks.patch.any()
+    seen = sight(landmarks, 2, plane(0, np.eye(4)), np.eye(4), K, 8)
+    assert seen.hidden.tolist() == [True]
+
+
 @pytest.mark.parametrize("better", ["confirmed", "sigma"])
 def test_a_cell_keeps_the_landmark_that_is_known_best(scene, better):
     image, _, others = scene

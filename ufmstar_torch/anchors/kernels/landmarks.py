@@ -48,7 +48,7 @@ class Columns(NamedTuple):
         point: [N, 3] in the world [m].
         pose: [N, 4, 4] of the cameras that measured them [m].
         sigma: [N] relative standard deviation of the distance from these cameras.
-        patch: [N, SIDE, SIDE] the windows around their pixels there, of mean 0 and, with enough contrast, length 1.
+        patch: [N, SIDE, SIDE] the windows around their pixels there, of mean 0 and length 1; 0 without contrast.
         used: [N] bool, False = a free slot.
         confirmed: [N] number of later views that confirmed the landmark.
         failed: [N] number of failures in a row.
@@ -379,8 +379,7 @@ def _store(landmarks, slot, frame, flat, width, height, sighted, n, T, K_inverse
         for j in range(4):
             landmarks.pose[slot, i, j] = T[i, j]
     shown = sampled(flat, width, height, u, v, 1.0, 0.0, 0.0, 1.0, corner, share, template)
-    if shown:
-        normalised(template, patch, along_u, along_v)
+    shown = shown and normalised(template, patch, along_u, along_v)
     for j in range(SIDE):
         for i in range(SIDE):
             landmarks.patch[slot, j, i] = patch[j * SIDE + i] if shown else np.float32(0)
