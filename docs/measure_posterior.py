@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from importlib.resources import as_file, files
 from itertools import islice
 from pathlib import Path
@@ -137,7 +137,8 @@ def figures(prepared: list[Prepared], kind: str, config: PosteriorConfig) -> lis
 
 def changed(config: PosteriorConfig, **values: float) -> PosteriorConfig:
     """A posterior's config with other values. Constants are attributes of the class; a subclass changes them."""
-    return type("Changed", (PosteriorConfig,), values)(config.half_life, config.discs)
+    settings = {one.name: values.pop(one.name, getattr(config, one.name)) for one in fields(config)}
+    return type("Changed", (PosteriorConfig,), values)(**settings)
 
 
 def by_tour(tours: list[list[list[Prepared]]], config: PosteriorConfig) -> NDArray[np.float64]:

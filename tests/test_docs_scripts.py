@@ -97,6 +97,14 @@ def test_the_gaussian_disagreement_of_a_part_is_below_that_of_the_whole(script: 
     assert (b.pointwise, b.gaussian) == (pytest.approx(0.6**2 / 2), pytest.approx(0.3**2))
 
 
+def test_settings_and_constants_of_the_posterior_change(script: Any) -> None:
+    """Both are changed by name, and the others stay."""
+    changed, config = script("measure_posterior").changed, PosteriorConfig()
+    assert (changed(config, half_life=10.0).half_life, changed(config, discs=6).discs) == (10.0, 6)
+    one = changed(config, drift=0.1)
+    assert (one.drift, one.half_life, one.discs) == (0.1, config.half_life, config.discs)
+
+
 @pytest.mark.slow
 def test_a_constant_of_the_posterior_variance_leaves_the_depth(script: Any) -> None:
     """With a network of corrupted truth, the constant changes the variance and not the depth."""
