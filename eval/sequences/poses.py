@@ -226,7 +226,8 @@ def _numbers(path: str | Path) -> tuple[list[list[float]], list[str]]:
 
 
 def _tokens(text: str) -> list[str]:
-    """The words of a line before its comment. A comma beside other separators is part of a word, as in "0,5 1,5"."""
+    """Split a line into words and leave its comment out. Where spaces or semicolons separate the words, a comma inside
+    a word stays: "0,5 1,5" has two words."""
     words = re.split(r"(?:^|\s)#", text, maxsplit=1)[0].split()
     separator = ";" if any(";" in word for word in words) else ","
     words = [word.strip(separator) for word in words]

@@ -22,7 +22,7 @@ from ufmstar_torch.anchors.kernels.windows import (
     zncc,
 )
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
-from ufmstar_torch.kernels.compile_cpu import empty, reordered, reordered_leaf
+from ufmstar_torch.kernels.compile_cpu import empty, leaf, reordered, reordered_leaf
 
 # Least ZNCC of a landmark's patch with an image that shows it.
 SHOWN = 0.8
@@ -315,9 +315,7 @@ def settle(landmarks, frame, image, T, K_inverse, sighted, agreed, accepted, rho
         else:
             refuted += 1
             valid[n] = False
-            landmarks.failed[slot] += 2
-            if landmarks.confirmed[slot] == 0 or landmarks.failed[slot] > FAILURES + landmarks.confirmed[slot]:
-                landmarks.used[slot] = False
+            _refute(landmarks, slot)
     if compared >= _ENOUGH:
         numbers[0] = memory * apart + (1 - memory) * _beyond(squares[:compared], variances[:compared], values)
     free = 0
@@ -327,26 +325,46 @@ def settle(landmarks, frame, image, T, K_inverse, sighted, agreed, accepted, rho
             continue
         while free < count and landmarks.used[free]:
             free += 1
-        slot = free
-        if free == count:  # the one not seen for longest
-            slot = 0
-            for i in range(1, count):
-                if landmarks.seen[i] < landmarks.seen[slot]:
-                    slot = i
-            if landmarks.seen[slot] == frame:
-                continue
+        slot = free if free < count else _oldest(landmarks)
+        if free == count and landmarks.seen[slot] == frame:
+            continue
         landmarks.confirmed[slot] = 0
         _store(landmarks, slot, frame, flat, width, height, sighted, n, T, K_inverse, window)
-    found = 0
-    for n in range(total):
-        if valid[n]:
-            sighted.pixel[found, 0], sighted.pixel[found, 1] = sighted.pixel[n, 0], sighted.pixel[n, 1]
-            sighted.rho[found], sighted.variance[found] = sighted.rho[n], sighted.variance[n]
-            values[found] = 1 / sighted.rho[n]
-            found += 1
+    found = _move_up(sighted, valid, values)
     if found >= _ENOUGH:
         numbers[1] *= np.exp((1 - memory) * np.log(median(values, found) / numbers[1]))
     return found, refuted
+
+
+@leaf
+def _refute(landmarks, slot):
+    """Count a refutation of a landmark as two failures, and remove a landmark with too many of them."""
+    landmarks.failed[slot] += 2
+    if landmarks.confirmed[slot] == 0 or landmarks.failed[slot] > FAILURES + landmarks.confirmed[slot]:
+        landmarks.used[slot] = False
+
+
+@leaf
+def _oldest(landmarks):
+    """The slot of the landmark that no image has shown for longest."""
+    slot = 0
+    for i in range(1, len(landmarks.seen)):
+        if landmarks.seen[i] < landmarks.seen[slot]:
+            slot = i
+    return slot
+
+
+@leaf
+def _move_up(sighted, valid, depth):
+    """Move the valid pixels to the front, and write their depths [m]; returns their number."""
+    found = 0
+    for n in range(len(valid)):
+        if valid[n]:
+            sighted.pixel[found, 0], sighted.pixel[found, 1] = sighted.pixel[n, 0], sighted.pixel[n, 1]
+            sighted.rho[found], sighted.variance[found] = sighted.rho[n], sighted.variance[n]
+            depth[found] = 1 / sighted.rho[n]
+            found += 1
+    return found
 
 
 @reordered_leaf

@@ -104,16 +104,11 @@ def correct(pixel, accepted, measured, views, K, K_inverse, depth, trusted, memo
     square, mean = empty((CAMERA, CAMERA), np.float64), empty(CAMERA, np.float64)
     _prior(errors, shares, views.image.shape[2], square, camera_precision, precision, right_side)
     for i in range(count):
-        n, delta[i] = found[i], 0.0
+        delta[i] = 0.0
         for k in range(view_count):
-            value, speed, slope, across = each[n, k, VALUE], each[n, k, SPEED], each[n, k, SLOPE], each[n, k, ACROSS]
-            used, shows, unexplained = np.isfinite(value), np.isfinite(across), errors.unexplained[shares[k]]
-            offset[k, i], shift[k, i] = value - rho[n] if used else 0.0, across if shows else 0.0
-            scale = (1 + slope * slope) / (speed * speed)
-            weight[k, i] = 1 / (each[n, k, NOISE] / (speed * speed) + unexplained * scale) if used else 0.0
-            across_weight[k, i] = 1 / (each[n, k, ACROSS_NOISE] + unexplained) if shows else 0.0
             for c in range(EACH):
                 change[k, c, i] = across_change[k, c, i] = 0.0
+    _weigh(found, each, rho, errors.unexplained, shares, offset, weight, shift, across_weight)
     for _ in range(_LINEARISATIONS):
         for k in range(view_count):
             rotated(views.H[k], views.b[k], K, K_inverse, R, t)
@@ -138,16 +133,8 @@ def correct(pixel, accepted, measured, views, K, K_inverse, depth, trusted, memo
         width = views.image.shape[2]
         learn_camera(error, covariance, width, errors, camera_precision, camera_posterior, square, mean)
     learn_noise(found, measured, shares, residual, across_residual, memory, values, errors)
-    common, row = rows[0], rows[1]
-    for i in range(count):
-        common[i] = 0.0
-    for p in range(size):
-        row[:] = 0.0
-        for q in range(size):
-            for i in range(count):
-                row[i] += covariance[p, q] * mean_change[q, i]
-        for i in range(count):
-            common[i] += row[i] * mean_change[p, i]
+    common = rows[0]
+    _common_variance(covariance, mean_change, rows[1], common)
     for i in range(count):
         n, most, dispersion = found[i], 0.0, errors.disagreement[0]
         for k in range(view_count):
@@ -158,6 +145,36 @@ def correct(pixel, accepted, measured, views, K, K_inverse, depth, trusted, memo
                 off[n] = ratio if np.isnan(off[n]) else max(off[n], ratio)
         rho[n] += delta[i]
         variance[n] = _PATCH * (dispersion / max(measured.agreed[n], 1)) / most + common[i]
+
+
+@reordered_leaf
+def _weigh(found, each, rho, unexplained, shares, offset, weight, shift, across_weight):
+    """Write the distances [V, N] of the matches from the inverse depths ``rho``, along the lines [1/m] and across [px],
+    and their inverse variances; 0 where a view shows no match."""
+    for i in range(offset.shape[1]):
+        n = found[i]
+        for k in range(len(offset)):
+            value, speed, slope, across = each[n, k, VALUE], each[n, k, SPEED], each[n, k, SLOPE], each[n, k, ACROSS]
+            used, shows, noise = np.isfinite(value), np.isfinite(across), unexplained[shares[k]]
+            offset[k, i], shift[k, i] = value - rho[n] if used else 0.0, across if shows else 0.0
+            scale = (1 + slope * slope) / (speed * speed)
+            weight[k, i] = 1 / (each[n, k, NOISE] / (speed * speed) + noise * scale) if used else 0.0
+            across_weight[k, i] = 1 / (each[n, k, ACROSS_NOISE] + noise) if shows else 0.0
+
+
+@reordered_leaf
+def _common_variance(covariance, mean_change, row, common):
+    """Write the variances [N] that the errors of poses and camera, of covariance [S, S], add to the inverse depths,
+    which change with them by ``mean_change`` [S, N]; ``row`` is a buffer [N]."""
+    for i in range(len(common)):
+        common[i] = 0.0
+    for p in range(len(covariance)):
+        row[:] = 0.0
+        for q in range(len(covariance)):
+            for i in range(len(common)):
+                row[i] += covariance[p, q] * mean_change[q, i]
+        for i in range(len(common)):
+            common[i] += row[i] * mean_change[p, i]
 
 
 @reordered_leaf

@@ -211,7 +211,7 @@ _CLEAR_SHARE = 1 / 3
 
 
 class Limits(NamedTuple):
-    """Of the tracks that become landmarks; see ``tracker.TrackerConfig``."""
+    """Limits that a track must keep to become a landmark; see ``tracker.TrackerConfig``."""
 
     pixel_noise: float
     max_relative_sigma: float

@@ -108,9 +108,9 @@ def _tracks(pixel, seen, T, K, damping, steps, point, covariance, error, ahead):
 
 @part
 def _cameras(T, K, to_image, to_ray, centre, origin):
-    """Of views with poses [W, 4, 4], whose pixels are counted from the principal point: ``to_image`` [W, 3, 3] takes an
-    offset from a camera to (u z, v z, z) in its image, ``to_ray`` [W, 3, 3] a pixel (u, v, 1) to the direction of its
-    ray; ``centre`` [W, 3] counts from their mean, the ``origin`` [3]."""
+    """Write the matrices and centres of views with poses [W, 4, 4]. Pixels are counted from the principal point.
+    ``to_image`` [W, 3, 3] maps an offset from a camera to (u z, v z, z) in its image, ``to_ray`` [W, 3, 3] a pixel
+    (u, v, 1) to the direction of its ray. ``centre`` [W, 3] is relative to the mean of the centres, ``origin`` [3]."""
     fx, fy, skew = K[0, 0], K[1, 1], K[0, 1]
     for i in range(3):
         total = 0.0
