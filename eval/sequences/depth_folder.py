@@ -10,15 +10,9 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.attach import pair_by_name
 from ufmstar_torch.eval.sequences.frame import FrameError
-from ufmstar_torch.eval.sequences.images import (
-    DEPTH_SUFFIXES,
-    SCALE_KEY,
-    list_files,
-    read_depth,
-    read_map,
-    require_scale,
-)
+from ufmstar_torch.eval.sequences.images import SCALE_KEY, read_depth, read_map, require_scale
 from ufmstar_torch.eval.sequences.options import check_scale
+from ufmstar_torch.eval.sequences.paths import DEPTH_SUFFIXES, list_files
 
 _VARIANCE_SUFFIXES = (".npy", ".npz", ".exr", ".tif", ".tiff")
 
