@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 from torchmetrics import Metric
 
+from ufmstar_torch.runtime.kinds import check_kinds
+
 COUNT, SUM = torch.int64, torch.float64  # kinds of states
 
 
@@ -186,6 +188,7 @@ class SumMetric(Metric):
             self._update_count += incoming_state._update_count
 
 
+@check_kinds
 def flat_pixels(
     depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None,
     mixture: tuple[Tensor, Tensor] | None = None, level: Tensor | None = None,
@@ -208,6 +211,8 @@ def flat_pixels(
     for name, value in (maps | {"inlier": inlier, "outlier": outlier, "level": level}).items():
         if value is None:
             continue
+        if value.device != depth.device:
+            raise ValueError(f"{name} must lie on the depth's device {depth.device}, got {value.device}")
         if value.shape != depth.shape:
             raise ValueError(f"{name} must have the depth's shape {tuple(depth.shape)}, got {tuple(value.shape)}")
         if name == "valid" and value.dtype != torch.bool:
