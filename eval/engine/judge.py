@@ -59,8 +59,8 @@ def add_to(
 
 def judge_run(metrics: dict[str, SequenceMetrics], row: RowResult, plugins: PluginMetrics = NO_PLUGINS) -> None:
     """Add a frame of a run to the metrics of its row, ``UFM``, of its network ``ALONE``, and of its ``POSTERIOR``, on
-    the row's valid pixels, and as "ufm.moving", "ufm.still", ... on its ``RowResult.parts``. A frame without ground
-    truth is ignored."""
+    the row's valid pixels, and as "ufm.moving", "ufm.still", ... on its ``RowResult.parts``, without curves of gates. A
+    frame without ground truth is ignored."""
     if row.truth is None:
         return
     depth = row.prediction.depth[0]
@@ -71,7 +71,7 @@ def judge_run(metrics: dict[str, SequenceMetrics], row: RowResult, plugins: Plug
     corrected = POSTERIOR if row.corrected else UFM
     for name, stated in maps.items():
         mixture, level = row.mixture if name == POSTERIOR else None, row.level if name == corrected else None
-        add_to(metrics, name, row, stated, row.valid, mixture, level, plugins=plugins)
+        add_to(metrics, name, row, stated, row.valid, mixture, level, gates=False, plugins=plugins)
 
 
 class RowJudge:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -16,6 +17,11 @@ from torchmetrics import Metric
 from ufmstar_torch.runtime.kinds import check_kinds
 
 COUNT, SUM = torch.int64, torch.float64  # kinds of states
+TOLERANCE = 0.25  # [1] of delta1, in both definitions
+# Bins of equal width in the logarithm of a variance or squared error [m^2], and their range: (0.1 mm)^2 to (100 m)^2.
+# One bin below has all smaller values and 0, one bin above all larger ones. Relative errors use the same bins.
+BINS = 4096
+LOW, HIGH = 1e-8, 1e4
 
 
 class Selection:
@@ -23,49 +29,50 @@ class Selection:
     their number is unknown without waiting, they are all pixels, with 1 where ``mask`` is False.
 
     Args:
-        maps: [P] each.
+        maps: [P] each; [0] = missing.
         mask: [P] True = selected.
-        complete: True if ``maps`` have the selected pixels alone; ``mask`` is not read then.
     """
 
-    def __init__(self, maps: Sequence[Tensor], mask: Tensor, *, complete: bool = False) -> None:
+    def __init__(self, maps: Sequence[Tensor], mask: Tensor) -> None:
         self.mask: Tensor | None = None
-        if complete or _compacts(mask.device):
-            whole = complete or bool(mask.all())
-            self.maps = tuple(maps) if whole else tuple(value.masked_select(mask) for value in maps)
+        if _compacts(mask.device):
+            index = None if bool(mask.all()) else mask.nonzero()[:, 0]
+            parts = (x if index is None or not len(x) else x.index_select(0, index) for x in maps)
+            self.maps = tuple(part.double() for part in parts)
         else:
-            self.maps = tuple(value.masked_fill(~mask, 1.0) for value in maps)
+            self.maps = tuple(x.double().masked_fill(~mask, 1.0) if len(x) else x for x in maps)
             self.mask = mask
 
     def __iter__(self) -> Iterator[Tensor]:
         return iter(self.maps)
 
-    def where(self, condition: Tensor) -> Selection:
+    def where(self, condition: Tensor) -> Self:
         """The selected pixels with a condition [P] on their values."""
-        return Selection(self.maps, condition if self.mask is None else condition & self.mask)
+        if self.mask is None and _compacts(condition.device) and bool(condition.all()):
+            return self
+        return type(self)(self.maps, condition if self.mask is None else condition & self.mask)
 
     def number(self, condition: Tensor | None = None) -> Tensor:
         """[] int64 number of the selected pixels, or of those with a condition [P]."""
         if condition is None:
             return torch.tensor(len(self.maps[0])) if self.mask is None else self.mask.sum()
-        return (condition if self.mask is None else condition & self.mask).sum()
+        return (condition if self.mask is None else condition & self.mask).count_nonzero()
 
     def total(self, value: Tensor) -> Tensor:
         """[] sum of a value [P] over the selected pixels."""
         return (value if self.mask is None else value.masked_fill(~self.mask, 0.0)).sum()
 
     def histogram(self, index: Tensor, bins: int, value: Tensor | None = None) -> Tensor:
-        """[bins] by an index [P] in [0, bins): number of the selected pixels, or of those with a ``value`` of True, or
-        sum of their ``value`` [P]."""
+        """[bins] by an index [P] in [0, bins): number of the selected pixels, or sum of their ``value`` [P]."""
         if self.mask is None:
-            if value is None or value.dtype != torch.bool:
-                return torch.bincount(index, value, bins)
-            return torch.bincount(index, value.double(), bins).long()  # faster than index[value], and exact
-        if value is None or value.dtype == torch.bool:
-            values = (self.mask if value is None else self.mask & value).long()
-        else:
-            values = value.masked_fill(~self.mask, 0.0)
+            return torch.bincount(index, value, bins)
+        values = self.mask.long() if value is None else value.masked_fill(~self.mask, 0.0)
         return torch.zeros(bins, dtype=values.dtype, device=values.device).scatter_add_(0, index, values)
+
+    def parted(self, index: Tensor, bins: int, condition: Tensor) -> tuple[Tensor, Tensor]:
+        """[bins] numbers of all selected pixels, and of those with a condition [P], by an index [P] in [0, bins)."""
+        counts = self.histogram(2 * index + condition, 2 * bins).reshape(bins, 2)
+        return counts.sum(1), counts[:, 1]
 
 
 def _compacts(device: torch.device) -> bool:
@@ -73,10 +80,63 @@ def _compacts(device: torch.device) -> bool:
     return device.type == "cpu"
 
 
+class Judged(Selection):
+    """Pixels with ground truth: d, v and g, and what several metrics compute from them, once. ``maps`` also has those
+    of a mixture and of intervals."""
+
+    def __iter__(self) -> Iterator[Tensor]:
+        return iter(self.maps[:3])
+
+    @cached_property
+    def error(self) -> Tensor:
+        """|d - g| [m]."""
+        return (self.maps[0] - self.maps[2]).abs()
+
+    @cached_property
+    def squared(self) -> Tensor:
+        """|d - g|^2 [m^2]."""
+        return self.error.square()
+
+    @cached_property
+    def relative(self) -> Tensor:
+        """|d - g| / g."""
+        return self.error / self.maps[2]
+
+    @cached_property
+    def sigma(self) -> Tensor:
+        """Root of v [m]."""
+        return self.maps[1].sqrt()
+
+    @cached_property
+    def log_variance(self) -> Tensor:
+        """ln v; -inf for 0."""
+        return self.maps[1].log()
+
+    @cached_property
+    def variance_bins(self) -> Tensor:
+        """``log_bin`` of v."""
+        return log_bin(self.log_variance)
+
+    @cached_property
+    def squared_bins(self) -> Tensor:
+        """``log_bin`` of |d - g|^2."""
+        return log_bin(self.squared.log())
+
+    @cached_property
+    def within(self) -> Tensor:
+        """True where |d - g| <= ``TOLERANCE`` g."""
+        return self.error <= TOLERANCE * self.maps[2]
+
+    @cached_property
+    def certain(self) -> Judged:
+        """Those with v > 0."""
+        return self.where(self.maps[1] > 0)
+
+
 @dataclass(frozen=True, eq=False)
 class Pixels:
-    """The pixels of one or more frames, flat and float64 on the maps' device. Ground truth is valid if positive and
-    finite, a depth if finite, a variance if finite and not negative."""
+    """The pixels of one or more frames, flat, in the maps' types and on their device. Ground truth is valid if positive
+    and finite, a depth if finite, a variance if finite and not negative."""
 
     depth: Tensor  # [P] d [m]
     variance: Tensor  # [P] v [m^2]; [0] without one
@@ -94,22 +154,20 @@ class Pixels:
     @cached_property
     def predicted(self) -> Tensor:
         """[P] True where there are depth and variance."""
-        return self.use & self.depth.isfinite() & (self.variance >= 0) & (self.variance < torch.inf)
+        return self.use & (self.depth.abs() < torch.inf) & (self.variance >= 0) & (self.variance < torch.inf)
 
     @cached_property
-    def depths(self) -> Selection:
-        """d and g where both are valid."""
-        return Selection((self.depth, self.target), self.with_truth & self.depth.isfinite())
+    def depths(self) -> Judged:
+        """The pixels where d and g are valid."""
+        variance = self.variance if len(self.variance) else torch.full_like(self.depth, torch.nan)
+        maps = self.depth, variance, self.target, self.inlier, self.outlier, self.level
+        return Judged(maps, self.with_truth & (self.depth.abs() < torch.inf))
 
     @cached_property
-    def judged(self) -> Selection:
-        """d, v and g where all are valid."""
-        return Selection((self.depth, self.variance, self.target), self.with_truth & self.predicted)
-
-    @cached_property
-    def certain(self) -> Selection:
-        """d, v and g where all are valid and v > 0."""
-        return self.judged.where(self.judged.maps[1] > 0)
+    def judged(self) -> Judged:
+        """The pixels where d, v and g are valid."""
+        v = self.depths.maps[1]
+        return self.depths.where((v >= 0) & (v < torch.inf))
 
 
 class SumMetric(Metric):
@@ -193,7 +251,7 @@ def flat_pixels(
     depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None,
     mixture: tuple[Tensor, Tensor] | None = None, level: Tensor | None = None,
 ) -> Pixels:  # fmt: skip
-    """All pixels of maps of one shape [...], in float64.
+    """All pixels of maps of one shape [...].
 
     Args:
         depth: predicted depth d [m]; not finite = no prediction.
@@ -220,13 +278,16 @@ def flat_pixels(
         if name != "valid" and not torch.is_floating_point(value):
             raise ValueError(f"{name} must be floating point, got {value.dtype}")
 
-    none = depth.new_zeros(0, dtype=torch.float64)
-
     def flat(value: Tensor | None) -> Tensor:
-        return none if value is None else value.detach().to(torch.float64).flatten()
+        return depth.new_zeros(0) if value is None else value.detach().flatten()
 
     use = depth.new_ones(depth.numel(), dtype=torch.bool) if valid is None else valid.flatten()
     return Pixels(flat(depth), flat(variance), flat(target), use, flat(inlier), flat(outlier), flat(level))
+
+
+def log_bin(log: Tensor) -> Tensor:
+    """Bins in [0, BINS + 1] of values with the logarithm ``log``: 0 below ``LOW``, BINS + 1 from ``HIGH`` on."""
+    return ((log - math.log(LOW)) * (BINS / math.log(HIGH / LOW)) + 1).clamp(0, BINS + 1).long()
 
 
 def share(part: Tensor, whole: Tensor) -> Tensor:

@@ -43,18 +43,13 @@ class ECEDelta(SumMetric):
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
         chosen = pixels.judged
-        d, v, g = chosen
         delta, bins = self.settings["delta"], self.settings["bins"]
+        tolerance = delta * chosen.maps[0].abs()
         # Bin b is [b/B, (b+1)/B); a confidence of exactly 1, as of v = 0, belongs to the last.
-        sigma = torch.where(v > 0, v, 1.0).sqrt()
-        confidence = torch.where(v > 0, torch.erf(delta * d.abs() / (math.sqrt(2.0) * sigma)), 1.0)
+        confidence = torch.erf(tolerance / (math.sqrt(2.0) * chosen.sigma)).nan_to_num(1.0)
         b = (confidence * bins).long().clamp_max(bins - 1)
-        accurate = (g - d).abs() <= delta * d.abs()
-        return {
-            "confidence": chosen.histogram(b, bins, confidence),
-            "accurate": chosen.histogram(b, bins, accurate),
-            "pixels": chosen.histogram(b, bins),
-        }
+        count, accurate = chosen.parted(b, bins, chosen.error <= tolerance)
+        return {"confidence": chosen.histogram(b, bins, confidence), "accurate": accurate, "pixels": count}
 
     def compute(self) -> dict[str, Tensor]:
         total = self.pixels.sum()
@@ -99,9 +94,8 @@ class ECEQuantile(SumMetric):
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
         chosen = pixels.judged
-        d, v, g = chosen
-        sigma = torch.where(v > 0, v, 1.0).sqrt()
-        z = torch.where(v > 0, (g - d) / sigma, torch.where(g <= d, -torch.inf, torch.inf))
+        d, _, g = chosen
+        z = ((g - d) / chosen.sigma).nan_to_num(-torch.inf, torch.inf, -torch.inf)
         first = chosen.histogram(torch.searchsorted(self.quantiles, z), len(self.levels) + 1)
         return {"at_or_below": first.cumsum(0)[:-1], "pixels": chosen.number()}
 

@@ -34,6 +34,7 @@ class SequenceMetrics(nn.Module):
     Args:
         with_variance: False for a network that predicts depth alone.
         bins: of the calibration errors: "ours", 10 of the confidence and 10 levels, or "authors", 100 and 101.
+        gates: False to leave out ``GatedPixels``, which has curves alone.
         plugins: a user's classes of ``SumMetric`` by name; their figures are called "own.FIGURE". Those that need a
             variance are ignored without one.
     """
@@ -44,6 +45,7 @@ class SequenceMetrics(nn.Module):
         *,
         with_variance: bool = True,
         bins: str = OURS,
+        gates: bool = True,
         plugins: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         super().__init__()
@@ -53,7 +55,7 @@ class SequenceMetrics(nn.Module):
         kinds: list[type[SumMetric]] = [DepthAccuracy]
         if with_variance:
             kinds += [NLL, ECEDelta, ECEQuantile, EntropyHistogram, Sparsification, SpearmanCorrelation, Mixture]
-            kinds += [IntervalCoverage, GatedPixels]
+            kinds += [IntervalCoverage, *([GatedPixels] if gates else ())]
         finer = _AUTHORS if bins == AUTHORS else {}
         made = {kind.__name__: kind(**finer.get(kind, {}), sync_on_compute=False) for kind in kinds}
         usable = {name: kind for name, kind in plugins.items() if with_variance or not kind.OF_VARIANCE}

@@ -229,4 +229,5 @@ def _posterior_figures(row: RowResult) -> dict[str, Any]:
 
 
 def _mean(values: Tensor, valid: Tensor) -> float:
-    return float(values[valid].double().mean()) if bool(valid.any()) else float("nan")
+    count = int(valid.count_nonzero())
+    return float(values.where(valid, 0.0).sum(dtype=torch.float64)) / count if count else float("nan")
