@@ -14,8 +14,6 @@ import torch
 from torch import Tensor
 from torchmetrics import Metric
 
-from ufmstar_torch.runtime.kinds import check_kinds
-
 COUNT, SUM = torch.int64, torch.float64  # kinds of states
 TOLERANCE = 0.25  # [1] of delta1, in both definitions
 # Bins of equal width in the logarithm of a variance or squared error [m^2], and their range: (0.1 mm)^2 to (100 m)^2.
@@ -246,7 +244,6 @@ class SumMetric(Metric):
             self._update_count += incoming_state._update_count
 
 
-@check_kinds
 def flat_pixels(
     depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None,
     mixture: tuple[Tensor, Tensor] | None = None, level: Tensor | None = None,
@@ -262,13 +259,16 @@ def flat_pixels(
         level: of the smallest central interval with the ground truth in it; None = no intervals.
 
     Raises:
-        ValueError: an argument has another shape than ``depth`` or the wrong type.
+        TypeError: an argument is no dense tensor.
+        ValueError: an argument has another shape or device than ``depth``, or the wrong dtype.
     """
     inlier, outlier = mixture or (None, None)
     maps = {"depth": depth, "variance": variance, "target": target, "valid": valid}
     for name, value in (maps | {"inlier": inlier, "outlier": outlier, "level": level}).items():
-        if value is None:
+        if value is None and name not in ("depth", "target"):
             continue
+        if not isinstance(value, Tensor) or value.layout != torch.strided:
+            raise TypeError(f"{name} must be a dense torch.Tensor, got {type(value).__name__}")
         if value.device != depth.device:
             raise ValueError(f"{name} must lie on the depth's device {depth.device}, got {value.device}")
         if value.shape != depth.shape:
