@@ -262,13 +262,18 @@ def flat_pixels(
         level: of the smallest central interval with the ground truth in it; None = no intervals.
 
     Raises:
-        ValueError: an argument has another shape than ``depth`` or the wrong type.
+        TypeError: an argument is no dense tensor.
+        ValueError: an argument has another shape or device than ``depth``, or the wrong dtype.
     """
     inlier, outlier = mixture or (None, None)
     maps = {"depth": depth, "variance": variance, "target": target, "valid": valid}
     for name, value in (maps | {"inlier": inlier, "outlier": outlier, "level": level}).items():
-        if value is None:
+        if value is None and name not in ("depth", "target"):
             continue
+        if not isinstance(value, Tensor) or value.layout != torch.strided:
+            raise TypeError(f"{name} must be a dense torch.Tensor, got {type(value).__name__}")
+        if value.device != depth.device:
+            raise ValueError(f"{name} must lie on the depth's device {depth.device}, got {value.device}")
         if value.shape != depth.shape:
             raise ValueError(f"{name} must have the depth's shape {tuple(depth.shape)}, got {tuple(value.shape)}")
         if name == "valid" and value.dtype != torch.bool:
