@@ -199,6 +199,35 @@ def scene(tmp_path_factory: pytest.TempPathFactory):
 
 
 @pytest.fixture(scope="session")
+def rendered_walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of an exported tour: 12 frames, 120x160, whose images show the motion. Tests must not change it."""
+    from ufmstar_torch.eval.sequences import open_sequence
+    from ufmstar_torch.eval.tour import export_tour
+
+    return export_tour(open_sequence("tour:41?frames=12&size=120x160"), tmp_path_factory.mktemp("rendered") / "walk")
+
+
+@pytest.fixture(scope="session")
+def finished_run(scene, tmp_path_factory: pytest.TempPathFactory):
+    """A run of :func:`scene` with exact depth, the recording and its scene; the variance is replaced by (2 % of the
+    depth)^2, and above the horizon by 1 m^2. Tests may export it."""
+    import numpy as np
+    from runs import own_depth_job
+
+    from ufmstar_torch.eval.run.run import run
+    from ufmstar_torch.eval.run.writers import read_frame
+
+    out = tmp_path_factory.mktemp("run") / "out"
+    run(own_depth_job(scene[0]), out)
+    for file in (out / "frames").iterdir():
+        maps = read_frame(file)
+        maps["variance"] = np.square(0.02 * maps["depth"])
+        maps["variance"][:20] = 1
+        np.savez(file, **maps)
+    return out, *scene
+
+
+@pytest.fixture(scope="session")
 def path(scene) -> Path:
     """The folder of :func:`scene`."""
     return scene[0]

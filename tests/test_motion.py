@@ -6,6 +6,7 @@ from dataclasses import replace
 from itertools import islice
 
 import numpy as np
+import oracle_field
 import oracle_posterior as oracle
 import pytest
 import torch
@@ -175,7 +176,7 @@ def points(value, size=(12, 16), region=None):
 
 
 def test_values_with_motion_against_the_oracle():
-    state, packed = oracle.start(), torch.zeros(1, SIZE, dtype=torch.float64)
+    state, packed = oracle_field.start(), torch.zeros(1, SIZE, dtype=torch.float64)
     for seed, value in enumerate((2.0, 1.0)):
         depth, _, claimed, *anchors = scene(seed, (12, 16), 40)
         anchors[1][:4] *= 12  # a ratio that no surface has; in the first frame the ratio of most surfaces is unknown

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import oracle_field
 import oracle_posterior as oracle
 import pytest
 import torch
@@ -52,11 +53,11 @@ def ratios(packed):
     """Those of a memory [SIZE], by name."""
     values = np.empty(RATIOS)
     write_ratios(views(packed.numpy()), priors(MODEL), values)
-    return dict(zip(oracle.START, values.tolist(), strict=True))
+    return dict(zip(oracle_field.START, values.tolist(), strict=True))
 
 
 def test_values_against_the_oracle_over_frames():
-    state, packed = oracle.start(), torch.zeros(1, SIZE, dtype=torch.float64)
+    state, packed = oracle_field.start(), torch.zeros(1, SIZE, dtype=torch.float64)
     for seed in range(2):
         depth, _, claimed, *anchors = scene(seed, (12, 16), 40)
         state, expected, variance, inlier, outlier = oracle.update(state, depth, claimed, *anchors)
@@ -65,8 +66,8 @@ def test_values_against_the_oracle_over_frames():
         np.testing.assert_allclose(out.variance[0], variance, rtol=1e-7)
         np.testing.assert_allclose(out.inlier[0], inlier, rtol=1e-7)
         np.testing.assert_allclose(out.outlier[0], outlier, rtol=1e-7)
-        assert float(out.calibration) == pytest.approx(oracle.ratio(state, "calibration"), rel=1e-7)
-        assert float(out.unseen) == pytest.approx(oracle.ratio(state, "unseen"), rel=1e-7)
+        assert float(out.calibration) == pytest.approx(oracle_field.ratio(state, "calibration"), rel=1e-7)
+        assert float(out.unseen) == pytest.approx(oracle_field.ratio(state, "unseen"), rel=1e-7)
         np.testing.assert_allclose(views(packed[0].numpy()).intervals, state["intervals"], rtol=1e-7)
 
 
@@ -82,7 +83,7 @@ def test_field_and_distance_against_dense_matrices_and_dijkstra(rows, cols):
     right, down, across, along = np.zeros((4, n))
     across[:], along[:] = np.inf, np.inf
     A = np.diag(diagonal := rng.uniform(0.1, 9, n))
-    for i, j, variance, length in oracle.links(logs):
+    for i, j, variance, length in oracle_field.links(logs):
         links, lengths = (right, across) if j == i + 1 and cols > 1 else (down, along)
         links[i], lengths[i] = 0.01 / variance, length
         A[[i, j], [i, j]] += links[i]
@@ -92,8 +93,8 @@ def test_field_and_distance_against_dense_matrices_and_dijkstra(rows, cols):
     np.testing.assert_allclose(solved, np.linalg.solve(A, Y), rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(variance, np.linalg.inv(A).diagonal(), rtol=1e-10)
     source = rng.random(n) < 0.05
-    expected = oracle.distances(logs, np.nonzero(source)[0])
-    np.testing.assert_allclose(distance(source, across, along, cols, oracle.REACH), expected, rtol=1e-13)
+    expected = oracle_field.distances(logs, np.nonzero(source)[0])
+    np.testing.assert_allclose(distance(source, across, along, cols, oracle_field.REACH), expected, rtol=1e-13)
 
 
 def streams_of(seeds, dtype, size=(36, 48)):
@@ -122,7 +123,7 @@ def of_stream(frame, anchors, claimed, i):
 @pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-7), (torch.float32, 1e-4)])
 def test_streams_of_one_batch_equal_the_oracle_s(dtype, rtol):
     """Some anchors are invalid, and V is NaN at a valid pixel."""
-    packed, states = torch.zeros(3, SIZE, dtype=torch.float64), [oracle.start() for _ in range(3)]
+    packed, states = torch.zeros(3, SIZE, dtype=torch.float64), [oracle_field.start() for _ in range(3)]
     for seeds in ((0, 1, 2), (3, 0, 1)):
         frame, anchors, claimed = streams_of(seeds, dtype, (12, 16))
         packed, out = update(packed, frame, anchors, claimed, MODEL)
@@ -131,13 +132,13 @@ def test_streams_of_one_batch_equal_the_oracle_s(dtype, rtol):
             for name, value in zip(("depth", "variance", "inlier", "outlier"), expected, strict=True):
                 assert getattr(out, name).dtype == dtype
                 np.testing.assert_allclose(getattr(out, name)[i], value, rtol=rtol, err_msg=name)
-            assert float(out.calibration[i]) == pytest.approx(oracle.ratio(states[i], "calibration"), rel=rtol)
-            assert float(out.unseen[i]) == pytest.approx(oracle.ratio(states[i], "unseen"), rel=rtol)
+            assert float(out.calibration[i]) == pytest.approx(oracle_field.ratio(states[i], "calibration"), rel=rtol)
+            assert float(out.unseen[i]) == pytest.approx(oracle_field.ratio(states[i], "unseen"), rel=rtol)
             memory = views(packed[i].numpy())
             np.testing.assert_allclose(memory.coefficients, states[i]["b"], rtol=100 * rtol, atol=rtol)
             np.testing.assert_allclose(memory.covariance, states[i]["C"], rtol=100 * rtol, atol=rtol)
             assert ratios(packed[i]) == pytest.approx(
-                {name: oracle.ratio(states[i], name) for name in oracle.START}, rtol
+                {name: oracle_field.ratio(states[i], name) for name in oracle_field.START}, rtol
             )
         assert not bool(packed[2].any())
 
