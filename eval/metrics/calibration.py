@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, SumMetric, share
+from ufmstar_torch.runtime.kinds import check_kinds
 
 
 class ECEDelta(SumMetric):
@@ -32,6 +33,7 @@ class ECEDelta(SumMetric):
 
     OF_VARIANCE = "ECE_delta"
 
+    @check_kinds
     def __init__(self, delta: float = 0.25, bins: int = 10, **kwargs: Any) -> None:
         if not 0 < delta < 1 or bins < 1:
             raise ValueError(f"delta must lie in (0, 1) and bins be >= 1, got delta={delta}, bins={bins}")
@@ -80,6 +82,7 @@ class ECEQuantile(SumMetric):
 
     OF_VARIANCE = "ECE_q"
 
+    @check_kinds
     def __init__(self, levels: Sequence[float] | None = None, **kwargs: Any) -> None:
         q = quantile_levels(10) if levels is None else torch.tensor(list(levels), dtype=torch.float64)
         if q.numel() == 0 or not bool(((q >= 0) & (q <= 1)).all() and (q.diff() > 0).all()):

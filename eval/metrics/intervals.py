@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, Selection, SumMetric, share
+from ufmstar_torch.runtime.kinds import check_kinds
 
 LEVELS = (0.5, 0.9, 0.99)
 _PERCENT = 100  # classes of levels
@@ -63,6 +64,7 @@ class Coverage(SumMetric):
     OF_VARIANCE = "the coverage"
     STATES = (("covered", COUNT), ("width", SUM), ("pixels", COUNT))
 
+    @check_kinds
     def __init__(self, level: float = 0.9, **kwargs: Any) -> None:
         if not 0 < level < 1:
             raise ValueError(f"level must lie in (0, 1), got {level}")

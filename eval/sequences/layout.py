@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ufmstar_torch.eval.sequences.plugins import load_plugins
+from ufmstar_torch.runtime.kinds import check_kinds
 
 # Each module has ``detect(path)``, ``read(path, options)`` and LOOKED_FOR, the files that it detects; if a path may
 # contain several sequences, also ``parts(path)``.
@@ -108,6 +109,7 @@ class Found(NamedTuple):
     layout: str
 
 
+@check_kinds
 def find_sequences(root: str | Path, layout: str = "auto", plugin: Sequence[str] = ()) -> list[Found]:
     """All sequences at most four folders below ``root``, sorted by name.
 
