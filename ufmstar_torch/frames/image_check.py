@@ -174,9 +174,9 @@ class ImageCheck:
         fits = pose.dim() == 2 or len(pose) in (1, len(image))  # if not, UfM* names it
         if image.is_meta or not fits or not (image.dtype == torch.uint8 or _in_unit_range(image)):
             return None
-        on_cpu, reduced_image = image.is_cpu, reduced(image.detach())
-        T = pose.detach().to(image.device).double().expand(len(image), *pose.shape[-2:])
-        grey, T = (reduced_image.numpy(), T.numpy() + 0.0) if on_cpu else (reduced_image, T + 0.0)
+        values: tuple[Values, Values] = reduced(image.detach()), pose.detach().to(image.device).double()
+        grey, T = (value.numpy() for value in values) if image.is_cpu else values
+        T = _library(T).broadcast_to(T, (len(grey), *T.shape[-2:])) + 0.0
         self._undone = last = self._seen
         if last is None or not last.fits(grey, T):
             last = _Seen.before(grey, T)
@@ -191,7 +191,7 @@ class ImageCheck:
         self._seen = _Seen(grey, T, first, still, empty, repeated)
         self._examined = True
         informative = shows & ~frozen
-        if not on_cpu:  # reading the counts would synchronise
+        if not image.is_cpu:  # reading the counts would synchronise
             return informative
         log_once(self._logged, _findings(self._seen))
         return torch.from_numpy(informative)
