@@ -102,8 +102,8 @@ def along_wall(evidence: LandmarkTracker | DenseEvidence) -> None:
 
 @contextmanager
 def _no_collection() -> Iterator[None]:
-    """Disable garbage collection, which takes a tenth of a compilation's time. Afterwards collect what was made meanwhile
-    (3 million objects after a compilation, few otherwise) before a frame has to; older objects would take .2 s more."""
+    """Disable garbage collection, which takes a tenth of a compilation's time. Afterwards collect what was made
+    meanwhile, 3 million objects after a compilation, before a frame has to; older objects would take .2 s more."""
     enabled = gc.isenabled()
     gc.disable()
     try:
