@@ -23,6 +23,7 @@ from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import as_map
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.runtime.checked import Checked, number
+from ufmstar_torch.runtime.kinds import check_kinds, require
 
 KINDS = ("inverse", "affine")
 # Reweighted fits: with a third of outliers on one side, each fit reduces the error to .85, and 25 to less than .02.
@@ -130,6 +131,7 @@ class AlignedNetwork(DepthNetwork):
         preprocess: the network's preprocessing; None: images in [0, 1], not resized.
     """
 
+    @check_kinds
     def __init__(self, network: nn.Module, alignment: Alignment, preprocess: Preprocess | None = None) -> None:
         super().__init__()
         self.network = network
@@ -157,6 +159,7 @@ class AlignedNetwork(DepthNetwork):
         return DepthPrediction(self.alignment.depth(relative))
 
 
+@check_kinds
 def fit_inverse_depth(
     prediction: Tensor,
     depth: Tensor,
@@ -188,6 +191,7 @@ def fit_inverse_depth(
     return _fit("inverse", prediction, depth, valid, shift, **options)
 
 
+@check_kinds
 def fit_affine_depth(
     prediction: Tensor,
     depth: Tensor,
@@ -310,7 +314,8 @@ def _points(
 
 
 def require_maps(name: str, value: Tensor) -> None:
-    """Raise a ValueError unless ``value`` is floating-point [B, H, W]."""
+    """Raises TypeError, ValueError: ``value`` is no floating-point tensor [B, H, W]."""
+    require(name, value, Tensor)
     if value.dim() != 3 or not value.is_floating_point() or not value.numel():
         raise ValueError(f"{name} must be floating-point [B, H, W], got {value.dtype} {tuple(value.shape)}")
 

@@ -18,11 +18,13 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 
+from ufmstar_torch.frames.arguments import require_whole
 from ufmstar_torch.frames.prediction import DepthPrediction, combine
 from ufmstar_torch.models.batch_layer import BatchLayer, Selection
 from ufmstar_torch.models.distribution import DepthDistribution, images_of
 from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.runtime.kinds import check_kinds
 
 # [1] Standard deviation of the factors around 1, as in the published implementations. A smaller one keeps the members
 # nearer to pretrained weights and to each other; random signs would destroy trained weights.
@@ -32,6 +34,7 @@ _PLAIN = (nn.Conv2d, nn.Linear)
 Network = TypeVar("Network", bound=nn.Module)
 
 
+@check_kinds
 def convert(network: Network, members: int, *, std: float = INIT_STD) -> Network:
     """A copy of a network in which every ``Conv2d`` and ``Linear`` is a :class:`BatchLayer`.
 
@@ -89,12 +92,14 @@ class BatchEnsemble(DepthNetwork):
         network: to convert, into a copy. Arguments and errors as in :func:`convert`.
     """
 
+    @check_kinds
     def __init__(self, network: UncertaintyNetwork, members: int, *, std: float = INIT_STD) -> None:
         super().__init__()
         self.network = convert(network, members, std=std)
         self.preprocess = network.preprocess
         self.members = members
 
+    @check_kinds
     def distribution(self, image: Tensor, member: int | None = None, *, repeat: bool = True) -> DepthDistribution:
         """The distributions of ``image`` [B, 3, H, W] for the losses: of one ``member``, [B, H, W], or of all. With
         ``repeat``, all members process every image: [N B, H, W], the B maps of member 0 first. Without it, the batch is
@@ -141,7 +146,7 @@ class BatchEnsemble(DepthNetwork):
         return [factor for layer in converted_layers(self.network) for factor in (layer.r, layer.s)]
 
     def _checked(self, member: int) -> int:
-        if not 0 <= member < self.members:
+        if not 0 <= require_whole("member", member) < self.members:
             raise IndexError(f"member must be from 0 to {self.members - 1}, got {member}")
         return member
 

@@ -19,6 +19,7 @@ from ufmstar_torch.files.read import CheckpointError as CheckpointError
 from ufmstar_torch.files.read import read_tensors
 from ufmstar_torch.files.write import write_atomic
 from ufmstar_torch.frames.arguments import as_path, require_kind
+from ufmstar_torch.runtime.kinds import check_kinds
 from ufmstar_torch.runtime.optional import optional
 
 # Keys under which training programs store the weights in a checkpoint, and prefixes that wrappers add to every key.
@@ -29,6 +30,7 @@ _UNKNOWN_SUFFIX = f"{{}} must end in .safetensors or one of {', '.join(_TORCH_SU
 _SHOWN = 8  # most keys in an error message
 
 
+@check_kinds
 def load_state_dict_file(path: str | Path, ignore: Collection[str] = ()) -> dict[str, Tensor]:
     """The weights in a file, on the CPU, by key.
 
@@ -46,6 +48,7 @@ def load_state_dict_file(path: str | Path, ignore: Collection[str] = ()) -> dict
     return _without_prefixes(_read(Path(path), ignore))
 
 
+@check_kinds
 def load_weights(module: nn.Module, path: str | Path) -> None:
     """Fill a module from a file, in place; all keys and shapes must match.
 
@@ -126,6 +129,7 @@ def safetensors_shapes(path: str | Path, prefix: str = "") -> dict[str, tuple[in
         raise CheckpointError(f"{path} is not a readable safetensors file: {error}") from error
 
 
+@check_kinds
 def save_checkpoint(
     path: str | Path, weights: nn.Module | Mapping[str, Tensor], metadata: Mapping[str, Any] | None = None
 ) -> None:

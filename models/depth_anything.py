@@ -19,6 +19,7 @@ from ufmstar_torch.models.hugging_face import HuggingFaceDepth, HuggingFaceSpec,
 from ufmstar_torch.models.hugging_face_checkpoint import Checkpoint, read_checkpoint
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import PlainSpec
+from ufmstar_torch.runtime.kinds import check_kinds
 
 SIZE = (518, 518)  # [px] of the input
 
@@ -45,6 +46,7 @@ class DepthAnything(HuggingFaceDepth):
         super().__init__(checkpoint, spec, dtype)
 
     @classmethod
+    @check_kinds
     def from_pretrained(
         cls,
         name_or_dir: str | Path,

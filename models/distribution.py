@@ -10,10 +10,20 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from ufmstar_torch.frames.prediction import DepthPrediction
+from ufmstar_torch.runtime.kinds import check_fields
+
+
+class _Maps:
+    """Checks that all fields are maps of one shape."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if len(shapes := {tuple(value.shape) for value in vars(self).values()}) > 1:
+            raise ValueError(f"{type(self).__name__} must hold maps of one shape, got {sorted(shapes)}")
 
 
 @dataclass(frozen=True)
-class PointDepth:
+class PointDepth(_Maps):
     """Depth without a variance."""
 
     depth: Tensor  # [B, H, W] [m]
@@ -24,7 +34,7 @@ class PointDepth:
 
 
 @dataclass(frozen=True)
-class GaussianDepth:
+class GaussianDepth(_Maps):
     """N(depth, exp(log_variance)) (Kendall and Gal 2017)."""
 
     depth: Tensor  # [B, H, W] mean [m]
@@ -37,7 +47,7 @@ class GaussianDepth:
 
 
 @dataclass(frozen=True)
-class EvidentialDepth:
+class EvidentialDepth(_Maps):
     """Normal-Inverse-Gamma evidence (Amini et al. 2020, Eq. 4 and 5).
 
     Mean and variance of the depth are random: variance ~ Inverse-Gamma(alpha, beta) and

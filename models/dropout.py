@@ -13,6 +13,7 @@ from ufmstar_torch.frames.prediction import DepthPrediction, combine, infer
 from ufmstar_torch.models.distribution import DepthDistribution
 from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.runtime.kinds import check_kinds
 
 SAMPLES = 10  # passes of the paper's multi-inference baseline
 
@@ -26,6 +27,7 @@ class DecoderDropout(nn.Module):
     range.
     """
 
+    @check_kinds
     def __init__(self, p: float) -> None:
         super().__init__()
         if not 0 <= p < 1:
@@ -43,6 +45,7 @@ class DecoderDropout(nn.Module):
         return x * (draw >= self.p).to(x.dtype) / (1 - self.p)
 
 
+@check_kinds
 def set_sampling(module: nn.Module, on: bool, generator: torch.Generator | None = None) -> int:
     """Switch sampling in eval mode on or off for every :class:`DecoderDropout` in ``module`` with p > 0, in place.
     Returns their number. ``generator``: of the random numbers, on the network's device; None: torch's global one.
@@ -76,6 +79,7 @@ class MonteCarloDropout(DepthNetwork):
 
     stochastic = True
 
+    @check_kinds
     def __init__(
         self,
         network: DepthNetwork,

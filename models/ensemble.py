@@ -15,6 +15,7 @@ from ufmstar_torch.frames.prediction import DepthPrediction, combine, infer, tak
 from ufmstar_torch.models.checkpoints import CheckpointError
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.runtime.kinds import check_kinds
 
 
 class Ensemble(DepthNetwork):
@@ -28,6 +29,7 @@ class Ensemble(DepthNetwork):
         ValueError: fewer than two members, or different preprocessing.
     """
 
+    @check_kinds
     def __init__(self, members: Sequence[DepthNetwork]) -> None:
         super().__init__()
         if len(members) < 2:

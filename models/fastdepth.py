@@ -32,6 +32,7 @@ from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec, providers_f
 from ufmstar_torch.models.onnx_weights import read_convolutions
 from ufmstar_torch.models.outputs import METRIC, OutputSpec, PlainSpec
 from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.runtime.kinds import check_fields, check_kinds
 
 # Strides of the encoder's stem and 13 blocks.
 _STRIDES = (2, 1, 2, 1, 2, 1, 2, 1, 1, 1, 1, 1, 2, 1)
@@ -55,6 +56,7 @@ class FastDepthWidths:
     decoder: tuple[int, ...]
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for name, count in (("encoder", len(_STRIDES)), ("decoder", 5)):
             value = getattr(self, name)
             if len(value) != count or min(value) < 1:
@@ -78,6 +80,7 @@ class FastDepthWidths:
         return cls(encoder, (200, 256, 120, 56, 16))
 
     @classmethod
+    @check_kinds
     def scaled(cls, multiplier: float) -> FastDepthWidths:
         """:meth:`full` times MobileNet's width multiplier: multiples of 8, at least .9 of the exact width.
         Raises ValueError: the multiplier is not positive."""
@@ -151,6 +154,7 @@ class FastDepth(Backbone):
         ValueError: an argument is out of range.
     """
 
+    @check_kinds
     def __init__(
         self,
         widths: FastDepthWidths | None = None,
@@ -218,6 +222,7 @@ class FastDepth(Backbone):
         return self.head(features)[:, 0]
 
     @classmethod
+    @check_kinds
     def from_onnx(cls, path: str | Path, *, dropout: float = 0.0, size: tuple[int, int] = (224, 224)) -> FastDepth:
         """The network with the weights of an ONNX export, in eval mode.
 

@@ -18,6 +18,7 @@ from ufmstar_torch.frames.arguments import require_whole
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.models.distribution import DepthDistribution, EvidentialDepth, GaussianDepth, PointDepth, images_of
 from ufmstar_torch.models.network import Backbone, DepthNetwork
+from ufmstar_torch.runtime.kinds import check_kinds
 
 # [log m^2] Standard deviations from 1 mm to 1 km, which covers all plausible ones. Within them, exp(s) and exp(-s)
 # times a squared depth stay in the range of float32.
@@ -101,6 +102,7 @@ class UncertaintyNetwork(DepthNetwork):
         ValueError: more scales than the backbone has.
     """
 
+    @check_kinds
     def __init__(self, backbone: Backbone, kind: type[UncertaintyHead] | None, scales: int = 1) -> None:
         super().__init__()
         channels = backbone.pyramid_channels
@@ -138,6 +140,7 @@ class UncertaintyNetwork(DepthNetwork):
         return (images_of(distribution, slice(len(image))) if self.training else distribution).prediction()
 
 
+@check_kinds
 def with_head(backbone: Backbone, method: str, scales: int = 1) -> UncertaintyNetwork:
     """A backbone with the head of a method: "depth" (none), "aleatoric" or "evidential"; ``scales`` as in
     :class:`UncertaintyNetwork`. Raises TypeError: ``backbone`` is no :class:`Backbone`; ValueError: another method, or

@@ -21,6 +21,7 @@ from ufmstar_torch.models.network import DepthNetwork, require_image
 from ufmstar_torch.models.outputs import METRIC, PlainSpec, as_map
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.runtime.checked import Checked, number
+from ufmstar_torch.runtime.kinds import check_kinds
 
 _LINEAR, _CUBIC = 2, 3  # Pillow's numbers, which the configurations use
 # The supported architectures: their image processor, and whether they always predict metric depth. Others, such as
@@ -174,6 +175,7 @@ class HuggingFaceDepth(DepthNetwork):
         return self
 
 
+@check_kinds
 def from_hugging_face(
     name_or_dir: Any,
     *,

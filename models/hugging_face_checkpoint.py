@@ -16,6 +16,7 @@ import torch
 from torch import nn
 
 from ufmstar_torch.files.limits import MOST_BYTES
+from ufmstar_torch.frames.arguments import as_path
 from ufmstar_torch.models.checkpoints import DAMAGE, CheckpointError, some
 from ufmstar_torch.runtime.optional import optional
 
@@ -51,7 +52,7 @@ def read_checkpoint(name_or_dir: str | Path, revision: str | None = None, local_
     from transformers import PreTrainedConfig
     from transformers.image_processing_base import ImageProcessingMixin
 
-    path = Path(name_or_dir).expanduser()
+    path = as_path("name_or_dir", name_or_dir).expanduser()
     # The name is a directory if that exists, or if it does not have the form "owner/name".
     local = path.is_dir() or path.is_absolute() or str(name_or_dir).startswith(".") or len(path.parts) != 2
     if local and not (path / "config.json").is_file():

@@ -8,6 +8,7 @@ from typing import Any
 
 from ufmstar_torch.frames.arguments import as_path
 from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.runtime.kinds import check_kinds
 
 # Name -> module and function of its loader.
 _LOADERS = {
@@ -29,6 +30,7 @@ def network_names() -> tuple[str, ...]:
     return tuple(_LOADERS)
 
 
+@check_kinds
 def load_network(name: str, weights: str | Path | None = None, **options: Any) -> DepthNetwork:
     """Load a depth network in eval mode, on the CPU.
 

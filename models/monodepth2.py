@@ -22,6 +22,7 @@ from ufmstar_torch.models.checkpoints import channels_of, fill, load_state_dict_
 from ufmstar_torch.models.dropout import DecoderDropout
 from ufmstar_torch.models.network import INITIAL_DEPTH, MULTIPLE, Backbone, fits, require_image
 from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.runtime.kinds import check_kinds
 from ufmstar_torch.runtime.optional import optional
 
 SMALLEST = 64  # [px] reflection padding needs maps of more than one pixel
@@ -113,6 +114,7 @@ class MonodepthResNet(Backbone):
         ModuleNotFoundError: torchvision is not installed.
     """
 
+    @check_kinds
     def __init__(
         self,
         layers: int = 50,

@@ -31,6 +31,7 @@ from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import PlainSpec
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.runtime.checked import Checked, number
+from ufmstar_torch.runtime.kinds import check_kinds
 
 # Keys of encoder.pth other than weights.
 _NO_WEIGHTS = ("height", "width", "use_stereo")
@@ -51,6 +52,7 @@ class Imported:
     unchanged: tuple[str, ...]  # keys of the network that were not filled: the head of a metric network
 
 
+@check_kinds
 def load_monodepth2(network: MonodepthResNet, encoder_path: str | Path, depth_path: str | Path) -> Imported:
     """Fill a network's encoder and decoder with published Monodepth2 weights, in place.
 

@@ -166,8 +166,8 @@ def in_eval_mode(network: nn.Module) -> Iterator[None]:
 def require_image(image: Tensor, multiple: int = 1, smallest: int = 1) -> tuple[int, int]:
     """(H, W) [px] of a network's input. Raises ValueError unless it is floating-point [B, 3, H, W] with H and W
     multiples of ``multiple`` and at least ``smallest``."""
-    if image.dim() != 4 or image.shape[1] != 3 or not image.is_floating_point():
-        shape = f"{image.dtype} {tuple(image.shape)}"
+    if not isinstance(image, Tensor) or image.dim() != 4 or image.shape[1] != 3 or not image.is_floating_point():
+        shape = f"{image.dtype} {tuple(image.shape)}" if isinstance(image, Tensor) else type(image).__name__
         raise ValueError(f"image must be floating-point [B, 3, H, W], as from the network's preprocess, got {shape}")
     height, width = image.shape[-2:]
     if not fits(height, width, multiple, smallest):

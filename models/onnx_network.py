@@ -21,6 +21,7 @@ from ufmstar_torch.models.onnx_sizes import require_sizes
 from ufmstar_torch.models.outputs import PlainSpec, ProgramSpec
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.runtime.checked import choice
+from ufmstar_torch.runtime.kinds import check_kinds
 from ufmstar_torch.runtime.optional import optional
 
 if TYPE_CHECKING:
@@ -78,6 +79,7 @@ class OnnxNetwork(DeclaredNetwork):
         ValueError: the file is damaged, or spec and graph do not match; the message names the tensor.
     """
 
+    @check_kinds
     def __init__(
         self,
         path: str | Path,

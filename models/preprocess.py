@@ -22,7 +22,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ufmstar_torch.files.limits import require_pixels
-from ufmstar_torch.frames.arguments import CameraLike, ImageLike, as_image, as_intrinsics
+from ufmstar_torch.frames.arguments import CameraLike, ImageLike, as_image, as_intrinsics, as_tensor
 from ufmstar_torch.gaussians.camera import crop_intrinsics, resize_intrinsics
 from ufmstar_torch.runtime.checked import Checked, number
 
@@ -115,8 +115,8 @@ class Preprocess(Checked):
     def geometry(self, height: int, width: int) -> Geometry:
         """The sizes of all steps for an image of height x width [px]. Raises ValueError: the crop is larger than the
         image, without ``resize_height``."""
-        if min(height, width) < 1:
-            raise ValueError(f"an image must have at least one pixel, got {height} x {width}")
+        if not (isinstance(height, int) and isinstance(width, int) and min(height, width) >= 1):
+            raise ValueError(f"an image must have at least one pixel, got {height!r} x {width!r}")
         ch, cw = self.crop or (0, 0)
         resized = (height, width)
         if self.resize_height is not None:
@@ -165,6 +165,7 @@ class Preprocess(Checked):
 
     def apply_intrinsics(self, intrinsics: Tensor, height: int, width: int) -> Tensor:
         """Intrinsics [..., 3, 3] [px] of the network's input, from those of an image of height x width."""
+        intrinsics = as_tensor("intrinsics", intrinsics)
         if intrinsics.shape[-2:] != (3, 3):
             raise ValueError(f"intrinsics must be [B, 3, 3], got {tuple(intrinsics.shape)}")
         g = self.geometry(height, width)
@@ -174,6 +175,9 @@ class Preprocess(Checked):
     def apply_depth(self, depth: Tensor) -> Tensor:
         """Resample a map [..., H, W] registered to the image (ground truth depth, a mask, labels) to the network's
         input [..., h, w]: every pixel copies the source pixel that contains its centre. Any dtype."""
+        depth = as_tensor("depth", depth)
+        if depth.dim() < 2:
+            raise ValueError(f"depth must be [..., H, W], got {tuple(depth.shape)}")
         g = self.geometry(*depth.shape[-2:])
         rows = _source_index(g.final[0], g.cropped[0], g.top, g.resized[0], g.image[0])
         columns = _source_index(g.final[1], g.cropped[1], g.left, g.resized[1], g.image[1])

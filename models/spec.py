@@ -14,6 +14,7 @@ from ufmstar_torch.models.module_backbone import ModuleBackbone, ModuleSpec
 from ufmstar_torch.models.network import MULTIPLE, Backbone, fits
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.runtime.checked import Checked, choice, number, section
+from ufmstar_torch.runtime.kinds import check_kinds
 
 MOST_MEMBERS = 1000  # of an ensemble
 _SMALLEST = {"fastdepth": 32, "monodepth2": 64}  # [px]
@@ -110,6 +111,7 @@ class NetworkSpec(Checked):
         return Preprocess.nyu(self.size, **statistics) if nyu else Preprocess(size=self.size, **statistics)
 
 
+@check_kinds
 def build_backbone(spec: NetworkSpec, module: nn.Module | None = None) -> Backbone:
     """The encoder and decoder of ``spec``, with random weights from torch's generator, or with a custom ``module``."""
     if spec.module is not None:
@@ -130,6 +132,7 @@ def build_backbone(spec: NetworkSpec, module: nn.Module | None = None) -> Backbo
     return backbone
 
 
+@check_kinds
 def build_network(
     spec: NetworkSpec, backbone: Backbone | None = None, *, std: float = INIT_STD
 ) -> UncertaintyNetwork | BatchEnsemble:

@@ -32,6 +32,7 @@ from ufmstar_torch.models.ensemble import Ensemble, LazyMember
 from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.spec import MOST_MEMBERS, NetworkSpec, build_backbone, build_network
+from ufmstar_torch.runtime.kinds import check_kinds
 
 FORMAT = "ufmstar_torch trained networks"
 VERSION = 1
@@ -54,6 +55,7 @@ class TrainedInfo:
         return self.networks * self.spec.members
 
 
+@check_kinds
 def save_trained(
     path: str | Path,
     networks: DepthNetwork | Sequence[DepthNetwork],
@@ -99,6 +101,7 @@ def save_trained(
     save_checkpoint(path, state, {**metadata, "info": dict(info or {})})
 
 
+@check_kinds
 def read_info(path: str | Path) -> TrainedInfo:
     """Read the metadata of a file without its weights. Raises FileNotFoundError: there is no such file;
     CheckpointError: it is damaged, of another format or of a newer version; ModuleNotFoundError: safetensors is not
@@ -106,6 +109,7 @@ def read_info(path: str | Path) -> TrainedInfo:
     return _TrainedFile(Path(path)).info
 
 
+@check_kinds
 def load_trained(
     path: str | Path | Iterable[str | Path],
     *,

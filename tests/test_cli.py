@@ -151,7 +151,7 @@ MISTAKES = {
     "data: no command": ("ufmstar data", "PATH A sequence, or a folder below which there are sequences. (required)"),
     "data: another command": ("ufmstar data mend x", "mend"),
     "data: no folder": ("ufmstar data check /nowhere", "no such file or folder"),
-    "data: layout": ("ufmstar data check {path}/images", "has no known layout, and nothing below it has"),
+    "data: layout": ("ufmstar data check {path}/images", "has no known layout: expected images"),
     "data: poses": ("ufmstar data check {path} --poses upside-down", "Expected one of ('camera-to-world'"),
     "data: pairs": ("ufmstar data check {path} --pairs 0", "pairs must be at least 1"),
     "data: intrinsics": (

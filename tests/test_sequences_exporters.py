@@ -21,8 +21,9 @@ from ufmstar_torch import cli
 from ufmstar_torch.eval.run.scale import network_scale
 from ufmstar_torch.eval.sequences import find_sequences, open_sequence
 from ufmstar_torch.eval.sequences.colmap import read_landmarks
-from ufmstar_torch.eval.sequences.images import grey_bytes, listed_file
+from ufmstar_torch.eval.sequences.images import grey_bytes
 from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
+from ufmstar_torch.eval.sequences.paths import listed_file
 from ufmstar_torch.eval.sequences.video import Video
 
 RNG = np.random.default_rng(0)
@@ -45,6 +46,80 @@ def test_files_whose_names_begin_with_a_dot_are_no_frames(tmp_path, layout):
     if after.depth_size is not None:
         np.testing.assert_array_equal(after[-1].depth, before[-1].depth)
     assert [found.layout for found in find_sequences(tmp_path)] == [layout]
+
+
+@pytest.mark.parametrize("layout", [name for name in LAYOUTS if name not in ("sens", "bag", "nyu")])
+def test_names_in_another_case_are_found(tmp_path, layout):
+    """As of files that were copied from Windows or a camera's card: IMG_0.JPG, where a list names IMG_0.jpg."""
+    path = LAYOUTS[layout](tmp_path)
+    path = path[0] if isinstance(path, tuple) else path
+    before = open_sequence(path)
+    names, frame = before.names, before[0]
+    for file in [file for file in tmp_path.rglob("*") if file.suffix in (".png", ".jpg", ".npy", ".txt")]:
+        if file.parent.name in (
+            "images",
+            "rgb",
+            "data",
+            "color",
+            "pose",
+            "depth",
+            "confidence",
+            "depth_left",
+            "seq-01",
+        ):
+            name = file.stem + file.suffix.upper() if "pose" not in file.name else file.name
+            file.rename(file.with_name(name))
+    after = open_sequence(path)
+    assert after.names == names
+    np.testing.assert_array_equal(after[0].image, frame.image)
+    np.testing.assert_array_equal(after[0].T_world_cam, frame.T_world_cam)
+    assert (after[0].depth is None) == (frame.depth is None)
+
+
+def test_folders_and_files_of_a_generic_recording_may_have_any_case(tmp_path):
+    path, scene = layouts.write_generic(tmp_path)
+    for name, other in (("images", "Images"), ("depth", "DEPTH"), ("poses.txt", "Poses.TXT"), ("K.txt", "k.txt")):
+        (path / name).rename(path / other)
+    sequence = open_sequence(path)
+    np.testing.assert_allclose(sequence[0].intrinsics, scene.K)
+    assert sequence[5].depth is not None
+    (path / "poses.TXT").write_text("")  # two names that differ in case alone
+    with pytest.raises(ValueError, match="no known layout"):
+        open_sequence(path)
+
+
+@pytest.mark.parametrize(
+    ("file", "remedy"),
+    [
+        ("keyframes/corrected_cameras/1.json", "ns-process-data polycam"),
+        ("scan.r3d", "export it there as a folder with EXR and JPG"),
+        ("rgbd/0.depth", "export it from Record3D with EXR and JPG"),
+        ("EXR_RGBD/metadata.json", "ns-process-data record3d"),
+        ("oxts/data/0000000000.txt", "take the odometry benchmark"),
+        ("image_2/000000.png", "--trajectory poses/NN.txt"),
+        ("results/frame000000.jpg", "--truth-scale 0.000152597"),
+        ("pose_intrinsic_imu.json", "its COLMAP model"),
+        ("camera_params_0000.json", "OpenGL axes"),
+        ("seq-01/frame-000000.pose.txt", r"open one of the 1 recordings below it, such as seq-01 \(7scenes\)"),
+        ("a.xyz", "expected images .*found a.xyz"),
+    ],
+)
+def test_an_export_that_no_reader_opens_gets_a_line_with_the_remedy(tmp_path, file, remedy):
+    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / file).write_text("")
+    with pytest.raises(ValueError, match=remedy) as error:
+        open_sequence(tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def test_eth3d(tmp_path):
+    """SLAM: TUM's files and calibration.txt; multi-view: a COLMAP model in dslr_calibration_undistorted/."""
+    slam, scene = layouts.write_tum(tmp_path, folder="cables_1")
+    (slam / "calibration.txt").write_text("50 51 31.5 23.5\n")
+    np.testing.assert_array_equal(open_sequence(slam)[0].intrinsics, [[50, 0, 31.5], [0, 51, 23.5], [0, 0, 1]])
+    views, scene, _ = written.write_colmap(tmp_path, text=True)
+    (views / "sparse" / "0").rename(views / "dslr_calibration_undistorted")
+    np.testing.assert_allclose(open_sequence(views)[0].T_world_cam, scene.T_world_cam[0], atol=1e-12)
 
 
 def test_a_folder_of_depth_without_depth_maps_is_logged(tmp_path, caplog):

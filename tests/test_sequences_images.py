@@ -19,7 +19,8 @@ from PIL import Image
 
 from ufmstar_torch.eval.sequences import images
 from ufmstar_torch.eval.sequences.frame import FrameError
-from ufmstar_torch.eval.sequences.images import image_size, list_files, read_color, read_depth
+from ufmstar_torch.eval.sequences.images import image_size, read_color, read_depth
+from ufmstar_torch.eval.sequences.paths import list_files
 from ufmstar_torch.files import limits
 
 RNG = np.random.default_rng(0)

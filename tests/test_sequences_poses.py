@@ -35,6 +35,20 @@ def write(tmp_path, text):
         (f"0.5,1,2,3,0,0,{QUARTER},{QUARTER},", 0.5),
         (f"0.5; 1; 2; 3; 0; 0; {QUARTER}; {QUARTER}", 0.5),
         (f"0.5 ,\t1 ,2, 3, 0, 0, {QUARTER} , {QUARTER}", 0.5),
+        (f"timestamp,tx,ty,tz,qx,qy,qz,qw\n0.5,1,2,3,0,0,{QUARTER},{QUARTER}", 0.5),
+        (f"x;y;z;qw;qx;qy;qz\n1;2;3;{QUARTER};0;0;{QUARTER}", None),
+        (f"# time(s) x(m) y(m) z(m) q_w q_x q_y q_z\n0.5 1 2 3 {QUARTER} 0 0 {QUARTER}", 0.5),
+        (  # EuRoC
+            "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], "
+            f"v_RS_R_x [m s^-1]\n0.5, 1, 2, 3, {QUARTER}, 0, 0, {QUARTER}, 9",
+            0.5,
+        ),
+        (  # rostopic echo -p
+            "%time,field.header.frame_id,field.pose.position.x,field.pose.position.y,field.pose.position.z,"
+            "field.pose.orientation.x,field.pose.orientation.y,field.pose.orientation.z,field.pose.orientation.w\n"
+            f"0.5,map,1,2,3,0,0,{QUARTER},{QUARTER}",
+            0.5,
+        ),
     ],
 )
 def test_every_format_gives_the_same_pose(tmp_path, line, timestamp):
@@ -66,6 +80,11 @@ def test_rounded_quaternions_are_normalised(tmp_path):
         ("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 2\n", r"txt:1: a pose's bottom row must be 0 0 0 1"),
         ("nan 0 0 0 0 0 0 1\n", r"txt:1: the timestamp must be finite"),
         ("# nothing\n", r"no pose found"),
+        (
+            "a,b,c,d,e,f,g\n0,0,0,0,0,0,1\n",
+            r"txt:1: expected numbers or a header .* timestamp tx ty tz qx qy qz qw, got 'a,b",
+        ),
+        ("x,y,z,qw,qx,qy,qz\n0,0,0,1,0,0,0\n0,0,0,1\n", r"txt:3: expected 7 columns or more, as the header .* got 4"),
         (b"\x89PNG\r\n\x1a\n\0\xff", r"txt: expected a text file"),
     ],
 )

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.runtime.checked import Checked, choice, number
+from ufmstar_torch.runtime.kinds import check_fields
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,7 @@ class AugmentationConfig(Checked):
     saturation: float = number(0.4, "x", "1", 0, 1)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         super().__post_init__()
         if len(self.scale) != 2 or not 1 <= self.scale[0] <= self.scale[1] < math.inf:
             raise ValueError(f"AugmentationConfig.scale must be (low, high), 1 <= low <= high, got {self.scale}")

@@ -17,6 +17,7 @@ from ufmstar_torch.eval.sequences.nyu import PARTS
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.runtime.kinds import check_kinds
 from ufmstar_torch.train.augment import Augmentation
 from ufmstar_torch.train.data_config import DataConfig, Part
 from ufmstar_torch.train.samples import Sample, SampleDataset, clips, joined
@@ -41,11 +42,12 @@ class DepthDataModule(LightningDataModule):
         ValueError: ``batch_size`` is no multiple of ``clip_frames``.
     """
 
+    @check_kinds
     def __init__(
         self, config: DataConfig, preprocess: Preprocess, batch_size: int = 8, *, seed: int = 0, clip_frames: int = 1
     ) -> None:
         super().__init__()
-        if batch_size % clip_frames:
+        if clip_frames < 1 or batch_size % clip_frames:
             raise ValueError(f"batch_size {batch_size} of a process must be a multiple of {clip_frames} frames")
         self.config, self.preprocess = config, preprocess
         self.batch_size, self.seed, self.clip_frames = batch_size, seed, clip_frames

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from ufmstar_torch.eval.tour.style import style_of
 from ufmstar_torch.runtime.checked import Checked, choice, number
+from ufmstar_torch.runtime.kinds import check_fields
 from ufmstar_torch.train.augment import AugmentationConfig
 
 _PART = re.compile(r"(\d+(?:\.\d+)?)\s*(%?):(\d+(?:\.\d+)?)\s*(%?)")
@@ -109,6 +110,7 @@ class DataConfig(Checked):
     on_bad_file: str = choice("raise", "skip")
 
     def __post_init__(self) -> None:
+        check_fields(self)
         super().__post_init__()
         count = len(self.paths)
         fits = {"nyu": count == 1, "sequences": count > 0, "tour": count == 0}[self.kind]

@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ufmstar_torch.models.distribution import DepthDistribution, EvidentialDepth, GaussianDepth, PointDepth
+from ufmstar_torch.runtime.kinds import check_kinds
 
 # [1] The regulariser's lambda, the weight of evidence at wrong pixels.
 EVIDENCE_WEIGHT = 0.01
@@ -27,6 +28,7 @@ _SQUARE_FLOOR = 1e-30
 _SERIES_FROM = 8.0
 
 
+@check_kinds
 def loss_of(
     distribution: DepthDistribution,
     target: Tensor,

@@ -18,6 +18,7 @@ from ufmstar_torch.eval.metrics import NLL, DepthAccuracy
 from ufmstar_torch.frames.prediction import stated_range
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble
 from ufmstar_torch.models.distribution import DepthDistribution, GaussianDepth
+from ufmstar_torch.runtime.kinds import check_kinds
 from ufmstar_torch.train.distil import Teacher, distillation_sums
 from ufmstar_torch.train.losses import gaussian_nll, loss_sums
 from ufmstar_torch.train.presets import Recipe
@@ -48,6 +49,7 @@ class TrainingModule(pl.LightningModule):
         seed: of the training.
     """
 
+    @check_kinds
     def __init__(self, network: nn.Module, recipe: Recipe, total_steps: int, seed: int = 0) -> None:
         super().__init__()
         # Halves the time of a step on CPUs, and suits tensor cores.

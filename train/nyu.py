@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ufmstar_torch.files.write import write_atomic
+from ufmstar_torch.runtime.kinds import check_kinds
 
 if TYPE_CHECKING:
     import h5py
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 _VALIDATION_EVERY = 4
 
 
+@check_kinds
 def convert_labelled(
     mat: str | Path,
     out: str | Path,

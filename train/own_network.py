@@ -21,6 +21,7 @@ from ufmstar_torch.models.outputs import PlainSpec
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.models.spec import NetworkSpec
 from ufmstar_torch.models.trained import load_ensemble
+from ufmstar_torch.runtime.kinds import check_kinds
 from ufmstar_torch.train.data import DepthDataModule
 from ufmstar_torch.train.data_config import DataConfig
 from ufmstar_torch.train.presets import DROPOUT, METHOD_ROWS, OF_HEAD, OF_MODULE, Recipe
@@ -29,6 +30,7 @@ from ufmstar_torch.train.settings import FitSettings, Job
 _ALIGNED_FRAMES = 32  # training frames that determine a relative network's scale and shift
 
 
+@check_kinds
 def train_module(
     backbone: nn.Module | str | Path,
     head: str | type[UncertaintyHead],
@@ -62,6 +64,7 @@ def train_module(
     return load_ensemble(Path(out) / WEIGHTS, job.backbone).eval()
 
 
+@check_kinds
 def own_job(
     backbone: nn.Module | str | Path,
     head: str | type[UncertaintyHead],

@@ -16,6 +16,7 @@ from typing import Any
 
 from ufmstar_torch.models.spec import NetworkSpec
 from ufmstar_torch.runtime.checked import Checked, choice, number
+from ufmstar_torch.runtime.kinds import check_kinds
 
 # Batch and learning rate of monodepth2 are DecTrain's; FastDepth was trained with eight images per step.
 TRAINING: dict[str, dict[str, Any]] = {
@@ -167,6 +168,7 @@ or more). fastdepth ends in a ReLU as published; --set network.positive=softplus
 presets demo and fastdepth-ufmstar, whose head learns UfM*'s variance, are ours."""
 
 
+@check_kinds
 def preset(name: str) -> Recipe:
     """A named recipe. Raises ValueError: there is no such preset."""
     if name not in PRESETS:

@@ -14,6 +14,7 @@ from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.layout import layout_of
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.runtime.kinds import check_kinds
 from ufmstar_torch.train.data_config import Part
 
 
@@ -25,6 +26,7 @@ class SequenceFrames:
     ValueError: no sequence, or a sequence whose part has no frame with depth.
     """
 
+    @check_kinds
     def __init__(self, sequences: Sequence[FrameSequence], part: str | Part = "0:100%") -> None:
         part = Part.parse(part) if isinstance(part, str) else part
         if not sequences:

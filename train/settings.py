@@ -8,6 +8,7 @@ from pathlib import Path
 from torch import nn
 
 from ufmstar_torch.runtime.checked import Checked, number
+from ufmstar_torch.runtime.kinds import check_fields
 from ufmstar_torch.train.data_config import DataConfig
 from ufmstar_torch.train.presets import MOST_MEMBERS, Recipe
 
@@ -55,6 +56,7 @@ class FitSettings(Checked):
     progress: bool = True
 
     def __post_init__(self) -> None:
+        check_fields(self)
         super().__post_init__()
         if any(word in self.strategy for word in ("spawn", "fork", "notebook")):
             raise ValueError(f"FitSettings.strategy must start processes as scripts: 'ddp', not {self.strategy!r}")

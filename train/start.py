@@ -15,6 +15,7 @@ from ufmstar_torch.models.checkpoints import CheckpointError, fill
 from ufmstar_torch.models.network import Backbone, DepthNetwork
 from ufmstar_torch.models.spec import NetworkSpec, build_backbone, build_network
 from ufmstar_torch.models.trained import load_for_training, read_info
+from ufmstar_torch.runtime.kinds import check_kinds
 
 IMAGENET = "imagenet"
 # [1] Standard deviation of a BatchEnsemble's factors with pretrained weights. With .5, the value for random weights,
@@ -24,6 +25,7 @@ PRETRAINED_STD = 0.1
 WAYS = f"trained .safetensors, FastDepth's .onnx, ResNet weights (.pth, or {IMAGENET!r}), or Monodepth2's folder"
 
 
+@check_kinds
 def starting_network(
     spec: NetworkSpec, init: Path | None, member: int = 0, module: nn.Module | None = None
 ) -> DepthNetwork:

@@ -29,6 +29,7 @@ from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence,
 from ufmstar_torch.eval.tour.style import style_of
 from ufmstar_torch.files.read import read_npy
 from ufmstar_torch.files.write import write_atomic
+from ufmstar_torch.runtime.kinds import check_kinds
 from ufmstar_torch.train.data_config import DataConfig
 from ufmstar_torch.train.sequence_data import SequenceFrames
 
@@ -38,6 +39,7 @@ _UNIT = 1e-3
 _FARTHEST = np.iinfo(np.uint16).max
 
 
+@check_kinds
 def tour_frames(
     seeds: Iterable[int],
     config: DataConfig,

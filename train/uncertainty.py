@@ -24,6 +24,7 @@ from ufmstar_torch.frames.prediction import NetworksInTurn
 from ufmstar_torch.models.any_network import wrap_network
 from ufmstar_torch.models.network import DepthNetwork, in_eval_mode
 from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.runtime.kinds import check_kinds
 
 _BASE = "aleatoric"  # one network, with all variances that it predicts
 ROWS: dict[str, Row] = {
@@ -34,6 +35,7 @@ ROWS: dict[str, Row] = {
 LOGGED = ("delta1", "nll", "ece_delta", "ece_q", "ause_rmse")
 
 
+@check_kinds
 def judge_network(
     network: nn.Module,
     sequences: Sequence[FrameSequence | str | Path],
@@ -92,6 +94,7 @@ class UncertaintyCallback(pl.Callback):
         ValueError: ``every`` is not positive.
     """
 
+    @check_kinds
     def __init__(
         self,
         sequences: Sequence[FrameSequence | str | Path],

@@ -65,7 +65,7 @@ def _check(options: CheckOptions) -> tuple[list, bool]:
         ValueError: an option out of range, or nothing below the folder has a known layout.
     """
     from ufmstar_torch.eval.check.data_check import check_data
-    from ufmstar_torch.eval.sequences.layout import find_sequences, layouts_of, parts_of, require_layout
+    from ufmstar_torch.eval.sequences.layout import find_sequences, layout_of, layouts_of, parts_of, require_layout
 
     path, opening = options.path, options.opening.changed()
     require_layout(options.opening.layout, options.opening.plugin)
@@ -75,7 +75,7 @@ def _check(options: CheckOptions) -> tuple[list, bool]:
         one = len(fitting) > 1 or (len(fitting) == 1 and len(parts_of(Path(path), fitting[0])) == 1)
     result = [] if one else find_sequences(path, layout=options.opening.layout, plugin=options.opening.plugin)
     if not one and not result and options.opening.layout == "auto":
-        raise ValueError(f"{path} has no known layout, and nothing below it has; see docs/data.md, or --layout")
+        layout_of("auto", Path(path), plugin=options.opening.plugin)  # raises, with what was expected
     if one or not result:  # check_data's error names the files of the layout
         return [check_data(path, pairs=options.pairs, **opening)], False
     return [

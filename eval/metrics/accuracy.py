@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, SumMetric, share
-
-TOLERANCE = 0.25  # [1] of delta1, in both definitions
+from ufmstar_torch.eval.metrics.base import COUNT, SUM, TOLERANCE, Pixels, SumMetric, share
 
 
 class DepthAccuracy(SumMetric):
@@ -28,14 +25,15 @@ class DepthAccuracy(SumMetric):
     )
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        d, g = chosen = pixels.depths
+        d, _, g = chosen = pixels.depths
+        most = 1 + TOLERANCE
         return {
-            "hits": chosen.number((d - g).abs() <= TOLERANCE * g),
-            "hits_ratio": chosen.number((d > 0) & (torch.maximum(d / g, g / d) < 1 + TOLERANCE)),
+            "hits": chosen.number(chosen.within),
+            "hits_ratio": chosen.number((d < most * g) & (g < most * d)),
             "pixels": chosen.number(),
             "with_truth": pixels.with_truth.sum(),
-            "relative": chosen.total((d - g).abs() / g),
-            "squared": chosen.total((d - g).square()),
+            "relative": chosen.total(chosen.relative),
+            "squared": chosen.total(chosen.squared),
         }
 
     def compute(self) -> dict[str, Tensor]:

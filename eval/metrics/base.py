@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
-from torch import Tensor
-from torchmetrics import Metric
+from torch import Tensor, nn
 
 COUNT, SUM = torch.int64, torch.float64  # kinds of states
+TOLERANCE = 0.25  # [1] of delta1, in both definitions
+# Bins of equal width in the logarithm of a variance or squared error [m^2], and their range: (0.1 mm)^2 to (100 m)^2.
+# One bin below has all smaller values and 0, one bin above all larger ones. Relative errors use the same bins.
+BINS = 4096
+LOW, HIGH = 1e-8, 1e4
 
 
 class Selection:
@@ -21,49 +26,50 @@ class Selection:
     their number is unknown without waiting, they are all pixels, with 1 where ``mask`` is False.
 
     Args:
-        maps: [P] each.
+        maps: [P] each; [0] = missing.
         mask: [P] True = selected.
-        complete: True if ``maps`` have the selected pixels alone; ``mask`` is not read then.
     """
 
-    def __init__(self, maps: Sequence[Tensor], mask: Tensor, *, complete: bool = False) -> None:
+    def __init__(self, maps: Sequence[Tensor], mask: Tensor) -> None:
         self.mask: Tensor | None = None
-        if complete or _compacts(mask.device):
-            whole = complete or bool(mask.all())
-            self.maps = tuple(maps) if whole else tuple(value.masked_select(mask) for value in maps)
+        if _compacts(mask.device):
+            index = None if bool(mask.all()) else mask.nonzero()[:, 0]
+            parts = (x if index is None or not len(x) else x.index_select(0, index) for x in maps)
+            self.maps = tuple(part.double() for part in parts)
         else:
-            self.maps = tuple(value.masked_fill(~mask, 1.0) for value in maps)
+            self.maps = tuple(x.double().masked_fill(~mask, 1.0) if len(x) else x for x in maps)
             self.mask = mask
 
     def __iter__(self) -> Iterator[Tensor]:
         return iter(self.maps)
 
-    def where(self, condition: Tensor) -> Selection:
+    def where(self, condition: Tensor) -> Self:
         """The selected pixels with a condition [P] on their values."""
-        return Selection(self.maps, condition if self.mask is None else condition & self.mask)
+        if self.mask is None and _compacts(condition.device) and bool(condition.all()):
+            return self
+        return type(self)(self.maps, condition if self.mask is None else condition & self.mask)
 
     def number(self, condition: Tensor | None = None) -> Tensor:
         """[] int64 number of the selected pixels, or of those with a condition [P]."""
         if condition is None:
             return torch.tensor(len(self.maps[0])) if self.mask is None else self.mask.sum()
-        return (condition if self.mask is None else condition & self.mask).sum()
+        return (condition if self.mask is None else condition & self.mask).count_nonzero()
 
     def total(self, value: Tensor) -> Tensor:
         """[] sum of a value [P] over the selected pixels."""
         return (value if self.mask is None else value.masked_fill(~self.mask, 0.0)).sum()
 
     def histogram(self, index: Tensor, bins: int, value: Tensor | None = None) -> Tensor:
-        """[bins] by an index [P] in [0, bins): number of the selected pixels, or of those with a ``value`` of True, or
-        sum of their ``value`` [P]."""
+        """[bins] by an index [P] in [0, bins): number of the selected pixels, or sum of their ``value`` [P]."""
         if self.mask is None:
-            if value is None or value.dtype != torch.bool:
-                return torch.bincount(index, value, bins)
-            return torch.bincount(index, value.double(), bins).long()  # faster than index[value], and exact
-        if value is None or value.dtype == torch.bool:
-            values = (self.mask if value is None else self.mask & value).long()
-        else:
-            values = value.masked_fill(~self.mask, 0.0)
+            return torch.bincount(index, value, bins)
+        values = self.mask.long() if value is None else value.masked_fill(~self.mask, 0.0)
         return torch.zeros(bins, dtype=values.dtype, device=values.device).scatter_add_(0, index, values)
+
+    def parted(self, index: Tensor, bins: int, condition: Tensor) -> tuple[Tensor, Tensor]:
+        """[bins] numbers of all selected pixels, and of those with a condition [P], by an index [P] in [0, bins)."""
+        counts = self.histogram(2 * index + condition, 2 * bins).reshape(bins, 2)
+        return counts.sum(1), counts[:, 1]
 
 
 def _compacts(device: torch.device) -> bool:
@@ -71,10 +77,63 @@ def _compacts(device: torch.device) -> bool:
     return device.type == "cpu"
 
 
+class Judged(Selection):
+    """Pixels with ground truth: d, v and g, and what several metrics compute from them, once. ``maps`` also has those
+    of a mixture and of intervals."""
+
+    def __iter__(self) -> Iterator[Tensor]:
+        return iter(self.maps[:3])
+
+    @cached_property
+    def error(self) -> Tensor:
+        """|d - g| [m]."""
+        return (self.maps[0] - self.maps[2]).abs()
+
+    @cached_property
+    def squared(self) -> Tensor:
+        """|d - g|^2 [m^2]."""
+        return self.error.square()
+
+    @cached_property
+    def relative(self) -> Tensor:
+        """|d - g| / g."""
+        return self.error / self.maps[2]
+
+    @cached_property
+    def sigma(self) -> Tensor:
+        """Root of v [m]."""
+        return self.maps[1].sqrt()
+
+    @cached_property
+    def log_variance(self) -> Tensor:
+        """ln v; -inf for 0."""
+        return self.maps[1].log()
+
+    @cached_property
+    def variance_bins(self) -> Tensor:
+        """``log_bin`` of v."""
+        return log_bin(self.log_variance)
+
+    @cached_property
+    def squared_bins(self) -> Tensor:
+        """``log_bin`` of |d - g|^2."""
+        return log_bin(self.squared.log())
+
+    @cached_property
+    def within(self) -> Tensor:
+        """True where |d - g| <= ``TOLERANCE`` g."""
+        return self.error <= TOLERANCE * self.maps[2]
+
+    @cached_property
+    def certain(self) -> Judged:
+        """Those with v > 0."""
+        return self.where(self.maps[1] > 0)
+
+
 @dataclass(frozen=True, eq=False)
 class Pixels:
-    """The pixels of one or more frames, flat and float64 on the maps' device. Ground truth is valid if positive and
-    finite, a depth if finite, a variance if finite and not negative."""
+    """The pixels of one or more frames, flat, in the maps' types and on their device. Ground truth is valid if positive
+    and finite, a depth if finite, a variance if finite and not negative."""
 
     depth: Tensor  # [P] d [m]
     variance: Tensor  # [P] v [m^2]; [0] without one
@@ -92,32 +151,29 @@ class Pixels:
     @cached_property
     def predicted(self) -> Tensor:
         """[P] True where there are depth and variance."""
-        return self.use & self.depth.isfinite() & (self.variance >= 0) & (self.variance < torch.inf)
+        return self.use & (self.depth.abs() < torch.inf) & (self.variance >= 0) & (self.variance < torch.inf)
 
     @cached_property
-    def depths(self) -> Selection:
-        """d and g where both are valid."""
-        return Selection((self.depth, self.target), self.with_truth & self.depth.isfinite())
+    def depths(self) -> Judged:
+        """The pixels where d and g are valid."""
+        variance = self.variance if len(self.variance) else torch.full_like(self.depth, torch.nan)
+        maps = self.depth, variance, self.target, self.inlier, self.outlier, self.level
+        return Judged(maps, self.with_truth & (self.depth.abs() < torch.inf))
 
     @cached_property
-    def judged(self) -> Selection:
-        """d, v and g where all are valid."""
-        return Selection((self.depth, self.variance, self.target), self.with_truth & self.predicted)
-
-    @cached_property
-    def certain(self) -> Selection:
-        """d, v and g where all are valid and v > 0."""
-        return self.judged.where(self.judged.maps[1] > 0)
+    def judged(self) -> Judged:
+        """The pixels where d, v and g are valid."""
+        v = self.depths.maps[1]
+        return self.depths.where((v >= 0) & (v < torch.inf))
 
 
-class SumMetric(Metric):
+class SumMetric(nn.Module):
     """A metric whose states are sums of fixed size, over the pixels with ground truth and a valid prediction.
 
     ``compute()`` returns the figures of all updates as float64 tensors by name: scalars and curves [B]. States reduce
-    by addition: across processes (torchmetrics synchronises at ``compute``; pass ``sync_on_compute=False`` if every
-    process has another sequence) and through ``merge_state``. Counts are int64 and exact; float64 sums depend on the
-    order of the updates in the last bits only. ``update`` computes on the maps' device, without a transfer if the
-    metric is on it too (``.to(device)``). MPS has no float64: keep the maps on the CPU there.
+    by addition (``merge_state``). Counts are int64 and exact; float64 sums depend on the order of the updates in the
+    last bits only. ``update`` computes on the maps' device, without a transfer if the metric is on it too
+    (``.to(device)``). MPS has no float64: keep the maps on the CPU there.
 
     Attributes:
         OF_VARIANCE: the name, in messages, of a metric that needs a variance; "" if it needs depth alone.
@@ -132,8 +188,6 @@ class SumMetric(Metric):
     STATES: tuple[tuple[Any, ...], ...] = ()
     CONSTANTS: Mapping[str, Tensor] = MappingProxyType({})
     settings: Mapping[str, Any] = MappingProxyType({})
-    is_differentiable = False
-    full_state_update = False
 
     if TYPE_CHECKING:
 
@@ -141,18 +195,15 @@ class SumMetric(Metric):
             """The type of the states, which are not in ``__dict__``."""
 
     def __init__(self, **kwargs: Any) -> None:
-        # torchmetrics keeps a computed value across merge_state and load_state_dict, where it is stale.
-        kwargs.setdefault("compute_with_cache", False)
         super().__init__(**kwargs)
         for name, kind, *shape in self.STATES:
-            self.add_state(name, torch.zeros(shape, dtype=kind), dist_reduce_fx="sum", persistent=True)
+            self._hold(name, torch.zeros(shape, dtype=kind))
         for name, value in self.CONSTANTS.items():
             self.register_buffer(name, value.clone(), persistent=False)
 
-    @property
-    def update_called(self) -> bool:
-        """True, because loaded or merged sums are valid too, and figures without a frame are NaN."""
-        return True
+    def _hold(self, name: str, zeros: Tensor) -> None:
+        """Add a state."""
+        self.register_buffer(name, zeros)
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
         """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use. Raises ValueError: shapes or types
@@ -160,12 +211,15 @@ class SumMetric(Metric):
         self.add(flat_pixels(depth, variance, target, valid))
 
     def add(self, pixels: Pixels) -> None:
-        """Add pixels. States are replaced instead of changed in place, because others may hold references to them.
-        Raises ValueError: a needed variance is missing."""
+        """Add pixels. Raises ValueError: a needed variance is missing."""
         if self.OF_VARIANCE and len(pixels.variance) != len(pixels.depth):
             judged = f"{self.OF_VARIANCE} judges the predicted distribution N(depth, variance)"
             raise ValueError(f"variance must be given: {judged}")
-        for name, added in self.sums(pixels).items():
+        self._add(self.sums(pixels))
+
+    def _add(self, sums: Mapping[str, Tensor]) -> None:
+        """Add to the states. They are replaced instead of changed in place, because others may hold references."""
+        for name, added in sums.items():
             state = getattr(self, name)
             setattr(self, name, state + added.to(state.device, state.dtype))
 
@@ -174,23 +228,30 @@ class SumMetric(Metric):
         """The pixels' contribution to each state, by name. On a GPU it must not wait for a value, so it selects pixels
         by ``Selection``."""
 
-    def merge_state(self, incoming_state: dict[str, Any] | Metric) -> None:
+    @abstractmethod
+    def compute(self) -> Mapping[str, Tensor]:
+        """The figures by name."""
+
+    def reset(self) -> None:
+        """Forget all frames."""
+        for name, *_ in self.STATES:
+            setattr(self, name, torch.zeros_like(getattr(self, name)))
+
+    def merge_state(self, incoming_state: SumMetric) -> None:
         """Add another metric's sums to this one's. Raises ValueError: the other metric has other settings."""
-        if isinstance(incoming_state, SumMetric) and incoming_state.settings != self.settings:
+        if incoming_state.settings != self.settings:
             raise ValueError(
                 f"incoming_state must come from a metric with the settings {self.settings}, "
                 f"got {incoming_state.settings}"
             )
-        super().merge_state(incoming_state)
-        if isinstance(incoming_state, Metric):
-            self._update_count += incoming_state._update_count
+        self._add({name: getattr(incoming_state, name) for name, *_ in self.STATES})
 
 
 def flat_pixels(
     depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None,
     mixture: tuple[Tensor, Tensor] | None = None, level: Tensor | None = None,
 ) -> Pixels:  # fmt: skip
-    """All pixels of maps of one shape [...], in float64.
+    """All pixels of maps of one shape [...].
 
     Args:
         depth: predicted depth d [m]; not finite = no prediction.
@@ -201,13 +262,18 @@ def flat_pixels(
         level: of the smallest central interval with the ground truth in it; None = no intervals.
 
     Raises:
-        ValueError: an argument has another shape than ``depth`` or the wrong type.
+        TypeError: an argument is no dense tensor.
+        ValueError: an argument has another shape or device than ``depth``, or the wrong dtype.
     """
     inlier, outlier = mixture or (None, None)
     maps = {"depth": depth, "variance": variance, "target": target, "valid": valid}
     for name, value in (maps | {"inlier": inlier, "outlier": outlier, "level": level}).items():
-        if value is None:
+        if value is None and name not in ("depth", "target"):
             continue
+        if not isinstance(value, Tensor) or value.layout != torch.strided:
+            raise TypeError(f"{name} must be a dense torch.Tensor, got {type(value).__name__}")
+        if value.device != depth.device:
+            raise ValueError(f"{name} must lie on the depth's device {depth.device}, got {value.device}")
         if value.shape != depth.shape:
             raise ValueError(f"{name} must have the depth's shape {tuple(depth.shape)}, got {tuple(value.shape)}")
         if name == "valid" and value.dtype != torch.bool:
@@ -215,13 +281,16 @@ def flat_pixels(
         if name != "valid" and not torch.is_floating_point(value):
             raise ValueError(f"{name} must be floating point, got {value.dtype}")
 
-    none = depth.new_zeros(0, dtype=torch.float64)
-
     def flat(value: Tensor | None) -> Tensor:
-        return none if value is None else value.detach().to(torch.float64).flatten()
+        return depth.new_zeros(0) if value is None else value.detach().flatten()
 
     use = depth.new_ones(depth.numel(), dtype=torch.bool) if valid is None else valid.flatten()
     return Pixels(flat(depth), flat(variance), flat(target), use, flat(inlier), flat(outlier), flat(level))
+
+
+def log_bin(log: Tensor) -> Tensor:
+    """Bins in [0, BINS + 1] of values with the logarithm ``log``: 0 below ``LOW``, BINS + 1 from ``HIGH`` on."""
+    return ((log - math.log(LOW)) * (BINS / math.log(HIGH / LOW)) + 1).clamp(0, BINS + 1).long()
 
 
 def share(part: Tensor, whole: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, SumMetric, share
+from ufmstar_torch.runtime.kinds import check_kinds
 
 
 class ECEDelta(SumMetric):
@@ -32,6 +33,7 @@ class ECEDelta(SumMetric):
 
     OF_VARIANCE = "ECE_delta"
 
+    @check_kinds
     def __init__(self, delta: float = 0.25, bins: int = 10, **kwargs: Any) -> None:
         if not 0 < delta < 1 or bins < 1:
             raise ValueError(f"delta must lie in (0, 1) and bins be >= 1, got delta={delta}, bins={bins}")
@@ -41,18 +43,13 @@ class ECEDelta(SumMetric):
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
         chosen = pixels.judged
-        d, v, g = chosen
         delta, bins = self.settings["delta"], self.settings["bins"]
+        tolerance = delta * chosen.maps[0].abs()
         # Bin b is [b/B, (b+1)/B); a confidence of exactly 1, as of v = 0, belongs to the last.
-        sigma = torch.where(v > 0, v, 1.0).sqrt()
-        confidence = torch.where(v > 0, torch.erf(delta * d.abs() / (math.sqrt(2.0) * sigma)), 1.0)
+        confidence = torch.erf(tolerance / (math.sqrt(2.0) * chosen.sigma)).nan_to_num(1.0)
         b = (confidence * bins).long().clamp_max(bins - 1)
-        accurate = (g - d).abs() <= delta * d.abs()
-        return {
-            "confidence": chosen.histogram(b, bins, confidence),
-            "accurate": chosen.histogram(b, bins, accurate),
-            "pixels": chosen.histogram(b, bins),
-        }
+        count, accurate = chosen.parted(b, bins, chosen.error <= tolerance)
+        return {"confidence": chosen.histogram(b, bins, confidence), "accurate": accurate, "pixels": count}
 
     def compute(self) -> dict[str, Tensor]:
         total = self.pixels.sum()
@@ -85,6 +82,7 @@ class ECEQuantile(SumMetric):
 
     OF_VARIANCE = "ECE_q"
 
+    @check_kinds
     def __init__(self, levels: Sequence[float] | None = None, **kwargs: Any) -> None:
         q = quantile_levels(10) if levels is None else torch.tensor(list(levels), dtype=torch.float64)
         if q.numel() == 0 or not bool(((q >= 0) & (q <= 1)).all() and (q.diff() > 0).all()):
@@ -96,9 +94,8 @@ class ECEQuantile(SumMetric):
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
         chosen = pixels.judged
-        d, v, g = chosen
-        sigma = torch.where(v > 0, v, 1.0).sqrt()
-        z = torch.where(v > 0, (g - d) / sigma, torch.where(g <= d, -torch.inf, torch.inf))
+        d, _, g = chosen
+        z = ((g - d) / chosen.sigma).nan_to_num(-torch.inf, torch.inf, -torch.inf)
         first = chosen.histogram(torch.searchsorted(self.quantiles, z), len(self.levels) + 1)
         return {"at_or_below": first.cumsum(0)[:-1], "pixels": chosen.number()}
 

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, Selection, SumMetric, share
+from ufmstar_torch.runtime.kinds import check_kinds
 
 LEVELS = (0.5, 0.9, 0.99)
 _PERCENT = 100  # classes of levels
 # Thresholds of sigma / d, and bounds of the classes of the relative error, 8 % and 17 % apart.
 _GATES = np.geomspace(0.01, 10.0, 91)
 _ERRORS = np.geomspace(0.001, 10.0, 61)
-_DELTA = 0.25
 _MIDDLE = LEVELS.index(0.9)
 
 
@@ -64,6 +64,7 @@ class Coverage(SumMetric):
     OF_VARIANCE = "the coverage"
     STATES = (("covered", COUNT), ("width", SUM), ("pixels", COUNT))
 
+    @check_kinds
     def __init__(self, level: float = 0.9, **kwargs: Any) -> None:
         if not 0 < level < 1:
             raise ValueError(f"level must lie in (0, 1), got {level}")
@@ -71,9 +72,10 @@ class Coverage(SumMetric):
         super().__init__(**kwargs)
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        d, v, g = chosen = pixels.judged
-        covered = chosen.number((g - d).square() <= self.half_width**2 * v)
-        return {"covered": covered, "width": chosen.total(2 * self.half_width * v.sqrt()), "pixels": chosen.number()}
+        chosen = pixels.judged
+        covered = chosen.number(chosen.squared <= self.half_width**2 * chosen.maps[1])
+        width = chosen.total(2 * self.half_width * chosen.sigma)
+        return {"covered": covered, "width": width, "pixels": chosen.number()}
 
     def compute(self) -> dict[str, Tensor]:
         return {"coverage": share(self.covered, self.pixels), "interval_width": share(self.width, self.pixels)}
@@ -97,18 +99,17 @@ class GatedPixels(SumMetric):
     CONSTANTS = MappingProxyType({"gates": torch.from_numpy(_GATES), "error_edges": torch.from_numpy(_ERRORS)})
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        d, v, g = chosen = pixels.judged
-        levels = Selection((pixels.level,), pixels.with_truth & pixels.predicted) if len(pixels.level) else ()
-        error, gates = (d - g).abs() / g, len(_GATES) + 1
-        gate = _class_of(v.sqrt() / d, self.gates)  # d = 0 is beyond every gate
-        joint = gate * (len(_ERRORS) + 1) + _class_of(error, self.error_edges)
+        chosen, gates = pixels.judged, len(_GATES) + 1
+        level = chosen.maps[-1]
+        gate = _class_of(chosen.sigma / chosen.maps[0], self.gates)  # d = 0 is beyond every gate
+        joint = gate * (len(_ERRORS) + 1) + _class_of(chosen.relative, self.error_edges)
         sums = {
             "errors": chosen.histogram(joint, gates * (len(_ERRORS) + 1)).reshape(gates, -1),
-            "accurate": chosen.histogram(gate, gates, error <= _DELTA),
+            "accurate": chosen.parted(gate, gates, chosen.within)[1],
         }
-        for level in levels:
-            sums["with_level"] = chosen.histogram(gate, gates, level.isfinite())
-            sums["covered"] = chosen.histogram(gate, gates, level <= LEVELS[_MIDDLE])
+        if len(level):
+            sums["with_level"] = chosen.parted(gate, gates, level.isfinite())[1]
+            sums["covered"] = chosen.parted(gate, gates, level <= LEVELS[_MIDDLE])[1]
         return sums
 
     def compute(self) -> dict[str, Tensor]:

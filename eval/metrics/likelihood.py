@@ -9,12 +9,12 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, Selection, SumMetric, share
+from ufmstar_torch.eval.metrics.base import COUNT, SUM, Judged, Pixels, Selection, SumMetric, share
 
 
-def gaussian_nll(d: Tensor, v: Tensor, g: Tensor) -> Tensor:
+def gaussian_nll(pixels: Judged) -> Tensor:
     """(g - d)^2 / (2 v) + 0.5 ln(2 pi v), v > 0 [nats]."""
-    return (g - d).square() / (2 * v) + 0.5 * (2 * math.pi * v).log()
+    return (pixels.squared / pixels.maps[1] + pixels.log_variance + math.log(2 * math.pi)) / 2
 
 
 class NLL(SumMetric):
@@ -29,8 +29,8 @@ class NLL(SumMetric):
     STATES = (("total", SUM), ("pixels", COUNT), ("with_truth", COUNT))
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        chosen = pixels.certain
-        total = chosen.total(gaussian_nll(*chosen))
+        chosen = pixels.judged.certain
+        total = chosen.total(gaussian_nll(chosen))
         return {"total": total, "pixels": chosen.number(), "with_truth": pixels.with_truth.sum()}
 
     def compute(self) -> dict[str, Tensor]:
@@ -51,11 +51,10 @@ class EntropyHistogram(SumMetric):
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
         every = Selection((pixels.variance,), pixels.predicted)
-        chosen = every.where(every.maps[0] > 0)
-        entropy = 0.5 * (math.log(2 * math.pi) + 1.0 + chosen.maps[0].log())
-        counts = chosen.histogram(((entropy + 8.0) * 4.0).floor().clamp(-1, 64).long() + 1, 66)  # edges .25 apart
-        below = torch.nn.functional.pad((every.number() - chosen.number())[None], (0, 65))
-        return {"counts": counts + below.to(counts.device), "total": chosen.total(entropy), "pixels": chosen.number()}
+        positive = every.maps[0] > 0
+        entropy = 0.5 * (math.log(2 * math.pi) + 1.0 + every.maps[0].log())
+        counts = every.histogram((entropy * 4 + 33).clamp(0, 65).long(), 66)  # edges .25 apart
+        return {"counts": counts, "total": every.total(entropy.where(positive, 0.0)), "pixels": every.number(positive)}
 
     def compute(self) -> dict[str, Tensor]:
         return {

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from types import MappingProxyType
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, Selection, SumMetric, share
+from ufmstar_torch.eval.metrics.base import COUNT, SUM, TOLERANCE, Pixels, SumMetric, share
 from ufmstar_torch.eval.metrics.calibration import quantile_levels
 
-_BINS, _DELTA = 10, 0.25
+_BINS = 10
 # Mass of a normal distribution within three standard deviations.
 _THREE_SIGMA = 0.9973002039367398
 
@@ -37,28 +38,30 @@ class Mixture(SumMetric):
     CONSTANTS = MappingProxyType({"levels": quantile_levels(_BINS)})
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        maps = pixels.depth, pixels.variance, pixels.target, pixels.inlier, pixels.outlier
-        v1, p = pixels.inlier, pixels.outlier
-        used = (v1 > 0) & v1.isfinite() & (p >= 0) & (p <= 1)
-        d, v, g, v1, p = chosen = Selection(maps, used & pixels.with_truth & pixels.predicted)
-        parts = torch.stack([v1, torch.maximum((v - (1 - p) * v1) / p.clamp_min(1e-12), v1)])
-        weight, sigma, error = torch.stack([1 - p, p]), parts.sqrt(), g - d
-        log_density = -(error.square() / parts + (2 * torch.pi * parts).log()) / 2
-        confidence = (weight * torch.erf(_DELTA * d.abs() / (2**0.5 * sigma))).sum(0)
-        below = (weight * (1 + torch.erf(error / (2**0.5 * sigma)))).sum(0) / 2
-        beyond = (weight * torch.erfc(3 * v1.sqrt() / (2**0.5 * sigma))).sum(0)
+        v1, p = pixels.judged.maps[3:5]
+        chosen = pixels.judged.where((v1 > 0) & (v1 < torch.inf) & (p >= 0) & (p <= 1))
+        d, v, g, v1, p, _ = chosen.maps
+        v2 = torch.maximum((v - (1 - p) * v1) / p.clamp_min(1e-12), v1)
+        error, tolerance, squared = g - d, TOLERANCE * d.abs(), chosen.squared
+        inner, outer = ((2 * part).sqrt() for part in (v1, v2))
+        # ln (w N) of both parts, without the constant
+        densities = [((w.square() / part).log() - squared / part) / 2 for w, part in ((1 - p, v1), (p, v2))]
+        confidence = torch.lerp(torch.erf(tolerance / inner), torch.erf(tolerance / outer), p)
+        below = (1 + torch.lerp(torch.erf(error / inner), torch.erf(error / outer), p)) / 2
+        beyond = torch.lerp(torch.full_like(p, 1 - _THREE_SIGMA), torch.erfc(3 * inner / (2**0.5 * outer)), p)
         bins, by_outlier = ((x * _BINS).long().clamp_max(_BINS - 1) for x in (confidence, p))
-        accurate = error.abs() <= _DELTA * d.abs()
+        counts, accurate = chosen.parted(bins, _BINS, chosen.error <= tolerance)
+        with_outlier, beyond_three = chosen.parted(by_outlier, _BINS, squared > 9 * v1)
         first = chosen.histogram((below * _BINS - 0.5).ceil().long(), _BINS + 1)  # number of levels below
         return {
-            "total": -chosen.total(torch.logaddexp(*(weight.log() + log_density))),
+            "total": chosen.total(math.log(2 * math.pi) / 2 - torch.logaddexp(*densities)),
             "confidence": chosen.histogram(bins, _BINS, confidence),
-            "pixels": chosen.histogram(bins, _BINS),
-            "accurate": chosen.histogram(bins, _BINS, accurate),
+            "pixels": counts,
+            "accurate": accurate,
             "at_or_below": first.cumsum(0)[:-1],
             "stated": chosen.histogram(by_outlier, _BINS, beyond),
-            "beyond": chosen.histogram(by_outlier, _BINS, error.square() > 9 * v1),
-            "with_outlier": chosen.histogram(by_outlier, _BINS),
+            "beyond": beyond_three,
+            "with_outlier": with_outlier,
             "covered": chosen.number((below - 0.5).abs() <= _THREE_SIGMA / 2),
         }
 

@@ -7,26 +7,16 @@ this approximation.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, SumMetric
+from ufmstar_torch.eval.metrics.base import BINS, COUNT, SUM, Pixels, SumMetric, log_bin
 from ufmstar_torch.eval.metrics.likelihood import gaussian_nll
 
-# Bins of the logarithm of variance or error; bins of each in their joint histogram (5.5 % in variance, 2 MB).
-BINS, JOINT_BINS = 4096, 512
-# Range of the bins of variances and squared errors [m^2]: (0.1 mm)^2 to (100 m)^2. One bin below has all smaller values
-# and 0, one bin above all larger ones. Relative errors use the same bins.
-LOW, HIGH = 1e-8, 1e4
-
-
-def log_bin(value: Tensor, bins: int) -> Tensor:
-    """Bins in [0, bins + 1] of values >= 0: 0 below ``LOW``, bins + 1 from ``HIGH`` on."""
-    index = (value.clamp_min(LOW) / LOW).log() * (bins / math.log(HIGH / LOW))
-    return torch.where(value < LOW, 0, index.clamp_max(bins).long() + 1)
+JOINT_BINS = 512  # of variance and error in their joint histogram (5.5 % in variance, 2 MB)
+_SHIFT = (BINS // JOINT_BINS).bit_length() - 1
 
 
 def mean_of_share(count: Tensor, total: Tensor, shares: Tensor) -> Tensor:
@@ -63,10 +53,9 @@ class Sparsification(SumMetric):
     )
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        d, v, g = pixels.judged
-        binned = pixels.judged.histogram
-        squared, relative = (d - g).square(), (d - g).abs() / g
-        b, of_squared, of_relative = (log_bin(value, BINS) for value in (v, squared, relative))
+        judged, binned = pixels.judged, pixels.judged.histogram
+        squared, relative, b, of_squared = judged.squared, judged.relative, judged.variance_bins, judged.squared_bins
+        of_relative = log_bin(relative.log())
         return {
             "count": binned(b, BINS + 2),
             "squared": binned(b, BINS + 2, squared),
@@ -109,9 +98,10 @@ class SpearmanCorrelation(SumMetric):
     STATES = (("joint", COUNT, JOINT_BINS + 2, JOINT_BINS + 2),)
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        d, v, g = pixels.judged
-        size = JOINT_BINS + 2
-        both = log_bin(v, JOINT_BINS) * size + log_bin((d - g).square(), JOINT_BINS)
+        size, judged = JOINT_BINS + 2, pixels.judged
+        # Eight of the finer bins make one; a shift takes an eighth of a division's time.
+        v, e = ((bins + (1 << _SHIFT) - 1) >> _SHIFT for bins in (judged.variance_bins, judged.squared_bins))
+        both = v * size + e
         return {"joint": pixels.judged.histogram(both, size * size).reshape(size, size)}
 
     def compute(self) -> dict[str, Tensor]:
@@ -139,9 +129,9 @@ class NLLByError(SumMetric):
     STATES = (("count", COUNT, BINS + 2), ("nll", SUM, BINS + 2))
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        d, v, g = chosen = pixels.certain
-        b = log_bin((d - g).square(), BINS)
-        return {"count": chosen.histogram(b, BINS + 2), "nll": chosen.histogram(b, BINS + 2, gaussian_nll(d, v, g))}
+        chosen = pixels.judged.certain
+        b = chosen.squared_bins
+        return {"count": chosen.histogram(b, BINS + 2), "nll": chosen.histogram(b, BINS + 2, gaussian_nll(chosen))}
 
     def compute(self) -> dict[str, Tensor]:
         shares = torch.arange(1, 11, dtype=torch.float64, device=self.count.device) / 10

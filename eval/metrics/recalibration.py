@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from ufmstar_torch.eval.metrics.ranking import HIGH, LOW
+from ufmstar_torch.eval.metrics.base import HIGH, LOW
 from ufmstar_torch.posterior.recalibrate import CONFIDENCE, Recalibration
 
 Array = NDArray[np.float64]

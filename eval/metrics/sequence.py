@@ -16,6 +16,7 @@ from ufmstar_torch.eval.metrics.intervals import GatedPixels, IntervalCoverage
 from ufmstar_torch.eval.metrics.likelihood import NLL, EntropyHistogram
 from ufmstar_torch.eval.metrics.mixture import Mixture
 from ufmstar_torch.eval.metrics.ranking import Sparsification, SpearmanCorrelation
+from ufmstar_torch.runtime.kinds import check_kinds
 
 OURS, AUTHORS = "ours", "authors"
 BINS = (OURS, AUTHORS)
@@ -33,15 +34,18 @@ class SequenceMetrics(nn.Module):
     Args:
         with_variance: False for a network that predicts depth alone.
         bins: of the calibration errors: "ours", 10 of the confidence and 10 levels, or "authors", 100 and 101.
+        gates: False to leave out ``GatedPixels``, which has curves alone.
         plugins: a user's classes of ``SumMetric`` by name; their figures are called "own.FIGURE". Those that need a
             variance are ignored without one.
     """
 
+    @check_kinds
     def __init__(
         self,
         *,
         with_variance: bool = True,
         bins: str = OURS,
+        gates: bool = True,
         plugins: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         super().__init__()
@@ -51,11 +55,11 @@ class SequenceMetrics(nn.Module):
         kinds: list[type[SumMetric]] = [DepthAccuracy]
         if with_variance:
             kinds += [NLL, ECEDelta, ECEQuantile, EntropyHistogram, Sparsification, SpearmanCorrelation, Mixture]
-            kinds += [IntervalCoverage, GatedPixels]
+            kinds += [IntervalCoverage, *([GatedPixels] if gates else ())]
         finer = _AUTHORS if bins == AUTHORS else {}
-        made = {kind.__name__: kind(**finer.get(kind, {}), sync_on_compute=False) for kind in kinds}
+        made = {kind.__name__: kind(**finer.get(kind, {})) for kind in kinds}
         usable = {name: kind for name, kind in plugins.items() if with_variance or not kind.OF_VARIANCE}
-        made |= {f"{_PLUGIN_PREFIX}{name}": kind(sync_on_compute=False) for name, kind in usable.items()}
+        made |= {f"{_PLUGIN_PREFIX}{name}": kind() for name, kind in usable.items()}
         self.metrics = nn.ModuleDict(made)
 
     def update(
@@ -116,6 +120,7 @@ class SequenceMetrics(nn.Module):
         }
 
 
+@check_kinds
 def mean_and_ci(values: Iterable[float]) -> tuple[float, float]:
     """Mean over sequences and the half-width of its 95 % confidence interval, t_(n-1) s / sqrt(n).
 

@@ -126,7 +126,7 @@ def is_length_png(path: Path) -> bool:
 # Metres per count, finest first, with ranges of 65.5 m, 256 m (KITTI's), 655 m and 6.6 km.
 DEPTH_UNITS = (0.001, 1 / 256, 0.01, 0.1)
 FULL = 65535
-PNG_LEVEL = 1  # zlib's: level 6 takes 3-5 times as long for 10 % less
+PNG_STRATEGY = 3  # zlib's Z_RLE, which looks for runs alone: as small as its level 1 in .7 of the time
 
 
 def fitting_unit(depth: NDArray[Any]) -> float:
@@ -156,5 +156,5 @@ def encode_length_png(values: NDArray[Any], unit: float, quantity: str) -> bytes
     entries |= {"invalid": "0", "saturated": str(np.count_nonzero(counts > FULL))}
     for key, value in entries.items():
         text.add_text(key, value)
-    Image.fromarray(coded).save(content, "PNG", compress_level=PNG_LEVEL, pnginfo=text)
+    Image.fromarray(coded).save(content, "PNG", compress_type=PNG_STRATEGY, pnginfo=text)
     return content.getvalue()

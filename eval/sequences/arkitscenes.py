@@ -17,9 +17,10 @@ from scipy.spatial.transform import Rotation
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_image
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Skipped
-from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, depth_loader, list_files
+from ufmstar_torch.eval.sequences.images import depth_loader
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.paths import DEPTH_SUFFIXES, list_files
 from ufmstar_torch.eval.sequences.poses import associate, numbers, read_matrix, trajectory_of
 from ufmstar_torch.gaussians.trajectory import Trajectory
 

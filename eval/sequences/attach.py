@@ -16,8 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from ufmstar_torch.eval.sequences.frame import Entry, Loader, Skipped
-from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, is_hidden, list_files, read_color
+from ufmstar_torch.eval.sequences.images import read_color
 from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.paths import DEPTH_SUFFIXES, is_hidden, list_files
 from ufmstar_torch.eval.sequences.poses import read_pose
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.gaussians.trajectory import Trajectory, interpolate_pose

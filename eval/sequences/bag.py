@@ -23,9 +23,9 @@ from ufmstar_torch.eval.sequences import ros_messages as ros
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import UNKNOWN
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Skipped
-from ufmstar_torch.eval.sequences.images import is_hidden, natural_key
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.paths import is_hidden, natural_key
 from ufmstar_torch.eval.sequences.poses import associate
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.gaussians.trajectory import interpolate_pose

@@ -22,9 +22,10 @@ from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_image, pair_depth
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.generic import depth_folder, listed_times
-from ufmstar_torch.eval.sequences.images import depth_loader, listed_file, listed_path, natural_key
+from ufmstar_torch.eval.sequences.images import depth_loader
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, resolve
+from ufmstar_torch.eval.sequences.paths import listed_file, listed_path, natural_key
 from ufmstar_torch.eval.sequences.poses import numbered_lines, poses_from_columns
 from ufmstar_torch.files.limits import read_json
 from ufmstar_torch.frames.warnings import LOGGER
@@ -96,11 +97,16 @@ def read_landmarks(path: Path, model_index: int | None = None) -> dict[str, np.n
 
 def _model_folders(path: Path) -> list[Path]:
     """The folders with a model: the numbered ones in ``sparse/`` in the order of their numbers, or else ``sparse/``, or
-    else the path itself."""
-    below = path / MODELS
+    else the path itself, or else ETH3D's folder."""
+    below, eth3d = path / MODELS, path / "dslr_calibration_undistorted"
     numbered = sorted((f for f in below.glob("*") if f.name.isdecimal()), key=natural_key) if below.is_dir() else []
     return next(
-        (found for found in (list(filter(_is_model, group)) for group in (numbered, [below], [path])) if found), []
+        (
+            found
+            for found in (list(filter(_is_model, group)) for group in (numbered, [below], [path], [eth3d]))
+            if found
+        ),
+        [],
     )
 
 

@@ -10,15 +10,10 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.attach import pair_by_name
 from ufmstar_torch.eval.sequences.frame import FrameError
-from ufmstar_torch.eval.sequences.images import (
-    DEPTH_SUFFIXES,
-    SCALE_KEY,
-    list_files,
-    read_depth,
-    read_map,
-    require_scale,
-)
+from ufmstar_torch.eval.sequences.images import SCALE_KEY, read_depth, read_map, require_scale
 from ufmstar_torch.eval.sequences.options import check_scale
+from ufmstar_torch.eval.sequences.paths import DEPTH_SUFFIXES, list_files
+from ufmstar_torch.runtime.kinds import check_kinds
 
 _VARIANCE_SUFFIXES = (".npy", ".npz", ".exr", ".tif", ".tiff")
 
@@ -48,6 +43,7 @@ class DepthMaps:
         return np.where(usable, depth, np.float32(0)), np.where(usable, variance, np.float32(0))
 
 
+@check_kinds
 def depth_maps(
     path: str | Path,
     names: Sequence[str],

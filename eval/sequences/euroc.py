@@ -19,9 +19,10 @@ import numpy as np
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_image
 from ufmstar_torch.eval.sequences.frame import FrameSequence, Size
-from ufmstar_torch.eval.sequences.images import first_image_size, listed_file
+from ufmstar_torch.eval.sequences.images import first_image_size
 from ufmstar_torch.eval.sequences.lens import FISHEYE, Lens
 from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.paths import listed_file
 from ufmstar_torch.eval.sequences.poses import csv_rows, number, numbers, read_matrix, trajectory_of
 from ufmstar_torch.gaussians.trajectory import Trajectory
 

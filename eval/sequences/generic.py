@@ -16,17 +16,11 @@ import numpy as np
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import UNKNOWN, pair_depth, stem_times
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped
-from ufmstar_torch.eval.sequences.images import (
-    DEPTH_SUFFIXES,
-    IMAGE_SUFFIXES,
-    depth_loader,
-    first_image_size,
-    list_files,
-    read_color,
-)
-from ufmstar_torch.eval.sequences.intrinsics import FILES, read_intrinsics
+from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size, read_color
+from ufmstar_torch.eval.sequences.intrinsics import FILES, camera_file, read_intrinsics
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, resolve
+from ufmstar_torch.eval.sequences.paths import DEPTH_SUFFIXES, IMAGE_SUFFIXES, list_files, on_disk
 from ufmstar_torch.eval.sequences.poses import associate, read_trajectory
 from ufmstar_torch.eval.sequences.tum import SCALE as TUM_SCALE
 from ufmstar_torch.eval.sequences.tum import read_file_list
@@ -36,7 +30,7 @@ IMAGES = ("images", "image", "rgb", "color", "frames", *(f"image_{camera}" for c
 DEPTHS = ("depth", "depths")
 TRAJECTORIES = (
     *("poses.txt", "pose.txt", "trajectory.txt", "traj.txt", "groundtruth.txt"),
-    *("CameraTrajectory.txt", "KeyFrameTrajectory.txt", "cam0_to_world.txt"),
+    *("CameraTrajectory.txt", "KeyFrameTrajectory.txt", "cam0_to_world.txt", "poses.csv", "trajectory.csv"),
 )
 _KITTI = "calib.txt"  # of KITTI's odometry benchmark; read if there is none of the others
 INTRINSICS = (*FILES, _KITTI)
@@ -50,7 +44,7 @@ def detect(path: Path) -> bool:
     """True if this reader finds images and a trajectory."""
     if path.is_file():
         return path.suffix.lower() in VIDEO_SUFFIXES
-    has_trajectory = any((path / name).is_file() for name in TRAJECTORIES)
+    has_trajectory = any(on_disk(path / name).is_file() for name in TRAJECTORIES)
     return has_trajectory and bool(_image_sources(path))
 
 
@@ -76,7 +70,7 @@ def read(path: Path, options: Options) -> FrameSequence:
 
 def has_images_and_depth(path: Path) -> bool:
     """True if :func:`open_unposed` finds a folder of images and one of depth maps."""
-    return path.is_dir() and all(any((path / name).is_dir() for name in names) for names in (IMAGES, DEPTHS))
+    return path.is_dir() and all(any(on_disk(path / name).is_dir() for name in names) for names in (IMAGES, DEPTHS))
 
 
 def open_unposed(path: Path, options: Options) -> FrameSequence:
@@ -87,8 +81,7 @@ def open_unposed(path: Path, options: Options) -> FrameSequence:
         raise ValueError("images without poses take no trajectory and no T_color_depth")
     if not has_images_and_depth(path):
         raise ValueError(f"{path} must hold one of {', '.join(IMAGES)} and one of {', '.join(DEPTHS)}")
-    first = next(name for name in IMAGES if (path / name).is_dir())
-    images, size = open_images(path, replace(options, images=options.images or path / first))
+    images, size = open_images(path, replace(options, images=options.images or _image_sources(path)[0]))
     scale = options.truth_scale
     if scale is None and (path / "depth.txt").is_file():
         scale = TUM_SCALE
@@ -104,7 +97,7 @@ def _lens(root: Path, options: Options, size: Size) -> Lens | None:
     if options.intrinsics is not None:
         return None
     others = tuple(name for name in INTRINSICS if name != _KITTI)
-    names = others if any((root / name).is_file() for name in others) else INTRINSICS
+    names = others if camera_file(root, others) else INTRINSICS
     return Lens.of(read_intrinsics(_named_or_found(root, None, names, "intrinsics")), size)
 
 
@@ -142,7 +135,7 @@ def open_images(path: Path, options: Options) -> tuple[list[Entry], Size]:
 
 def _image_sources(path: Path) -> list[Path]:
     """Folders with images, or else the folder itself, or else its video files."""
-    folders = [path / name for name in IMAGES if (path / name).is_dir()]
+    folders = [folder for name in IMAGES if (folder := on_disk(path / name)).is_dir()]
     return folders or ([path] if list_files(path) else list_files(path, VIDEO_SUFFIXES))
 
 
@@ -163,7 +156,7 @@ def depth_folder(root: Path, inside: Path, options: Options) -> Path | None:
     """The folder of depth maps: ``options.truth``, or else one of ``DEPTHS`` in a folder; None without any."""
     if options.truth is not None:
         return resolve(root, options.truth)
-    return next((inside / name for name in DEPTHS if (inside / name).is_dir()), None)
+    return next((folder for name in DEPTHS if (folder := on_disk(inside / name)).is_dir()), None)
 
 
 def _with_depth(images: list[Entry], root: Path, options: Options, scale: float | None) -> list[Entry]:
@@ -191,7 +184,7 @@ def _depth_files(folder: Path, images: list[Entry], options: Options) -> dict[st
 def _named_or_found(root: Path, override: str | Path | None, names: tuple[str, ...], option: str) -> Path:
     if override is not None:
         return resolve(root, override)
-    result = [root / name for name in names if (root / name).is_file()]
+    result = [file for name in names if (file := on_disk(root / name)).is_file()]
     if len(result) != 1:
         listing = f"found {[file.name for file in result]}" if result else f"looked for {', '.join(names)}"
         hint = "; `ufmstar poses` computes poses from images alone" if option == "trajectory" and not result else ""

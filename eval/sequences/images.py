@@ -8,7 +8,6 @@ pixels become black; both are logged once per folder.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from contextlib import redirect_stdout, suppress
 from functools import lru_cache, partial
@@ -20,20 +19,18 @@ import torch
 from PIL import Image
 
 from ufmstar_torch.eval.sequences.frame import Entry, Frame, FrameError, Loader, Size, Skipped
+from ufmstar_torch.eval.sequences.paths import list_files
 from ufmstar_torch.files.limits import MOST_PIXELS, require_pixels
 from ufmstar_torch.files.read import read_npy, read_npz
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.runtime.optional import optional
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
-DEPTH_SUFFIXES = (".png", ".exr", ".npy", ".npz", ".tif", ".tiff")
 # Errors of Pillow's plugins for broken files (SyntaxError: bad PNG chunk).
 _BROKEN_IMAGE = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
 # Key of a PNG's text chunk: metres per unit of its 16-bit values.
 SCALE_KEY = "depth_scale"
 # Bit depth, colour type, compression, filter and interlacing, from a PNG's header.
 _SIGNATURE, _RGB = b"\x89PNG\r\n\x1a\n", bytes((8, 2, 0, 0, 0))
-_ELSEWHERE = re.compile(r"[A-Za-z]:|file:")  # a drive of Windows, a scheme
 _MILLIMETRE = 1e-3
 # Largest values of images of 8, 10, 12, 14 and 16 bits, which are all stored in 16 bits.
 _FULL_SCALES = (255, 1023, 4095, 16383, 65535)
@@ -172,44 +169,6 @@ def first_depth_size(frames: Iterable[Entry | Skipped]) -> Size | None:
                 height, width = frame.load_depth().shape
                 return height, width
     return None
-
-
-def list_files(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:
-    """The folder's files with one of the suffixes, numbers in names sorted by value (2 before 10). Broken links are
-    included, so that their frames are skipped and counted."""
-    named = (path for path in folder.iterdir() if path.suffix.lower() in suffixes and not is_hidden(path))
-    return sorted((p for p in named if p.is_file() or (p.is_symlink() and not p.exists())), key=natural_key)
-
-
-def is_hidden(path: Path) -> bool:
-    """True if the name begins with a dot, as that of an unfinished download, and ._NAME, in which macOS stores the
-    attributes of NAME."""
-    return path.name.startswith(".")
-
-
-def listed_path(text: str) -> Path:
-    """The path that a text file states, also if a program on Windows wrote it with backslashes."""
-    return Path(text.replace("\\", "/"))
-
-
-def listed_file(folder: Path, text: str | Path) -> Path:
-    """The file below ``folder`` that a text file names; it need not exist.
-
-    A path outside of the folder is never used. Where another computer's path is listed (absolute, with a drive or a
-    scheme, or with ".."), the longest end of it that is a file below the folder counts.
-    """
-    path = listed_path(str(text))
-    parts = [part for part in path.parts if part not in ("/", "//", "..") and not _ELSEWHERE.fullmatch(part)]
-    if len(parts) == len(path.parts):
-        return folder / path
-    ends = (folder.joinpath(*parts[start:]) for start in range(len(parts)))
-    return next((end for end in ends if end.is_file()), folder.joinpath(*parts[-1:]))
-
-
-def natural_key(path: Path) -> list[tuple[int, int, str]]:
-    """Sort key of a file name: digit groups by value, the rest as text."""
-    parts = re.split(r"(\d+)", path.name)
-    return [(0, int(part), part) if part.isdigit() else (1, 0, part) for part in parts]
 
 
 def depth_loader(

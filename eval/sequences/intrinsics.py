@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ufmstar_torch.eval.sequences.frame import Size
+from ufmstar_torch.eval.sequences.paths import on_disk
 
 # A file's path, a matrix [3, 3] (or ScanNet's [4, 4]), or the numbers fx, fy, cx, cy [px].
 IntrinsicsLike = str | Path | np.ndarray | Sequence[float]
@@ -16,7 +17,7 @@ IntrinsicsLike = str | Path | np.ndarray | Sequence[float]
 # Names of files with the camera of the images, and of the depth maps.
 FILES = (
     *("K.txt", "intrinsics.txt", "intrinsic.txt", "camera.txt", "intrinsics.K.txt"),
-    *("camera-intrinsics.txt", "camera_intrinsics.txt"),
+    *("camera-intrinsics.txt", "camera_intrinsics.txt", "calibration.txt"),  # the last: ETH3D
 )
 DEPTH_FILES = ("K_depth.txt", "depth_K.txt", "intrinsics_depth.txt", "depth_intrinsics.txt", "depth.intrinsics.K.txt")
 
@@ -63,7 +64,7 @@ def _projections(path: Path) -> np.ndarray | None:
 
 def camera_file(folder: Path, names: Sequence[str]) -> Path | None:
     """The first file of these names in a folder."""
-    return next((folder / name for name in names if (folder / name).is_file()), None)
+    return next((file for name in names if (file := on_disk(folder / name)).is_file()), None)
 
 
 def parse_intrinsics(words: Sequence[str], option: str) -> str | list[float] | None:

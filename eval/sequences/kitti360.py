@@ -31,9 +31,10 @@ from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import UNKNOWN, frame_of_image, pair_depth
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Size, Skipped
 from ufmstar_torch.eval.sequences.ground_truth import project
-from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size, list_files
+from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, resolve
+from ufmstar_torch.eval.sequences.paths import list_files
 from ufmstar_torch.eval.sequences.poses import numbered_lines, numbers, read_matrix, read_trajectory
 
 LOOKED_FOR = "data_2d_raw/DRIVE/image_00/data_rect (the root, the drive's folder or the camera's)"

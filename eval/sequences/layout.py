@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from fnmatch import fnmatch
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ufmstar_torch.eval.sequences.plugins import load_plugins
+from ufmstar_torch.runtime.kinds import check_kinds
 
 # Each module has ``detect(path)``, ``read(path, options)`` and LOOKED_FOR, the files that it detects; if a path may
 # contain several sequences, also ``parts(path)``.
@@ -16,6 +18,21 @@ _MODULES = (
     *("bag", "stray", "arkitscenes", "generic"),
 )
 GENERIC = "generic"
+_NERFSTUDIO = "convert it with nerfstudio, `ns-process-data {} --data DIR --output-dir OUT`, and open OUT"
+# Files of exports that no reader opens, and what makes them readable.
+_CONVERTED = (
+    ("keyframes/*cameras", f"it is a raw export of Polycam; {_NERFSTUDIO.format('polycam')}"),
+    ("*.r3d", "it is a file of Record3D; export it there as a folder with EXR and JPG"),
+    ("rgbd/*.depth", "its depth has Apple's compression; export it from Record3D with EXR and JPG"),
+    ("EXR_RGBD", f"it is an export of Record3D; {_NERFSTUDIO.format('record3d')}"),
+    ("oxts", "a raw drive of KITTI has no poses of its cameras; take the odometry benchmark or KITTI-360"),
+    ("image_?/000000.png", "for KITTI's odometry, pass --trajectory poses/NN.txt (of image_0) and --images image_0"),
+    ("results/frame000000.jpg", "for Replica, move results/depth* to depth/, and pass --images results, --intrinsics "
+     "600 600 599.5 339.5 and --truth-scale 0.000152597"),
+    ("pose_intrinsic_imu.json", "it is an iPhone's part of ScanNet++; its COLMAP model can be opened"),
+    ("camera_params_*.json", "for Isaac Sim, write a transforms.json with transform_matrix = inverse of the transposed "
+     "cameraViewTransform, which has OpenGL axes"),
+)  # fmt: skip
 _DEEPEST = 4  # levels of folders that are searched
 READERS: dict[str, Any] = {
     "7scenes" if name == "seven_scenes" else name: import_module(f"ufmstar_torch.eval.sequences.{name}")
@@ -51,10 +68,24 @@ def layout_of(layout: str, path: Path, explicit: bool = False, plugin: Sequence[
     if len(fitting) > 1:
         raise ValueError(f"{path} fits the layouts {', '.join(fitting)}: pass layout")
     if not fitting:
-        expected = "\n".join(f"  {name}: {reader.LOOKED_FOR}" for name, reader in by_name.items())
-        inside = sorted(p.name for p in path.iterdir())[:8] if path.is_dir() else [path.name]
-        raise ValueError(f"{path} has no known layout. Looked for\n{expected}\nand found {inside}")
+        raise ValueError(f"{path} has no known layout: {_remedy(path, list(by_name))}")
     return fitting[0]
+
+
+def _remedy(path: Path, names: Sequence[str]) -> str:
+    """How to open a path that has none of the layouts ``names``."""
+    if remedy := next((remedy for pattern, remedy in _CONVERTED if _holds(path, pattern)), None):
+        return remedy
+    if below := find_sequences(path):
+        listed = ", ".join(f"{found.path.relative_to(path)} ({found.layout})" for found in below[:3])
+        return f"open one of the {len(below)} recordings below it, such as {listed}"
+    inside = ", ".join(sorted(p.name for p in path.iterdir())[:8]) if path.is_dir() else ""
+    published = f"or the files of {', '.join(name for name in names if name != GENERIC)} (docs/data.md)"
+    return f"expected {READERS[GENERIC].LOOKED_FOR}; {published}; found {inside or 'none of them'}"
+
+
+def _holds(path: Path, pattern: str) -> bool:
+    return any(path.glob(pattern)) if path.is_dir() else fnmatch(path.name.lower(), pattern)
 
 
 def layouts_of(path: Path, plugin: Sequence[str] = ()) -> list[str]:
@@ -78,6 +109,7 @@ class Found(NamedTuple):
     layout: str
 
 
+@check_kinds
 def find_sequences(root: str | Path, layout: str = "auto", plugin: Sequence[str] = ()) -> list[Found]:
     """All sequences at most four folders below ``root``, sorted by name.
 

@@ -5,7 +5,6 @@ lines of JSON.
 from __future__ import annotations
 
 import base64
-import binascii
 import hashlib
 import json
 import math
@@ -23,9 +22,10 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.eval.sequences.attach import stem_times
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence, check_intrinsics
-from ufmstar_torch.eval.sequences.images import IMAGE_SUFFIXES, is_hidden, listed_path, read_color
+from ufmstar_torch.eval.sequences.images import read_color
 from ufmstar_torch.eval.sequences.intrinsics import pinhole
-from ufmstar_torch.eval.sequences.poses import in_metres, numbers, parse_pose, poses_from_columns
+from ufmstar_torch.eval.sequences.paths import IMAGE_SUFFIXES, is_hidden, listed_path, on_disk
+from ufmstar_torch.eval.sequences.poses import PoseColumns, in_metres, numbers, parse_pose, poses_from_columns
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.gaussians.conventions import CONVENTIONS, OURS
 
@@ -56,6 +56,7 @@ class PoseFile:
         self._read, self._line = 0, 0
         self._head, self._tail = b"", b""  # first and last bytes of what was read
         self._digest = hashlib.sha256()  # of all that was read
+        self._columns = PoseColumns()
         self._file: tuple[int, int] | None = None  # device and inode
 
     def new(self) -> Iterator[LiveEvent]:
@@ -69,6 +70,7 @@ class PoseFile:
             if not self._continues(file):
                 LOGGER.warning("%s was written anew: its poses are read from the start", self.path)
                 self._read, self._line, self._head, self._tail, self._digest = 0, 0, b"", b"", hashlib.sha256()
+                self._columns = PoseColumns()
             file.seek(self._read)
             text = file.read()
         complete = text[: text.rfind(b"\n") + 1]
@@ -77,7 +79,7 @@ class PoseFile:
         self._digest.update(complete)
         for line in complete.decode("utf-8", "replace").splitlines():
             self._line += 1
-            if (pose := parse_pose(line, f"{self.path}:{self._line}")) is not None:
+            if (pose := parse_pose(line, f"{self.path}:{self._line}", self._columns)) is not None:
                 yield LiveEvent(pose[0], T_world_cam=in_metres(self._convert(pose[1]), self._scale))
 
     def _continues(self, file: BinaryIO) -> bool:
@@ -215,7 +217,7 @@ def json_lines(
                 image, unreadable = None, unreadable + 1
                 if unreadable == 1:
                     LOGGER.warning("line %d: the image is left out: %s (logged once)", number, error)
-        except (ValueError, TypeError, OverflowError, RecursionError, binascii.Error) as error:
+        except (ValueError, TypeError, OverflowError, RecursionError) as error:
             raise ValueError(f"line {number}: {error}") from error
         if image is not None or pose is not None:
             yield LiveEvent(float(event["stamp"]), image, pose, K)
@@ -265,5 +267,8 @@ def _image(text: Any, folder: Path) -> NDArray[np.uint8]:
         raise ValueError(f"an image is the name of a file, got {text!r:.40}")
     head, comma, body = text.partition(",")
     if head.startswith("data:") and comma:
-        return read_color("image", base64.b64decode(body, validate=True))
-    return read_color(folder / listed_path(text))
+        try:
+            return read_color("image", base64.b64decode(body, validate=True))
+        except ValueError as error:
+            raise FrameError("image", f"no base64: {error}") from error
+    return read_color(on_disk(folder / listed_path(text)))

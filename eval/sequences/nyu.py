@@ -13,9 +13,10 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence
-from ufmstar_torch.eval.sequences.images import first_depth_size, is_hidden, natural_key, positive
+from ufmstar_torch.eval.sequences.images import first_depth_size, positive
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.paths import is_hidden, natural_key
 from ufmstar_torch.files.limits import require_bytes
 
 LOOKED_FOR = "val/SCENE/*.h5 or train/SCENE/*.h5 (the root, meaning val, the part's folder or the scene's)"

@@ -17,6 +17,7 @@ from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import in_metres
 from ufmstar_torch.frames.arguments import as_path
 from ufmstar_torch.gaussians.conventions import CONVENTIONS, OURS
+from ufmstar_torch.runtime.kinds import check_kinds
 
 # By option, the layouts that use it; other options are used by all.
 _USED_BY = {
@@ -32,6 +33,7 @@ _USED_BY = {
 }
 
 
+@check_kinds
 def open_sequence(path: str | Path, layout: str = "auto", **options: Any) -> FrameSequence:
     """Open a sequence of posed images. Only headers and text files are read before it is indexed.
 

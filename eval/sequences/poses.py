@@ -11,11 +11,15 @@ of columns of a line defines the format:
 16    4x4 rows of a matrix
 17    frame number or timestamp, then 4x4 rows (KITTI-360)
 ====  ==========================================================
+
+A header, with ``#`` or without, that names a position and a quaternion (``tx``, ``p_RS_R_x [m]``, ``qw``,
+``field.pose.orientation.w``) sets their columns and order; other columns are left out.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -35,6 +39,12 @@ _QUATERNION_TOLERANCE = 0.02
 _SAME_PLACE, _SAME_DIRECTION = 0.01, 2.0
 # printf on Windows writes NaN and infinity as 1.#IND, 1.#QNAN, 1.#INF.
 _WINDOWS_NON_FINITE = re.compile(r"[+-]?1\.?#(IND|QNAN|SNAN|INF)\d*", re.IGNORECASE)
+# Names of columns, in lower case and without units: of EuRoC, ROS, and people's tables.
+_TIME = re.compile(r"t|id|index|sec.*|frame.*|time.*|.*stamp.*")
+_NAMES = (
+    *(re.compile(rf"(?:|t|p|[tp]_\w*|.*(?:pos|trans)\w*[._]?){axis}") for axis in "xyz"),
+    *(re.compile(rf"(?:q|q_\w*|.*(?:quat|orient|rot)\w*[._]?){axis}") for axis in "xyzw"),
+)
 
 
 def in_metres(T_world_cam: np.ndarray, scale: float) -> np.ndarray:
@@ -44,11 +54,39 @@ def in_metres(T_world_cam: np.ndarray, scale: float) -> np.ndarray:
     return T
 
 
+class PoseColumns:
+    """The words of a pose file's lines, in the order of this module's formats. A header before the first pose sets the
+    columns."""
+
+    def __init__(self) -> None:
+        self._order: list[int] | None = None
+        self._started = False
+
+    def words(self, text: str, where: str) -> list[str]:
+        """The numbers of a line as words; none for a comment, a header or an empty line. Raises ValueError: the line
+        has fewer columns than the header, or the first one has words that name no pose."""
+        if not self._started and (order := _named_columns(text)):
+            self._order = order
+            return []
+        words = _tokens(text)
+        if words and not self._started and re.match(r"(?!nan|inf)[a-z%]", words[0], re.IGNORECASE):
+            expected = "a header that names the columns, such as timestamp tx ty tz qx qy qz qw"
+            raise ValueError(f"{where}: expected numbers or {expected}, got {text.strip()!r:.60}")
+        self._started |= bool(words)
+        if not words or self._order is None:
+            return words
+        if len(words) <= max(self._order):
+            raise ValueError(
+                f"{where}: expected {max(self._order) + 1} columns or more, as the header names, got {len(words)}"
+            )
+        return [words[column] for column in self._order]
+
+
 def read_trajectory(path: str | Path) -> Trajectory:
     """Read a trajectory in any of the formats of this module; ``#`` starts a comment. Samples are sorted by time; the
     first of equal poses with the same timestamp is used. Raises ValueError: a line (named by file and number) is no
     pose of a known format, or contradicts another one; or there is no pose."""
-    rows, lines = _numbers(as_path("path", path))
+    rows, lines = _numbers(as_path("path", path), PoseColumns().words)
     for row, where in zip(rows, lines, strict=True):
         if len(row) not in (7, 8, 12, 13, 16, 17):
             raise ValueError(
@@ -74,10 +112,10 @@ def read_trajectory(path: str | Path) -> Trajectory:
     return Trajectory(timestamps, T_world_cam)
 
 
-def parse_pose(text: str, where: str) -> tuple[float, np.ndarray] | None:
+def parse_pose(text: str, where: str, columns: PoseColumns) -> tuple[float, np.ndarray] | None:
     """Timestamp and pose [4, 4] of one line with 8, 13 or 17 numbers, all NaN if an entry of the pose is not finite;
-    None for a comment or an empty line. Raises ValueError: another form; ``where`` names the line."""
-    tokens = _tokens(text)
+    None for a line without numbers. Raises ValueError: another form; ``where`` names the line."""
+    tokens = columns.words(text, where)
     if not tokens:
         return None
     row = np.array([number(token, where) for token in tokens])
@@ -108,7 +146,7 @@ def associate(first: np.ndarray, second: np.ndarray, max_difference: float) -> d
 def read_matrix(path: str | Path) -> np.ndarray:
     """The numbers of a small text file, one row per line, [R, C] float64, non-finite ones included. Raises ValueError:
     a line has something other than numbers, or lines differ in length."""
-    rows, lines = _numbers(path)
+    rows, lines = _numbers(path, lambda text, _: _tokens(text))
     for row, where in zip(rows, lines, strict=True):
         if len(row) != len(rows[0]):
             raise ValueError(f"{where}: expected {len(rows[0])} numbers as in the first line, got {len(row)}")
@@ -213,21 +251,32 @@ def _require_consistent(T_world_cam: np.ndarray, first: np.ndarray, same: np.nda
         raise ValueError(f"{lines[i]}: the pose has the timestamp of line {other}, but lies {far} {many}")
 
 
-def _numbers(path: str | Path) -> tuple[list[list[float]], list[str]]:
-    """The numbers of each non-empty line, and its FILE:LINE; a ``#`` inside a token (Windows' 1.#IND) starts no
-    comment."""
+def _numbers(path: str | Path, words_of: Callable[[str, str], list[str]]) -> tuple[list[list[float]], list[str]]:
+    """The numbers of each non-empty line, whose words ``words_of`` its text and FILE:LINE returns, and its
+    FILE:LINE."""
     rows, lines = [], []
     for line, text in numbered_lines(path):
-        tokens, where = _tokens(text), f"{path}:{line}"
-        if tokens:
+        where = f"{path}:{line}"
+        if tokens := words_of(text, where):
             rows.append([number(token, where) for token in tokens])
             lines.append(where)
     return rows, lines
 
 
+def _named_columns(text: str) -> list[int] | None:
+    """The columns of the timestamp (if it is named), x, y, z, qx, qy, qz and qw in a header; None if it names no
+    pose."""
+    separator = next((mark for mark in ";," if mark in text), None)
+    names = [re.sub(r"\[.*?\]|\(.*?\)|[#%\s]", "", word).lower() for word in text.split(separator)]
+    names = [name for name in names if name]
+    found = [next((i for i, name in enumerate(names) if form.fullmatch(name)), None) for form in (_TIME, *_NAMES)]
+    order = [column for column in found if column is not None]
+    return order if None not in found[1:] and len(set(order)) == len(order) else None
+
+
 def _tokens(text: str) -> list[str]:
-    """Split a line into words and leave its comment out. Where spaces or semicolons separate the words, a comma inside
-    a word stays: "0,5 1,5" has two words."""
+    """Split a line into words and leave its comment out; a ``#`` inside a word (Windows' 1.#IND) starts none. Where
+    spaces or semicolons separate the words, a comma inside a word stays: "0,5 1,5" has two words."""
     words = re.split(r"(?:^|\s)#", text, maxsplit=1)[0].split()
     separator = ";" if any(";" in word for word in words) else ","
     words = [word.strip(separator) for word in words]

@@ -13,10 +13,11 @@ import numpy as np
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_files
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped, fits
-from ufmstar_torch.eval.sequences.images import depth_loader, first_depth_size, first_image_size, list_files
+from ufmstar_torch.eval.sequences.images import depth_loader, first_depth_size, first_image_size
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics, scale_intrinsics
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.paths import list_files, on_disk
 
 LOOKED_FOR = "color/, pose/ and intrinsic/ folders"
 _NATIVE_COLOR, _NATIVE_DEPTH = (968, 1296), (480, 640)
@@ -44,7 +45,7 @@ def read(path: Path, options: Options) -> FrameSequence:
 
 
 def _frame(path: Path, image: Path, options: Options) -> Entry | Skipped:
-    pose, depth = path / "pose" / f"{image.stem}.txt", path / "depth" / f"{image.stem}.png"
+    pose, depth = (on_disk(path / kind / f"{image.stem}{end}") for kind, end in (("pose", ".txt"), ("depth", ".png")))
     load_depth = depth_loader(depth if depth.is_file() else None, options.truth_scale)
     return frame_of_files(image.stem, image, pose if pose.is_file() else None, load_depth, options)
 

@@ -22,10 +22,11 @@ from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_files
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Loader
 from ufmstar_torch.eval.sequences.ground_truth import register_depth
-from ufmstar_torch.eval.sequences.images import depth_loader, first_depth_size, first_image_size, natural_key
+from ufmstar_torch.eval.sequences.images import depth_loader, first_depth_size, first_image_size
 from ufmstar_torch.eval.sequences.intrinsics import camera_matrix, pinhole
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, resolve, with_camera_files
+from ufmstar_torch.eval.sequences.paths import natural_key
 from ufmstar_torch.eval.sequences.poses import read_pose
 
 LOOKED_FOR = "frame-NNNNNN.pose.txt files"
@@ -35,7 +36,7 @@ _K_DEPTH = (585.0, 585.0, 320.0, 240.0)
 _NO_DEPTH = 65535
 # [m] An approximation: the colour camera is 2.5 cm to the right of the depth camera, with the same orientation.
 _T_COLOR_DEPTH = np.array([[1.0, 0, 0, -0.025], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-_FRAME = re.compile(r"(frame-\d+)\.(color\.png|color\.jpg|depth\.png|pose\.txt)")
+_FRAME = re.compile(r"(frame-\d+)\.(color\.png|color\.jpg|depth\.png|pose\.txt)", re.IGNORECASE)
 
 
 def detect(path: Path) -> bool:
@@ -58,7 +59,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     for file in sorted(path.iterdir(), key=natural_key):
         found = _FRAME.fullmatch(file.name)
         if found:
-            files.setdefault(found[1], {})[found[2].split(".")[0]] = file
+            files.setdefault(found[1].lower(), {})[found[2].lower().split(".")[0]] = file
     color_size = first_image_size(kinds["color"] for kinds in files.values() if "color" in kinds) or _NATIVE_SIZE
     frames = []
     for name, kinds in files.items():

@@ -18,6 +18,7 @@ from ufmstar_torch.eval.sequences.images import read_color, read_depth
 from ufmstar_torch.eval.sequences.intrinsics import pinhole_values
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.paths import on_disk
 from ufmstar_torch.eval.sequences.poses import csv_rows, number, poses_from_columns, read_matrix
 from ufmstar_torch.eval.sequences.video import Video
 
@@ -61,8 +62,8 @@ def read(path: Path, options: Options) -> FrameSequence:
             continue
         camera = tuple(value[name] for name in _FOCAL) if set(_FOCAL) <= value.keys() else pinhole_values(K)
         lenses[name] = Lens(camera, video.size)
-        file = path / "depth" / f"{name}.png"
-        load = partial(_depth, file, path / "confidence" / file.name, options.truth_scale) if file.is_file() else None
+        file, confidence = (on_disk(path / kind / f"{name}.png") for kind in ("depth", "confidence"))
+        load = partial(_depth, file, confidence, options.truth_scale) if file.is_file() else None
         frames.append(Entry(name, T, partial(video.read, int(index)), load, time))
     return assemble("stray", path, frames, lenses, options)
 

@@ -11,9 +11,10 @@ from pathlib import Path
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_image
 from ufmstar_torch.eval.sequences.frame import FrameSequence
-from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size, list_files
+from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, with_camera_files
+from ufmstar_torch.eval.sequences.paths import list_files, on_disk
 from ufmstar_torch.eval.sequences.poses import read_trajectory
 from ufmstar_torch.gaussians.conventions import CONVENTIONS
 
@@ -48,7 +49,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     frames = []
     for number, T in enumerate(CONVENTIONS["ned"].convert(trajectory.T_world_cam)):
         image = by_number.get(number, folder / "image_left" / f"{number:06d}_left.png")
-        depth = folder / "depth_left" / f"{image.stem}_depth.npy"
+        depth = on_disk(folder / "depth_left" / f"{image.stem}_depth.npy")
         load_depth = depth_loader(depth if depth.is_file() else None, options.truth_scale)
         frames.append(frame_of_image(image.stem, image, load_depth, T))
     name = path.resolve().name if folder == path else f"{path.resolve().name}_{folder.name}"

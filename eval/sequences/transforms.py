@@ -21,17 +21,10 @@ import numpy as np
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import UNKNOWN
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Size, Skipped
-from ufmstar_torch.eval.sequences.images import (
-    IMAGE_SUFFIXES,
-    depth_loader,
-    image_size,
-    is_hidden,
-    listed_file,
-    listed_path,
-    read_color,
-)
+from ufmstar_torch.eval.sequences.images import depth_loader, image_size, read_color
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.paths import IMAGE_SUFFIXES, is_hidden, listed_file, listed_path, on_disk
 from ufmstar_torch.files.limits import read_json
 from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.gaussians.conventions import CONVENTIONS
@@ -80,7 +73,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     for frame, image in zip(frames, paths, strict=True):
         name = image.stem if short else str(image.with_suffix("")).strip("/").replace("/", "__")
         whole = listed_file(file.parent, image)  # may lack the suffix, as in NeRF's synthetic scenes
-        candidates = (whole, *(whole.with_name(whole.name + suffix) for suffix in IMAGE_SUFFIXES))
+        candidates = (whole, *(on_disk(whole.with_name(whole.name + suffix)) for suffix in IMAGE_SUFFIXES))
         image_file = next((path for path in candidates if path.is_file()), None)
         if image_file is None:
             entries.append(Skipped(name, "missing image file", whole))

@@ -15,9 +15,10 @@ import numpy as np
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_image
 from ufmstar_torch.eval.sequences.frame import FrameSequence
-from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size, listed_file, listed_path
+from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, with_camera_files
+from ufmstar_torch.eval.sequences.paths import listed_file, listed_path
 from ufmstar_torch.eval.sequences.poses import associate, numbered_lines, read_trajectory
 
 LOOKED_FOR = "rgb.txt and groundtruth.txt"

@@ -11,6 +11,7 @@ from ufmstar_torch.eval.tour.route import SPACING
 from ufmstar_torch.eval.tour.shapes import rotation
 from ufmstar_torch.eval.tour.style import style_of
 from ufmstar_torch.eval.tour.tour import Tour
+from ufmstar_torch.runtime.kinds import check_kinds
 
 Array = NDArray[np.float64]
 
@@ -26,6 +27,7 @@ SWAY = 0.04  # largest sway of the hand on each axis [m]
 _GLANCE, _PITCH, _ROLL = np.radians(22.0), np.radians(4.0), np.radians(1.2)
 
 
+@check_kinds
 def tour_path(tour: Tour, frames: int, seed: int | None = None, *, pan: bool = False) -> Tensor:
     """[N, 4, 4] float64 camera-to-world poses [m] of a camera that walks through the rooms and returns.
 

@@ -18,6 +18,7 @@ from ufmstar_torch.eval.tour.style import STYLES
 from ufmstar_torch.eval.tour.tour import Tour, make_tour
 from ufmstar_torch.eval.tour.view import TourView, intrinsics, render
 from ufmstar_torch.files.limits import MOST_PIXELS, require_bytes, require_pixels
+from ufmstar_torch.runtime.kinds import check_kinds
 
 PREFIX = "tour:"
 _FORM = (
@@ -56,6 +57,7 @@ def open_tour(name: str) -> FrameSequence:
     return tour_sequence(int(seed), **options)
 
 
+@check_kinds
 def tour_sequence(
     seed: int,
     *,
@@ -139,6 +141,7 @@ def _view(walk: _Renderer, index: int) -> TourView:
     return render(tour, walk.poses[index], walk.K, *walk.size, frame_seed=seed)
 
 
+@check_kinds
 def export_tour(sequence: FrameSequence, folder: str | Path) -> Path:
     """Write a sequence of :func:`tour_sequence` in the generic layout: images/, depth/ (float32 npy [m]), poses.txt and
     K.txt. Raises FileExistsError: the folder is not empty; ValueError: a frame has no image or no depth."""

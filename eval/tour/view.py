@@ -15,6 +15,7 @@ from ufmstar_torch.eval.tour.sensor import develop
 from ufmstar_torch.eval.tour.shade import shade
 from ufmstar_torch.eval.tour.tour import Tour
 from ufmstar_torch.eval.tour.visibility import Window, surface_windows
+from ufmstar_torch.runtime.kinds import check_kinds
 
 _SKY = torch.tensor([[0.55], [0.7], [0.9]])  # linear RGB
 
@@ -34,6 +35,7 @@ def intrinsics(height: int, width: int, fov_degrees: float = 70.0) -> NDArray[np
     return np.array([[f, 0.0, (width - 1) / 2], [0.0, f, (height - 1) / 2], [0.0, 0.0, 1.0]])
 
 
+@check_kinds
 def render(
     tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width: int, *, frame_seed: int | None = None
 ) -> TourView:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ufmstar_torch.frames.arguments import require_float, require_mask
 from ufmstar_torch.gaussians.fixed_order import apply
+from ufmstar_torch.runtime.kinds import check_kinds
 
 _UNCHECKED = torch.empty(0)
 
@@ -68,6 +69,7 @@ class Anchors:
     contradiction: Tensor = _UNCHECKED
 
     @classmethod
+    @check_kinds
     def from_points(
         cls,
         points_cam: Tensor,

@@ -30,6 +30,7 @@ from ufmstar_torch.anchors.motion import LANDMARK, LINE, OFF_LINE, SEARCH, Motio
 from ufmstar_torch.anchors.saved_state import POSITIVE, SavedState
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.runtime.checked import Checked, number
+from ufmstar_torch.runtime.kinds import check_kinds
 
 if TYPE_CHECKING:
     from ufmstar_torch.anchors.kernels.dense import Search, Views
@@ -127,6 +128,7 @@ class DenseEvidence(SavedState):
     }
     RANGES: ClassVar = {"_depth": POSITIVE}
 
+    @check_kinds
     def __init__(self, config: DenseConfig | None = None) -> None:
         self.config = config if config is not None else DenseConfig()
         self._keyframes = Keyframes(self.config.keyframes)

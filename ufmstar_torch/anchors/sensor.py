@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from torch.nn.functional import max_pool2d
 
 from ufmstar_torch.anchors.landmarks import Landmarks
+from ufmstar_torch.runtime.kinds import check_kinds
 
 # Cells of the image on each side, of which each gives at most one anchor: the nodes of the posterior's grid.
 _CELLS = 28
@@ -42,6 +43,7 @@ _SIGMA = {"stereo": (0.001, 0.0, 0.003), "tof": (0.01, 0.01, 0.0)}
 SENSORS = tuple(_SIGMA)
 
 
+@check_kinds
 def sensor_landmarks(
     depth: NDArray[np.float32],
     K_depth: NDArray[np.float64],

@@ -21,6 +21,7 @@ from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.files.limits import read_text
 from ufmstar_torch.files.read import read_npz
 from ufmstar_torch.gaussians.camera import invert_rigid
+from ufmstar_torch.runtime.kinds import check_kinds
 
 # Largest number of landmarks in one image; a tracker follows 300.
 _MAX_VISIBLE = 500
@@ -79,6 +80,7 @@ class LandmarkMap:
         object.__setattr__(self, "sigma", sigma)
 
     @classmethod
+    @check_kinds
     def read(cls, path: str | Path) -> LandmarkMap:
         """Read a file of landmarks.
 
@@ -107,6 +109,7 @@ class LandmarkMap:
         digest = hashlib.sha256(self.points_world.tobytes() + self.sigma.tobytes()).hexdigest()
         return {"anchors": "landmarks", "landmarks": digest}
 
+    @check_kinds
     def anchors(self, T_world_cam: Tensor, intrinsics: Tensor, size: tuple[int, int]) -> Anchors:
         """All landmarks as anchors of B views; those out of view are not valid.
 

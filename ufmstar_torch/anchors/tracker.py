@@ -21,6 +21,7 @@ from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, OtherCameraErro
 from ufmstar_torch.anchors.saved_state import POSITIVE, SavedState, saved_image
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
 from ufmstar_torch.runtime.checked import Checked, number
+from ufmstar_torch.runtime.kinds import check_kinds
 
 if TYPE_CHECKING:
     from ufmstar_torch.anchors.kernels.triangulate import Triangulated
@@ -111,6 +112,7 @@ class LandmarkTracker(SavedState):
     }
     RANGES: ClassVar = {"_depth": POSITIVE}
 
+    @check_kinds
     def __init__(self, config: TrackerConfig | None = None) -> None:
         self.config = config if config is not None else TrackerConfig()
         self._refinement = PoseRefinement()

@@ -6,9 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from ufmstar_torch.frames.arguments import as_tensor, require_number
 from ufmstar_torch.frames.prediction import DepthPrediction
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.posterior.distribution import LEAST_VARIANCE, DepthDistribution
@@ -234,7 +236,7 @@ class UncertaintyOutput:
             ValueError: ``level`` is not within (0, 1); or no stream has evidence: neither a posterior with held-out
                 anchors, nor a ``Recalibration``.
         """
-        if not 0 < level < 1:
+        if not 0 < require_number("level", level) < 1:
             raise ValueError(f"level must lie within (0, 1), got {level!r}")
         lower, upper = self.distribution().interval(level)
         return lower.to(self.depth.dtype), upper.to(self.depth.dtype)
@@ -249,8 +251,7 @@ class UncertaintyOutput:
         Raises:
             ValueError: as :meth:`interval`, without its ``level``.
         """
-        bound = torch.as_tensor(than, dtype=torch.float64, device=self.depth.device).expand(self.depth.shape)
-        return self.distribution().below(bound).to(self.depth.dtype)
+        return self.distribution().below(self._bound("than", than)).to(self.depth.dtype)
 
     def probability_between(self, near: float | Tensor, far: float | Tensor) -> Tensor:
         """Probability that the depth lies between ``near`` and ``far`` [m]; otherwise as :meth:`probability_nearer`.
@@ -258,10 +259,18 @@ class UncertaintyOutput:
         Raises:
             ValueError: as :meth:`probability_nearer`; or ``near`` is beyond ``far``.
         """
-        near, far = (torch.as_tensor(x, dtype=torch.float64, device=self.depth.device) for x in (near, far))
+        near, far = self._bound("near", near), self._bound("far", far)
         if bool((near > far).any()):
             raise ValueError("near must be at most far, got a larger one")
         return self.probability_nearer(far) - self.probability_nearer(near)
+
+    def _bound(self, name: str, value: float | Tensor) -> Tensor:
+        """The argument ``name``, depths [m] that broadcast with ``depth``, in float64 and that shape."""
+        number = as_tensor(name, value) if isinstance(value, Tensor | np.ndarray) else require_number(name, value)
+        try:
+            return torch.as_tensor(number, dtype=torch.float64, device=self.depth.device).expand(self.depth.shape)
+        except RuntimeError as error:
+            raise ValueError(f"{name} must broadcast with depth {tuple(self.depth.shape)}: {error}") from error
 
     @property
     def has_intervals(self) -> bool:

@@ -82,6 +82,8 @@ def rotation_deviation(R: Tensor) -> Tensor:
 
 def invert_rigid(T: Tensor) -> Tensor:
     """The inverse [..., 4, 4] of rigid transforms [..., 4, 4], or without their last row [..., 3, 4]."""
+    if not isinstance(T, Tensor) or T.shape[-2:] not in ((4, 4), (3, 4)):
+        raise ValueError(f"T must be a tensor [..., 4, 4] or [..., 3, 4], got {getattr(T, 'shape', type(T).__name__)}")
     R_inv = T[..., :3, :3].mT
     t_inv = -apply(R_inv, T[..., :3, 3])
     last = T[..., 3:, :] if T.shape[-2] == 4 else T.new_tensor([[0, 0, 0, 1]]).expand(*T.shape[:-2], 1, 4)

@@ -122,6 +122,8 @@ class GaussianMixture:
         return GaussianMixture(**{name: pad(value) for name, value in self.tensors().items()})
 
     def __post_init__(self) -> None:
+        if wrong := [name for name, value in vars(self).items() if not isinstance(value, Tensor)]:
+            raise TypeError(f"{wrong[0]} must be a torch.Tensor, got {type(getattr(self, wrong[0])).__name__}")
         if self.weight.dim() != 2:
             raise ValueError(f"weight must have shape (B, K), got {tuple(self.weight.shape)}")
         slots = b, k = self.weight.shape

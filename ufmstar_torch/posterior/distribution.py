@@ -79,8 +79,10 @@ class DepthDistribution:
 
     def _sum(self, depth: Tensor) -> Tensor:
         """S [B, ...]."""
-        z = (depth - self.mean.double()) / self.variance.double().sqrt()
-        return (self.weight.double() * ndtr(z)).sum(0)
+        total = torch.zeros_like(depth)
+        for weight, mean, variance in zip(self.weight, self.mean, self.variance, strict=True):
+            total = total + weight * ndtr((depth - mean) / variance.double().sqrt())
+        return total
 
     def _quantiles_at(self, like: Tensor) -> Tensor:
         """[3, B, 1, ...] to broadcast over the pixels of ``like`` [B, ...]."""

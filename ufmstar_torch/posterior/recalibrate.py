@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.frames.arguments import as_path
 from ufmstar_torch.runtime.checked import Checked, choice, flat
 from ufmstar_torch.runtime.stateful import plain
 
@@ -57,6 +58,8 @@ class Recalibration(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         v, r = self.variance, self.recalibrated
+        if not all(isinstance(knots, tuple | list) for knots in (v, r)):
+            raise ValueError("Recalibration.variance and recalibrated must be tuples of numbers")
         if not v or len(v) != len(r):
             raise ValueError(f"Recalibration needs knots, got {len(v)} and {len(r)} values")
         of_variance = self.covariate == VARIANCE
@@ -126,8 +129,9 @@ class Recalibration(Checked):
 
     def save(self, path: str | Path) -> None:
         """Write the map as JSON for :meth:`from_json`."""
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        Path(path).write_text(json.dumps(self.to_dict(), indent=2) + "\n", encoding="utf-8")
+        path = as_path("path", path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(self.to_dict(), indent=2) + "\n", encoding="utf-8")
 
     def _knots(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """The knots, at least two; a single knot gets a second one above it, with the same V' / V or h."""
