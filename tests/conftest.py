@@ -199,6 +199,15 @@ def scene(tmp_path_factory: pytest.TempPathFactory):
 
 
 @pytest.fixture(scope="session")
+def rendered_walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of an exported tour: 12 frames, 120x160, whose images show the motion. Tests must not change it."""
+    from ufmstar_torch.eval.sequences import open_sequence
+    from ufmstar_torch.eval.tour import export_tour
+
+    return export_tour(open_sequence("tour:41?frames=12&size=120x160"), tmp_path_factory.mktemp("rendered") / "walk")
+
+
+@pytest.fixture(scope="session")
 def finished_run(scene, tmp_path_factory: pytest.TempPathFactory):
     """A run of :func:`scene` with exact depth, the recording and its scene; the variance is replaced by (2 % of the
     depth)^2, and above the horizon by 1 m^2. Tests may export it."""

@@ -20,8 +20,7 @@ from ufmstar_torch.steps.fuse import append, fuse, view_weights
 pytestmark = pytest.mark.numerics
 
 
-@pytest.mark.parametrize("weighted", [False, True], ids=["w2", "weighted and given"])
-@pytest.mark.parametrize("baseline", [0.07, 0.5, None])
+@pytest.mark.parametrize(("weighted", "baseline"), [(False, 0.07), (True, 0.5), (False, None)])
 @given(seed=st.integers(0, 10**6))
 def test_agrees_with_the_oracle(backend, weighted, baseline, seed):
     """Several c that match one k are fused in increasing c. ``weighted``: by overlap, with distances instead of

@@ -30,7 +30,6 @@ from ufmstar_torch.eval.run import rerun_log
 from ufmstar_torch.eval.sequences import live as sources
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.live import LONGEST_LINE, PoseFile, growing_folder, json_lines, replay
-from ufmstar_torch.eval.tour import export_tour
 from ufmstar_torch.files.write import hold
 from ufmstar_torch.frames.prediction import NetworksInTurn
 
@@ -445,9 +444,11 @@ def test_a_viewer_shows_the_results_on_this_computer_alone(ufmstar, stand_in, mo
     assert depths[0].words[0].dtype == np.uint16
 
 
-def test_poses_that_contradict_the_images_of_a_recording_are_named(ufmstar, tmp_path, caplog):
-    path = export_tour(open_sequence("tour:41?frames=12&size=120x160"), tmp_path / "walk")
+def test_poses_that_contradict_the_images_of_a_recording_are_named(ufmstar, rendered_walk, caplog):
     for poses, named in (((), 0), (("--poses", "opengl"), 1)):
         caplog.clear()
-        assert ufmstar(path, "--plain", "--speed", "100", *poses)[0] == 0
-        assert sum(text.startswith(f"{path}: poses disagree with the images") for text in caplog.messages) == named
+        assert ufmstar(rendered_walk, "--plain", "--speed", "100", *poses)[0] == 0
+        assert (
+            sum(text.startswith(f"{rendered_walk}: poses disagree with the images") for text in caplog.messages)
+            == named
+        )

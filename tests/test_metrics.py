@@ -9,7 +9,7 @@ from collections import Counter
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from metric_maps import ALL, JUDGED, UNCERTAIN, figures, maps
 from scipy import stats
@@ -182,7 +182,6 @@ class TestMasks:
 
 
 class TestStreaming:
-    @settings(max_examples=20)
     @given(cut=st.integers(0, 12), seed=st.integers(0, 99))
     def test_parts_add_up_to_the_whole(self, cut: int, seed: int) -> None:
         d, v, g = maps(12, 9, seed=seed, scale=1.5)

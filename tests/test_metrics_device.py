@@ -66,11 +66,11 @@ def as_on_a_device(monkeypatch):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_form_of_devices_has_the_figures_of_the_cpu(kind, as_on_a_device, monkeypatch):
-    data, metric = frames(), kind(sync_on_compute=False)
+    data, metric = frames(), kind()
     as_on_a_device()
     metric = added(metric, data)
     monkeypatch.undo()
-    expected = added(kind(sync_on_compute=False), data)
+    expected = added(kind(), data)
     assert metric.compute().keys() == expected.compute().keys()
     for name, value in expected.compute().items():
         torch.testing.assert_close(metric.compute()[name], value, rtol=1e-9, atol=1e-9, equal_nan=True)
@@ -79,7 +79,7 @@ def test_the_form_of_devices_has_the_figures_of_the_cpu(kind, as_on_a_device, mo
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_update_needs_no_value(kind):
     """Tensors of the device "meta" have none, so that an update that reads one fails."""
-    metric = added(kind(sync_on_compute=False).to("meta"), tuple(x.to("meta") for x in frames()))
+    metric = added(kind().to("meta"), tuple(x.to("meta") for x in frames()))
     assert all(getattr(metric, name).device.type == "meta" for name, *_ in metric.STATES)
 
 
@@ -109,9 +109,9 @@ def test_coverage_and_width_of_normal_errors():
 @pytest.mark.gpu
 @pytest.mark.parametrize("kind", KINDS)
 def test_on_a_gpu_an_update_does_not_wait(kind):
-    expected = added(kind(sync_on_compute=False), frames()).compute()
-    data, metric = tuple(x.to("cuda") for x in frames()), kind(sync_on_compute=False).to("cuda")
-    added(kind(sync_on_compute=False).to("cuda"), data)  # compiles the kernels
+    expected = added(kind(), frames()).compute()
+    data, metric = tuple(x.to("cuda") for x in frames()), kind().to("cuda")
+    added(kind().to("cuda"), data)  # compiles the kernels
     torch.cuda.set_sync_debug_mode("error")
     try:
         metric = added(metric, data)

@@ -29,10 +29,6 @@ ON_CPU = pytest.mark.parametrize("backend", ["torch", "numba"], indirect=True)
 VARIANTS = {
     "default": (UfMStarConfig(segment=SPGF, unmeasured="paper", features=2, initial_capacity=8), {}),
     "overlap": (UfMStarConfig(segment=SPGF, unmeasured="paper", disagreement="overlap"), {"disagreement": "overlap"}),
-    "relative": (
-        UfMStarConfig(segment=SPGF, unmeasured="relative", unmeasured_relative=0.2),
-        {"unmeasured": "relative", "unmeasured_relative": 0.2},
-    ),
     "nan": (UfMStarConfig(segment=SPGF, unmeasured="nan"), {"unmeasured": "nan"}),
     "paper": (UfMStarConfig.paper(), {"neighbourhood": (2.0, 0.1, 0.5), "baseline": None}),
     "members": (UfMStarConfig(segment=SPGF, view_baseline=0.02), {

@@ -69,7 +69,7 @@ def choosing():
     from ufmstar_torch.frames.choose import choose
     print("chosen", choose([1.0, 2.0]))
 def metrics():
-    from ufmstar_torch.eval.metrics import mean_and_ci
+    from ufmstar_torch.eval.metrics import NLL
 def ranking():
     from ufmstar_torch.cli import main
     main(["rank", "a", "--depth", "self", "--out", "c"])
@@ -105,7 +105,7 @@ def test_what_is_missing_without_extras_is_named():
         ("train_module ufmstar_torch.train.train_module", "lightning", "train"),
         ("ufmstar run: failed: this command", r"\w+", "eval"),
         ("ufmstar rank: failed: this command", r"\w+", "eval"),
-        ("metrics ufmstar_torch.eval.metrics.mean_and_ci", "torchmetrics", "eval"),
+        ("metrics ufmstar_torch.eval.metrics.NLL", "torchmetrics", "eval"),
     ):
         (line,) = (line for line in output.splitlines() if line.startswith(who))
         assert re.search(rf"needs the package {package}: pip install 'ufmstar-torch\[{extra}\]'", line), line

@@ -24,6 +24,7 @@ import ufmstar_torch
 from ufmstar_torch import DepthPrediction, UfMStar, UncertainDepth
 from ufmstar_torch.kernels import compile_cpu
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, part
+from ufmstar_torch.kernels.cpu.vectors import vectors
 from ufmstar_torch.runtime.warm_up import warm_up
 
 COLD = """
@@ -259,6 +260,29 @@ def test_every_kernel_has_a_stamp_of_its_own():
     kernels = {one.py_func for m in modules for one in vars(m).values() if isinstance(one, Dispatcher)}
     assert len(kernels) > 30
     assert len({compile_cpu.code_stamp(one) for one in kernels}) == len(kernels)
+
+
+def test_a_stamp_covers_vector_instructions():
+    """Which a writer, and a function that it calls, make."""
+
+    def kernel_of(factor, extra):
+        def more(value):
+            return value * extra
+
+        @vectors
+        def write(code, values):
+            values.store(more(values.load(0) * factor), 0)
+
+        def kernel(values):
+            write(values)
+
+        return kernel
+
+    stamps = [
+        compile_cpu.code_stamp(kernel_of(*factors)) for factors in ((2.0, 3.0), (2.0, 3.0), (5.0, 3.0), (2.0, 5.0))
+    ]
+    assert stamps[0] == stamps[1]
+    assert len(set(stamps)) == 3
 
 
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from statistics import median
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,9 +22,8 @@ from ufmstar_torch.eval.engine.rows import RowResult, RowRunner
 from ufmstar_torch.eval.engine.stream import FrameResult
 from ufmstar_torch.eval.methods import method
 from ufmstar_torch.eval.methods.row import Row
-
-if TYPE_CHECKING:  # a sequence without ground truth does not need torchmetrics, whose import takes a while
-    from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
+from ufmstar_torch.eval.metrics.ranking import NLLByError
+from ufmstar_torch.eval.metrics.sequence import SequenceMetrics
 
 # Names of a run's figures: of UfM*, of the network alone, and of the posterior if there is one.
 UFM, ALONE, POSTERIOR = "ufm", "network_alone", "posterior"
@@ -47,8 +46,6 @@ def add_to(
     """Add a row's frame with ground truth to the metrics of a key, and of "key.moving" and "key.still" where it is
     known what moves (``RowResult.parts``); they are created with the arguments ``how`` of ``SequenceMetrics``. The
     other arguments, with depth and variance in ``maps``, are those of ``SequenceMetrics.update``."""
-    from ufmstar_torch.eval.metrics import SequenceMetrics
-
     assert row.truth is not None
     masks = {f"{key}.{part}": mask if valid is None else valid & mask for part, mask in row.parts.items()}
     for name, mask in ({key: valid} | masks).items():
@@ -113,8 +110,6 @@ class RowJudge:
         self._memory.append(self._runner.memory())
         if result.truth is None:
             return
-        from ufmstar_torch.eval.metrics import NLLByError
-
         self._judged += 1
         depth, variance, target = (
             torch.where(result.valid, result.depth, torch.nan), result.variance, torch.from_numpy(result.truth)
@@ -127,7 +122,7 @@ class RowJudge:
         if self._multiview and (confidence := result.prediction.confidence) is not None:
             self._samples.append(_samples(confidence[0], depth, variance, target))
         for other, name in self._references.items():
-            by_error = self._by_error.setdefault(f"{BY_ERROR}:{name}", NLLByError(sync_on_compute=False))
+            by_error = self._by_error.setdefault(f"{BY_ERROR}:{name}", NLLByError())
             by_error.update(depth, variance, target, rows[other].confident)
 
     def record(self) -> Record:

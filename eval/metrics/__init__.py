@@ -1,6 +1,6 @@
 """Streaming metrics (section "Metrics for Uncertainty"): sums only, so that memory does not grow with frames.
 
-The names below load the base of torchmetrics when they are first used, not when this package is imported.
+The single metrics below are ``torchmetrics.Metric`` classes (``synchronised``), ``SequenceMetrics`` is not.
 """
 
 from __future__ import annotations
@@ -22,4 +22,6 @@ if TYPE_CHECKING:
     from ufmstar_torch.eval.metrics.sequence import SequenceMetrics as SequenceMetrics
     from ufmstar_torch.eval.metrics.sequence import mean_and_ci as mean_and_ci
 else:
-    __getattr__, __dir__ = lazy_names(__name__)
+    _SINGLE = ("DepthAccuracy", "ECEDelta", "ECEQuantile", "Coverage", "NLL", "EntropyHistogram", "NLLByError")
+    _SINGLE += ("Sparsification", "SpearmanCorrelation")
+    __getattr__, __dir__ = lazy_names(__name__, **dict.fromkeys(_SINGLE, "ufmstar_torch.eval.metrics.synchronised"))

@@ -11,8 +11,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
-from torch import Tensor
-from torchmetrics import Metric
+from torch import Tensor, nn
 
 COUNT, SUM = torch.int64, torch.float64  # kinds of states
 TOLERANCE = 0.25  # [1] of delta1, in both definitions
@@ -168,14 +167,13 @@ class Pixels:
         return self.depths.where((v >= 0) & (v < torch.inf))
 
 
-class SumMetric(Metric):
+class SumMetric(nn.Module):
     """A metric whose states are sums of fixed size, over the pixels with ground truth and a valid prediction.
 
     ``compute()`` returns the figures of all updates as float64 tensors by name: scalars and curves [B]. States reduce
-    by addition: across processes (torchmetrics synchronises at ``compute``; pass ``sync_on_compute=False`` if every
-    process has another sequence) and through ``merge_state``. Counts are int64 and exact; float64 sums depend on the
-    order of the updates in the last bits only. ``update`` computes on the maps' device, without a transfer if the
-    metric is on it too (``.to(device)``). MPS has no float64: keep the maps on the CPU there.
+    by addition (``merge_state``). Counts are int64 and exact; float64 sums depend on the order of the updates in the
+    last bits only. ``update`` computes on the maps' device, without a transfer if the metric is on it too
+    (``.to(device)``). MPS has no float64: keep the maps on the CPU there.
 
     Attributes:
         OF_VARIANCE: the name, in messages, of a metric that needs a variance; "" if it needs depth alone.
@@ -190,8 +188,6 @@ class SumMetric(Metric):
     STATES: tuple[tuple[Any, ...], ...] = ()
     CONSTANTS: Mapping[str, Tensor] = MappingProxyType({})
     settings: Mapping[str, Any] = MappingProxyType({})
-    is_differentiable = False
-    full_state_update = False
 
     if TYPE_CHECKING:
 
@@ -199,18 +195,15 @@ class SumMetric(Metric):
             """The type of the states, which are not in ``__dict__``."""
 
     def __init__(self, **kwargs: Any) -> None:
-        # torchmetrics keeps a computed value across merge_state and load_state_dict, where it is stale.
-        kwargs.setdefault("compute_with_cache", False)
         super().__init__(**kwargs)
         for name, kind, *shape in self.STATES:
-            self.add_state(name, torch.zeros(shape, dtype=kind), dist_reduce_fx="sum", persistent=True)
+            self._hold(name, torch.zeros(shape, dtype=kind))
         for name, value in self.CONSTANTS.items():
             self.register_buffer(name, value.clone(), persistent=False)
 
-    @property
-    def update_called(self) -> bool:
-        """True, because loaded or merged sums are valid too, and figures without a frame are NaN."""
-        return True
+    def _hold(self, name: str, zeros: Tensor) -> None:
+        """Add a state."""
+        self.register_buffer(name, zeros)
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
         """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use. Raises ValueError: shapes or types
@@ -218,12 +211,15 @@ class SumMetric(Metric):
         self.add(flat_pixels(depth, variance, target, valid))
 
     def add(self, pixels: Pixels) -> None:
-        """Add pixels. States are replaced instead of changed in place, because others may hold references to them.
-        Raises ValueError: a needed variance is missing."""
+        """Add pixels. Raises ValueError: a needed variance is missing."""
         if self.OF_VARIANCE and len(pixels.variance) != len(pixels.depth):
             judged = f"{self.OF_VARIANCE} judges the predicted distribution N(depth, variance)"
             raise ValueError(f"variance must be given: {judged}")
-        for name, added in self.sums(pixels).items():
+        self._add(self.sums(pixels))
+
+    def _add(self, sums: Mapping[str, Tensor]) -> None:
+        """Add to the states. They are replaced instead of changed in place, because others may hold references."""
+        for name, added in sums.items():
             state = getattr(self, name)
             setattr(self, name, state + added.to(state.device, state.dtype))
 
@@ -232,16 +228,23 @@ class SumMetric(Metric):
         """The pixels' contribution to each state, by name. On a GPU it must not wait for a value, so it selects pixels
         by ``Selection``."""
 
-    def merge_state(self, incoming_state: dict[str, Any] | Metric) -> None:
+    @abstractmethod
+    def compute(self) -> Mapping[str, Tensor]:
+        """The figures by name."""
+
+    def reset(self) -> None:
+        """Forget all frames."""
+        for name, *_ in self.STATES:
+            setattr(self, name, torch.zeros_like(getattr(self, name)))
+
+    def merge_state(self, incoming_state: SumMetric) -> None:
         """Add another metric's sums to this one's. Raises ValueError: the other metric has other settings."""
-        if isinstance(incoming_state, SumMetric) and incoming_state.settings != self.settings:
+        if incoming_state.settings != self.settings:
             raise ValueError(
                 f"incoming_state must come from a metric with the settings {self.settings}, "
                 f"got {incoming_state.settings}"
             )
-        super().merge_state(incoming_state)
-        if isinstance(incoming_state, Metric):
-            self._update_count += incoming_state._update_count
+        self._add({name: getattr(incoming_state, name) for name, *_ in self.STATES})
 
 
 def flat_pixels(

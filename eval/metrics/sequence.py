@@ -57,9 +57,9 @@ class SequenceMetrics(nn.Module):
             kinds += [NLL, ECEDelta, ECEQuantile, EntropyHistogram, Sparsification, SpearmanCorrelation, Mixture]
             kinds += [IntervalCoverage, *([GatedPixels] if gates else ())]
         finer = _AUTHORS if bins == AUTHORS else {}
-        made = {kind.__name__: kind(**finer.get(kind, {}), sync_on_compute=False) for kind in kinds}
+        made = {kind.__name__: kind(**finer.get(kind, {})) for kind in kinds}
         usable = {name: kind for name, kind in plugins.items() if with_variance or not kind.OF_VARIANCE}
-        made |= {f"{_PLUGIN_PREFIX}{name}": kind(sync_on_compute=False) for name, kind in usable.items()}
+        made |= {f"{_PLUGIN_PREFIX}{name}": kind() for name, kind in usable.items()}
         self.metrics = nn.ModuleDict(made)
 
     def update(

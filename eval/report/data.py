@@ -212,7 +212,8 @@ def _added(total: Sums, sums: Sums) -> Sums:
 
 def _curves(total: Sums) -> Curves:
     """Curves of summed states."""
-    from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
+    from ufmstar_torch.eval.metrics.ranking import NLLByError
+    from ufmstar_torch.eval.metrics.sequence import SequenceMetrics
 
     states = total[METRICS]
     judged = any(key.startswith("metrics.NLL.") for key in states)

@@ -15,7 +15,7 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,6 +27,7 @@ from ufmstar_torch.eval.engine.files import to_json, write_bytes_atomic
 from ufmstar_torch.eval.engine.judge import UFM, judge_run
 from ufmstar_torch.eval.engine.rows import RowResult
 from ufmstar_torch.eval.engine.stream import FrameResult
+from ufmstar_torch.eval.metrics.sequence import SequenceMetrics
 from ufmstar_torch.eval.run.folder import FolderKind
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.writers import (
@@ -43,9 +44,6 @@ from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.own_output import RECORDS
 from ufmstar_torch.eval.sequences.plugins import load_plugins
 from ufmstar_torch.frames.output import EVERY_FRAME
-
-if TYPE_CHECKING:  # a sequence without ground truth does not need torchmetrics, whose import takes a while
-    from ufmstar_torch.eval.metrics import SequenceMetrics
 
 CACHE = "cache"
 NEAR_ZERO = 1e-3  # [m] no depth network is more accurate than this sigma

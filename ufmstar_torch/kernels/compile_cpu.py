@@ -200,7 +200,12 @@ def code_stamp(function: Callable[..., Any]) -> str:
             add((name, value.dtype.str, value.shape, value.tobytes()))
         elif isinstance(value, type):
             add((name, value.__qualname__, getattr(value, "_fields", None)))
-        elif isinstance(value, ModuleType | BuiltinFunctionType | np.ufunc | Intrinsic):
+        elif isinstance(value, Intrinsic):
+            add((name, Path(inspect.getfile(value._defn)).read_bytes()))  # what it is made with: ``cpu.vectors``
+            for cell in value._defn.__closure__ or ():
+                if isinstance(cell.cell_contents, FunctionType):  # which writes its instructions
+                    visit(name, cell.cell_contents)
+        elif isinstance(value, ModuleType | BuiltinFunctionType | np.ufunc):
             add((name, getattr(value, "__name__", "")))
         elif isinstance(value, int | float | str | tuple | np.generic | None):
             add((name, value))

@@ -24,7 +24,7 @@ from ufmstar_torch.frames.frame import FrameInput
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, part
 from ufmstar_torch.kernels.cpu.calls import array, each
 from ufmstar_torch.kernels.cpu.regress import Seen, View
-from ufmstar_torch.kernels.cpu.regress_cull import FIELDS, cull
+from ufmstar_torch.kernels.cpu.regress_cull import FIELDS, cull, limit
 from ufmstar_torch.kernels.cpu.regress_vectors import TERMS, add_shares
 from ufmstar_torch.kernels.cpu.rigid import padded
 from ufmstar_torch.kernels.cpu.sample import folded
@@ -215,7 +215,7 @@ def _distribute(index, predicted, chosen, rows, K, width, view, sums):
         points[i, 0], points[i, 1], points[i, 2] = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z
     start, order = grid(pixel, chosen, _PER_CELL)[4:]
     capacity = packed.shape[1]
-    retained, work = empty(visible.size, np.int64), empty(8 + capacity, packed.dtype)
+    retained, work = empty(visible.size, np.int64), empty(9 + capacity, packed.dtype)
     near, added = empty((FIELDS, capacity), np.float64), empty((3, capacity), np.float64)
     density = empty(capacity, np.float64)
     point, row = empty(3, np.float64), empty(4, np.float64)
@@ -224,7 +224,7 @@ def _distribute(index, predicted, chosen, rows, K, width, view, sums):
         if start[cell] == start[cell + 1]:
             continue
         box = _box(points, order, start[cell], start[cell + 1])
-        count = cull(packed, visible.size, settings.among, box, settings, work, retained)
+        count = cull(packed, visible.size, limit(settings.epsilon, settings.among), box, settings, work, retained)
         n = padded(count)
         for i in range(count):
             for field in range(FIELDS):

@@ -22,20 +22,23 @@ from ufmstar_torch.kernels.cpu.regress_tiles import exact, exact_at
 from ufmstar_torch.steps.regress import HALF
 
 Reals = NDArray[np.floating[Any]]
-# Share of the denominator that culling may leave out: about the rounding of a sum in the dtype, so that culling is no
+# Share of the sums that culling may leave out: about the rounding of a sum in the dtype, so that culling is no
 # coarser than the arithmetic itself.
 EPSILON = {torch.float32: 1e-6, torch.float64: 1e-14}
+# The same for maps without features: sigma, a square root, is off by half of it at most.
+ERROR = {torch.float32: 1e-2, torch.float64: 1e-14}
 _DTYPES: dict[Any, torch.dtype] = {np.dtype(np.float32): torch.float32, np.dtype(np.float64): torch.float64}
 
 
 def views_of(
     seen: Sequence[Seen], depth: Reals, intrinsics: NDArray[np.float64], config: UfMStarConfig, *others: torch.dtype
 ) -> list[View]:
-    """The components in view of each stream, for the exact sum. The error is that of the most precise dtype among the
-    depth's and the ``others``."""
-    epsilon = min(EPSILON[dtype] for dtype in (_DTYPES[depth.dtype], *others))
+    """The components in view of each stream, for the exact sum. The error for anchors is that of the most precise dtype
+    among the depth's and the ``others``."""
+    dtype = _DTYPES[depth.dtype]
+    errors = min(EPSILON[one] for one in (dtype, *others)), (EPSILON if config.features else ERROR)[dtype]
     prior = config.prior_weight, config.prior_mean
-    return [in_view(one, depth[b], intrinsics[b], prior, epsilon) for b, one in enumerate(seen)]
+    return [in_view(one, depth[b], intrinsics[b], prior, *errors) for b, one in enumerate(seen)]
 
 
 def regress_maps(

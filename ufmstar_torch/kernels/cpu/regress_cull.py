@@ -7,16 +7,18 @@ A component k adds w_k(x) = pi_k N(x; mu_k, Sigma_k) to the denominator D(x) = p
    so that no bit changes.
 2. Tile of 8 x 8 pixels: the same, for the components that the block keeps.
 
-Each level leaves out the components with h_k <= (eps / 2n) max(max_j l_j, pi_0 / 1000), with n components at that
-level. max_j l_j and pi_0 are parts of the denominator, so that the components left out add up to
-d(x) <= eps max(max_j w_j(x), pi_0 / 1000) <= eps D(x). The error is d/D times the difference of two averages of m_k
-and mu_0:
+A component adds h_k at most to the denominator and h_k m_k to the numerator N(x) = pi_0 mu_0 + sum_k w_k(x) m_k. Each
+level, with n components, leaves out those with
 
-    |m_hat - m_hat_culled| <= eps max(m_k, mu_0),
+    h_k <= (eps / 2n) d  and  h_k m_k <= (eps / 2n) max(max_j l_j m_j, pi_0 mu_0, m_0 d),  d = max(max_j l_j, pi_0).
 
-and eps / 1000 max(m_k, mu_0) at a point that no component explains (every w_j <= pi_0 / 1000). The factor 1000 keeps
-the *relative* error small there, where m_hat itself is small. Rounding of the sums adds to it; the bounds contain their
-own rounding. tests/test_regress.py checks the bound.
+d is a part of D, and the other maxima are parts of N or, with m_0 = 1e-12 m^2, of m_0 D. All components left out add up
+to at most eps D and eps max(N, m_0 D):
+
+    |m_hat - m_hat_culled| <= eps/(1 - eps) max(m_hat, m_0),
+
+and an average of other features is off by eps/(1 - eps) times the largest difference of two of them. Rounding of the
+sums adds to it; the bounds contain their own rounding. tests/test_regress.py checks the bound.
 """
 
 from __future__ import annotations
@@ -32,8 +34,11 @@ from ufmstar_torch.kernels.cpu.regress_vectors import TERMS, bounds
 from ufmstar_torch.kernels.cpu.rigid import COVARIANCE, WEIGHT, padded
 
 HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
-_PRIOR = 1e-3  # share of the prior in a threshold
 FIELDS = 10  # of a component: mean (3), whitening (6), log2 of the peak
+ROWS = FIELDS + 1  # and, where components are culled, log2 of m
+_BOX = 9  # numbers of a box and its bounds
+_LEAST = 1e-12  # m_0 [m^2]
+_LOG2_LEAST = math.log2(_LEAST)
 _LOG2_E = math.log2(math.e)
 _SCALE = math.sqrt(0.5 * _LOG2_E)
 # Rows of :func:`whiten`, the last of which is the peak.
@@ -45,15 +50,18 @@ class Settings(NamedTuple):
 
     Attributes:
         prior_weight, prior_mean: of the prior.
-        epsilon: share of the denominator that culling may leave out.
-        least: log2 of the least threshold.
+        epsilon: of the culling for the image and for anchors.
+        error: of the culling for maps, at least epsilon.
+        least, least_product: log2 of the prior's parts of the denominator and of the numerator.
         among: number of all components, of which a view has some.
     """
 
     prior_weight: float
     prior_mean: float
     epsilon: float
+    error: float
     least: float
+    least_product: float
     among: int
 
 
@@ -85,7 +93,7 @@ class View(NamedTuple):
 
 
 def in_view(
-    seen: Seen, depth: NDArray[np.floating], K: NDArray[np.float64], prior: tuple[float, float], epsilon: float
+    seen: Seen, depth: NDArray[np.floating], K: NDArray[np.float64], prior: tuple[float, float], *epsilon: float
 ) -> View:
     """The components that can matter in an image.
 
@@ -94,12 +102,13 @@ def in_view(
         depth: [H, W], not positive where invalid.
         K: [3, 3].
         prior: its weight and mean.
-        epsilon: share of the denominator that culling may leave out.
+        epsilon: of the culling for the image and for anchors, and of that for maps.
     """
     n, dtype = len(seen.disagreement), depth.dtype
-    slot, fields, packed = np.empty(n, np.int64), np.empty((n, FIELDS)), np.empty((FIELDS, padded(n)), dtype)
+    slot, fields, packed = np.empty(n, np.int64), np.empty((n, FIELDS)), np.empty((ROWS, padded(n)), dtype)
     terms = np.empty((n, TERMS), dtype)
-    settings = Settings(*prior, epsilon, math.log2(_PRIOR * prior[0]), n)
+    least = math.log2(prior[0]), math.log2(prior[0] * max(prior[1], _LEAST))
+    settings = Settings(*prior, *epsilon, *least, n)
     count = _in_view(*seen, K, depth, settings, slot, fields, packed, terms)
     return View(slot[:count], fields[:count], packed, terms[:count], settings)
 
@@ -117,18 +126,18 @@ def _in_view(components, m, features, K, depth, settings, index, fields, packed,
         for i in range(6):
             whitened[i, k] *= _SCALE
         whitened[PEAK, k] = (math.log(whitened[PEAK, k]) - HALF_LOG_TWO_PI_CUBED) * _LOG2_E
-    _pack(components, whitened, every, n, packed)
+    _pack(components, whitened, m, every, n, packed)
     z = 0.0
     for v in range(height):
         z = max(z, np.float64(_largest(depth[v])))
     left, top = (0 - K[0, 2]) / K[0, 0] * z, (0 - K[1, 2]) / K[1, 1] * z
     right, bottom = (width - 1 - K[0, 2]) / K[0, 0] * z, (height - 1 - K[1, 2]) / K[1, 1] * z
     box = min(left, 0.0), min(top, 0.0), 0.0, max(right, 0.0), max(bottom, 0.0), z
-    work = empty(8 + packed.shape[1], depth.dtype)
+    work = empty(_BOX + packed.shape[1], depth.dtype)
     # Blocks divide their threshold by n. A larger divisor makes this one lower in spite of rounding of the boxes.
-    chosen = cull(packed, n, n + n // 64 + 1, box, settings, work, index)
+    chosen = cull(packed, n, limit(settings.epsilon, n + n // 64 + 1), box, settings, work, index)
     _terms(components, whitened, index, chosen, m, features, fields, constants)
-    _pack(components, whitened, index, chosen, packed)
+    _pack(components, whitened, m, index, chosen, packed)
     return chosen
 
 
@@ -142,10 +151,10 @@ def _largest(values):
 
 
 @leaf
-def _pack(components, whitened, index, n, packed):
+def _pack(components, whitened, m, index, n, packed):
     """The fields of the first n chosen components by field, padded with components of density 0.
 
-    The fields are mean, whitening and log2 of the peak: 2^(peak - |whitening (x - mean)|^2) is the density.
+    The fields are mean, whitening, log2 of the peak and of m: 2^(peak - |whitening (x - mean)|^2) is the density.
     """
     for i in range(3):
         for k in range(n):
@@ -153,6 +162,8 @@ def _pack(components, whitened, index, n, packed):
     for i in range(3, FIELDS):
         for k in range(n):
             packed[i, k] = whitened[i - 3, index[k]]
+    for k in range(n):
+        packed[FIELDS, k] = math.log2(max(m[index[k]], _LEAST))
     pad(packed, n)
 
 
@@ -171,16 +182,10 @@ def _terms(components, whitened, index, count, m, features, fields, constants):
 
 
 @leaf
-def _limit(epsilon, count):
-    """log2 of the share of a lower bound that one component may add at one level, with a margin for rounding."""
-    return math.log2(epsilon / (2 * max(count, 1))) - 0.01
-
-
-@leaf
 def pad(packed, n):
     """Fill the fields after n components up to the padded number with components of density 0."""
     for j in range(n, padded(n)):
-        for i in range(FIELDS - 1):
+        for i in range(ROWS):
             packed[i, j] = 0
         packed[FIELDS - 1, j] = -1e30
 
@@ -205,23 +210,28 @@ def whiten(components, n, whitened):
 
 
 @leaf
-def cull(packed, n, level, box, settings, work, retained):
+def limit(epsilon, count):
+    """log2 of the share of a sum that one of ``count`` components may add at one level, with a margin for rounding."""
+    return math.log2(epsilon / (2 * max(count, 1))) - 0.01
+
+
+@leaf
+def cull(packed, n, share, box, settings, work, retained):
     """Write those of the n packed components that matter in the box (low, high) to ``retained``; return their number.
 
-    ``level`` is the number of components of the level, which divides the threshold. ``work`` is scratch for 8 numbers
-    and one for each component.
+    ``share`` is the level's :func:`limit`. ``work`` is scratch for 9 numbers and one for each component.
     """
     real = packed.dtype.type
     slack = 16 * (2.0**-23 if packed.itemsize == 4 else 2.0**-52)
     for i in range(3):
         centre, half = 0.5 * (box[i] + box[3 + i]), 0.5 * (box[3 + i] - box[i])
         work[i], work[3 + i] = centre, half + slack * (half + abs(centre))
-    work[6], work[7] = slack, settings.least
-    upper = work[8:]
+    work[6], work[7], work[8] = slack, settings.least, settings.least_product
+    upper = work[_BOX:]
     bounds(packed, packed.shape[1], padded(n), work, upper)
-    threshold = work[7] + real(_limit(settings.epsilon, level))
+    density, product = work[7] + real(share), max(work[8], work[7] + real(_LOG2_LEAST)) + real(share)
     count = 0
     for j in range(n):
         retained[count] = j
-        count += upper[j] > threshold
+        count += (upper[j] > density) | (upper[j] + packed[FIELDS, j] > product)
     return count

@@ -18,8 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.kernels.compile_cpu import contracted, empty, kernel, leaf, part
-from ufmstar_torch.kernels.cpu.regress_cull import FIELDS, cull, pad
-from ufmstar_torch.kernels.cpu.regress_vectors import PIXELS, TILE, TINY, mix, mix_more, mix_three, place_points
+from ufmstar_torch.kernels.cpu.regress_cull import ROWS, cull, limit, pad
+from ufmstar_torch.kernels.cpu.regress_vectors import (
+    PIXELS,
+    TILE,
+    TINY,
+    mix,
+    mix_more,
+    mix_three,
+    place_points,
+    read_tile,
+    write_tile,
+)
 from ufmstar_torch.kernels.cpu.vectors import LANES
 
 _SIDE = 4  # tiles of a block
@@ -54,8 +64,8 @@ class Lists(NamedTuple):
     """Scratch of the components that a block and a tile keep.
 
     Attributes:
-        near: [10, n] fields of the block's.
-        work: [n + 8] of :func:`cull`.
+        near: [11, n] fields of the block's.
+        work: [n + 9] of :func:`cull`.
         in_block, in_tile: [n] indices.
     """
 
@@ -120,7 +130,7 @@ def _scratch(view, features, shift):
         empty((2, PIXELS), dtype), empty(PIXELS, dtype), empty((_TILES, 3 * PIXELS), dtype),
         empty((_TILES, 9), np.float64), empty(_TILES, np.bool_), empty((_TILES, PIXELS), dtype), empty(10, dtype),
     )  # fmt: skip
-    lists = Lists(empty((FIELDS, n), dtype), empty(n + 8, dtype), empty(n, np.int64), empty(n, np.int64))
+    lists = Lists(empty((ROWS, n), dtype), empty(n + 9, dtype), empty(n, np.int64), empty(n, np.int64))
     start, prior = empty(6, dtype), view.settings.prior_weight
     start[_EVIDENCE], start[_TOTAL], start[_LAST], start[3] = prior, prior * view.settings.prior_mean, 0, TINY
     start[4], start[5] = shift[1], shift[0]
@@ -140,7 +150,7 @@ def _mixed(features):
 @leaf
 def _blocks(depth, K, view, features, tiles, lists, sums, out, out_f, first, shares):
     """Regress every ``shares``-th block of an image, from block ``first`` on."""
-    seen, (near, work, in_block, in_tile), packed = tiles.seen, lists, view.packed
+    seen, (near, work, in_block, in_tile), packed, settings = tiles.seen, lists, view.packed, view.settings
     rows, columns = (depth.shape[0] + _BLOCK - 1) // _BLOCK, (depth.shape[1] + _BLOCK - 1) // _BLOCK
     half = 0.5 * (TILE - 1)
     for block in range(first, rows * columns, shares):
@@ -156,10 +166,10 @@ def _blocks(depth, K, view, features, tiles, lists, sums, out, out_f, first, sha
         if not any_seen:
             _clear(v0, u0, _BLOCK, out, out_f)
             continue
-        count = cull(
-            packed, view.slot.size, view.settings.among, _union(tiles.boxes, seen), view.settings, work, in_block
-        )
-        for i in range(FIELDS):
+        share, box = limit(settings.error, settings.among), _union(tiles.boxes, seen)
+        count = cull(packed, view.slot.size, share, box, settings, work, in_block)
+        share = limit(settings.error, count)
+        for i in range(ROWS):
             for j in range(count):
                 near[i, j] = packed[i, in_block[j]]
         pad(near, count)
@@ -168,7 +178,7 @@ def _blocks(depth, K, view, features, tiles, lists, sums, out, out_f, first, sha
             if not seen[tile]:
                 _clear(v, u, TILE, out, out_f)
                 continue
-            chosen = cull(near, count, count, _box(tiles.boxes, tile), view.settings, work, in_tile)
+            chosen = cull(near, count, share, _box(tiles.boxes, tile), settings, work, in_tile)
             for j in range(chosen):
                 in_tile[j] = in_block[in_tile[j]]
             _average(PIXELS, tiles, tile, in_tile, chosen, view, features, sums)
@@ -221,7 +231,8 @@ def _at_pixels(depth, K, pixels, begin, order, view, features, tiles, lists, sum
                         out_f[g, order[low + i]] = np.nan
                 continue
             box, settings = _box(tiles.boxes, 0), view.settings
-            chosen = cull(view.packed, view.slot.size, settings.among, box, settings, lists.work, retained)
+            share = limit(settings.error, settings.among)
+            chosen = cull(view.packed, view.slot.size, share, box, settings, lists.work, retained)
             filled = (count + LANES - 1) // LANES * LANES
             _average(filled, tiles, 0, retained, chosen, view, features, sums)
             for i in range(count):
@@ -236,9 +247,7 @@ def _at_pixels(depth, K, pixels, begin, order, view, features, tiles, lists, sum
 def _depths(depth, v0, u0, z):
     """Depths [64] of a tile, 0 beyond the image."""
     if v0 + TILE <= depth.shape[0] and u0 + TILE <= depth.shape[1]:
-        for v in range(TILE):
-            for u in range(TILE):
-                z[v * TILE + u] = depth[v0 + v, u0 + u]
+        read_tile(depth, v0 * depth.shape[1] + u0, depth.shape[1], z)
     else:
         for i in range(PIXELS):
             v, u = v0 + i // TILE, u0 + i % TILE
@@ -334,9 +343,7 @@ def _clear(v0, u0, side, out, out_f):
 def _copy(values, v0, u0, out):
     """Copy the values [64] of a tile to a map."""
     if v0 + TILE <= out.shape[0] and u0 + TILE <= out.shape[1]:
-        for v in range(TILE):
-            for u in range(TILE):
-                out[v0 + v, u0 + u] = values[v * TILE + u]
+        write_tile(values, out, v0 * out.shape[1] + u0, out.shape[1])
     else:
         for v in range(v0, min(v0 + TILE, out.shape[0])):
             for u in range(u0, min(u0 + TILE, out.shape[1])):

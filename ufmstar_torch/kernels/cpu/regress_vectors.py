@@ -16,6 +16,27 @@ TERMS = 11  # of a component: whitening (6), log2 of the peak, m, the last three
 TINY = 2.0**-100
 
 
+def _rows(code, at, stride):
+    """For each vector of a tile: its first pixel, and where its rows begin in an image whose tile begins at ``at``."""
+    for pixel in range(0, PIXELS, code.lanes):
+        rows = range(pixel // TILE, (pixel + code.lanes) // TILE)
+        yield pixel, [code.plus(at, code.times(stride, row)) for row in rows]
+
+
+@vectors
+def read_tile(code, image, at, stride, values):
+    """Copy the pixels of a tile, which begins at the index ``at`` of an image of width ``stride``, to values [64]."""
+    for pixel, starts in _rows(code, at, stride):
+        values.store(image.load_rows(starts, TILE), pixel)
+
+
+@vectors
+def write_tile(code, values, image, at, stride):
+    """Inverse of :func:`read_tile`."""
+    for pixel, starts in _rows(code, at, stride):
+        image.store_rows(values.load(pixel), starts, TILE)
+
+
 @vectors
 def place_points(code, z, grid, ray, points, hole, box):
     """Write the points of a tile from its origin, the middle of the tile at the least depth.
@@ -50,21 +71,22 @@ def place_points(code, z, grid, ray, points, hole, box):
 
 @vectors
 def bounds(code, packed, stride, n, box, upper):
-    """log2 of upper bounds of densities in a box of points, and of the greatest lower bound.
+    """log2 of upper bounds of densities in a box of points, and of the greatest lower bounds of a density and of a
+    density times m.
 
     Infinity and NaN, from a far outlier, retain a component and raise no lower bound.
 
     Args:
-        packed: [10, stride] the components' fields: mean, whitening, log2 of the peak.
+        packed: [11, stride] the components' fields: mean, whitening, log2 of the peak and of m.
         n: number of components, a multiple of a vector's length.
-        box: [8] its centre, half its sides, the relative rounding error of a distance, which widens the box, and the
-            least lower bound, which the greatest lower bound replaces.
+        box: [9] its centre, half its sides, the relative rounding error of a distance, which widens the box, and the
+            least lower bounds, which the greatest lower bounds replace.
         upper: [n].
     """
     centre, half = [box.one(i) for i in range(3)], [box.one(3 + i) for i in range(3)]
-    slack, greatest = box.one(6), code.variable(box.one(7))
+    slack, greatest, greatest_product = box.one(6), code.variable(box.one(7)), code.variable(box.one(8))
     with code.loop(n, code.lanes) as j:
-        fields = [packed.load(code.plus(j, code.times(stride, i))) for i in range(10)]
+        fields = [packed.load(code.plus(j, code.times(stride, i))) for i in range(11)]
         mean, (a, b, c, d, e, f), peak = fields[:3], fields[3:9], fields[9]
         x, y, z = (centre[i] - mean[i] for i in range(3))
         u, v, w = (half[i] + slack * mean[i].size() for i in range(3))
@@ -75,8 +97,10 @@ def bounds(code, packed, stride, n, box, upper):
             far, near = m + r, (m - r).at_least(0.0)
             low, high = low - far * far, high - near * near
         greatest.value = low.at_least(greatest.value)
+        greatest_product.value = (low + fields[10]).at_least(greatest_product.value)
         upper.store(high, j)
     box.put(greatest.value.everywhere(Lanes.at_least), 7)
+    box.put(greatest_product.value.everywhere(Lanes.at_least), 8)
 
 
 @vectors

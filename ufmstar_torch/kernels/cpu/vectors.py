@@ -7,7 +7,7 @@ after the other. Here expressions work on vectors of 64 bytes. A processor with 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -129,6 +129,24 @@ class Memory:
         """Write a vector from ``index + offset`` on."""
         at = self._builder.bitcast(self._at(index, offset), self._vector.as_pointer())
         self._builder.store(value.value, at).align = self._size
+
+    def _row(self, index: Any, width: int) -> Any:
+        return self._builder.bitcast(self._at(index, 0), ir.VectorType(self._vector.element, width).as_pointer())
+
+    def load_rows(self, starts: Sequence[Any], width: int) -> Lanes:
+        """The vector of one or two rows of ``width`` numbers, which begin at ``starts``."""
+        rows = [self._builder.load(self._row(start, width)) for start in starts]
+        for row in rows:
+            row.align = self._size
+        order = ir.Constant(ir.VectorType(ir.IntType(32), self._vector.count), list(range(self._vector.count)))
+        return self._lanes(self._builder.shuffle_vector(rows[0], rows[-1], order))
+
+    def store_rows(self, value: Lanes, starts: Sequence[Any], width: int) -> None:
+        """Write a vector as one or two rows of ``width`` numbers, which begin at ``starts``."""
+        for i, start in enumerate(starts):
+            order = ir.Constant(ir.VectorType(ir.IntType(32), width), list(range(i * width, (i + 1) * width)))
+            row = self._builder.shuffle_vector(value.value, value.value, order)
+            self._builder.store(row, self._row(start, width)).align = self._size
 
     def one(self, index: Any, offset: int = 0) -> Lanes:
         """A single number in every lane of a vector."""
