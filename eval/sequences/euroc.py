@@ -18,7 +18,7 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_image
-from ufmstar_torch.eval.sequences.frame import FrameSequence, Size
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped
 from ufmstar_torch.eval.sequences.images import first_image_size
 from ufmstar_torch.eval.sequences.lens import FISHEYE, Lens
 from ufmstar_torch.eval.sequences.options import Options
@@ -44,7 +44,8 @@ def read(path: Path, options: Options) -> FrameSequence:
     a malformed file (named), no ground truth and no ``trajectory``, or no usable frame."""
     folder = _camera_folder(path)
     assert folder is not None
-    images, frames = [], []
+    images: list[Path] = []
+    frames: list[Entry | Skipped] = []
     for words, where in csv_rows(folder / "data.csv"):
         if not images and is_header(words):
             continue

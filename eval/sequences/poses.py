@@ -254,7 +254,8 @@ def _require_consistent(T_world_cam: np.ndarray, first: np.ndarray, same: np.nda
 def _numbers(path: str | Path, words_of: Callable[[str, str], list[str]]) -> tuple[list[list[float]], list[str]]:
     """The numbers of each non-empty line, whose words ``words_of`` its text and FILE:LINE returns, and its
     FILE:LINE. Lines of words before the first number are headers."""
-    rows, lines = [], []
+    rows: list[list[float]] = []
+    lines: list[str] = []
     for line, text in numbered_lines(path):
         where = f"{path}:{line}"
         tokens = words_of(text, where)
