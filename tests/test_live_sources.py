@@ -41,7 +41,7 @@ POSE = [1, 2, 3, 0, 0, 0, 1]
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
-    return write_members(tmp_path_factory.mktemp("weights") / "three.safetensors")
+    return write_members(tmp_path_factory.mktemp("weights") / "one.safetensors", 1)
 
 
 @pytest.fixture
@@ -269,7 +269,7 @@ def test_a_recording_live(ufmstar, tmp_path):
     assert (code, sorted((tmp_path / "out").iterdir())) == (2, before)  # refused before anything is replaced
     assert "another process is writing" in err
     lock.release()
-    assert ufmstar("tour:4?frames=2&size=64x96", "--plain", "--out", tmp_path / "out", "--overwrite")[0] == 0
+    assert ufmstar("tour:3?frames=2&size=64x96", "--plain", "--out", tmp_path / "out", "--overwrite")[0] == 0
     assert not any((tmp_path / "out" / f"{line['stamp']:.6f}.npz").exists() for line in lines[2:])
     for content, text in ((b"no state", "it begins with b'no state'"), (malicious(tmp_path), "never loaded because")):
         (tmp_path / "state.pt").write_bytes(content)
