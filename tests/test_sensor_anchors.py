@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -12,9 +13,11 @@ from runs import job_of, read_summary, records
 
 from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStarConfig, cli
 from ufmstar_torch.anchors import Landmarks, sensor_landmarks
-from ufmstar_torch.anchors.sensor import completed
+from ufmstar_torch.anchors.sensor import SensorMemory, completed
 from ufmstar_torch.eval.engine.anchors import landmarks_of, sensor_of
+from ufmstar_torch.eval.engine.judge import UFM
 from ufmstar_torch.eval.engine.maps import MapSource
+from ufmstar_torch.eval.engine.stream import frame_results
 from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences.frame import in_memory
@@ -132,6 +135,119 @@ def test_poses_without_a_known_error_correct_nothing():
         assert found.shared == unchanged.shared
 
 
+# ---- depths of earlier frames
+
+
+def seen_from(x=0.0, z=0.0):
+    """A camera-to-world pose of a camera that has moved and not turned."""
+    T = np.eye(4)
+    T[:3, 3] = x, 0, z
+    return T
+
+
+def extended(memory, depth, T=seen_from()):  # noqa: B008
+    """The anchors that the memory adds to those of the depth."""
+    sensor = sensor_landmarks(depth, K, K)
+    found, n = memory.extended(sensor, depth, T, K), len(sensor.depth)
+    np.testing.assert_array_equal(found.depth[:n], sensor.depth)
+    return found.pixel[n:], found.depth[n:], found.variance[n:]
+
+
+def test_a_hole_has_the_depths_of_earlier_frames():
+    """Half a metre nearer to a wall of 3 m, whose middle is missing now."""
+    memory, depth = SensorMemory(), plane(z=2.5)
+    assert len(extended(memory, plane(z=3.0))[1]) == 0
+    depth[60:180, 80:240] = 0
+    pixel, z, variance = extended(memory, depth, seen_from(z=0.5))
+    np.testing.assert_allclose(z, 2.5)
+    np.testing.assert_allclose(variance, (0.001 + 0.003 * 9) ** 2 + 0.025**2)
+    assert ((pixel > [80, 60]) & (pixel < [239, 179])).all()
+    cell = np.floor((pixel + 0.5) / CELL)
+    assert len(np.unique(cell, axis=0)) == len(cell) > 100
+
+
+def test_points_behind_a_nearer_surface_are_hidden():
+    """A box of 1 m stands before the wall of 3 m. A hole covers its left border and the wall beside it."""
+    memory, depth = SensorMemory(), plane(z=3.0)
+    extended(memory, plane(z=3.0))
+    depth[:, 160:260] = 1.0
+    depth[:, 100:200] = 0
+    pixel, _, _ = extended(memory, depth)
+    assert len(pixel) > 100
+    # what the box hides at its side of the hole is not known: there, the wall stays
+    assert pixel[:, 0].max() < 200 - 5
+
+
+def test_points_where_the_sensor_measures_anew_are_deleted():
+    """A thing of 1 m leaves: it does not come back in a later hole."""
+    memory, hole = SensorMemory(), plane(z=3.0)
+    near = plane(z=3.0)
+    near[60:180, 80:240] = 1.0
+    extended(memory, near)
+    extended(memory, plane(z=3.0))
+    hole[60:180, 80:240] = 0
+    _, z, _ = extended(memory, hole)
+    assert len(z) > 100
+    assert set(z.round(6)) == {3.0}
+
+
+def test_points_that_contradict_the_sensor_are_deleted():
+    """The poses begin anew: the wall is at 2 m, where a wall of 3 m was."""
+    memory, hole = SensorMemory(), plane(z=2.0)
+    hole[60:180, 80:240] = 0
+    extended(memory, plane(z=3.0))
+    assert len(extended(memory, hole)[1]) == 0
+    assert len(extended(memory, plane(z=2.0), np.full((4, 4), np.nan))[1]) == 0
+    extended(memory, plane(z=2.0))
+    assert len(extended(memory, hole)[1]) > 100
+
+
+def test_the_memory_has_a_fixed_size():
+    memory = SensorMemory()
+    for i in range(9):
+        extended(memory, plane(z=3.0), seen_from(x=10 * i))
+    assert memory.bytes == 4096 * 4 * 8
+
+
+def loops(points, depth, T):
+    """{cell: depth} of the points [m] that :class:`SensorMemory` adds to a depth map of 320 x 240, the newest last."""
+    inside, nearest, cells = [], np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0), {}
+    for point in points:
+        x, y, z = T[:3, :3].T @ (point - T[:3, 3])
+        u, v = round(200 * x / z + 159.5), round(200 * y / z + 119.5)
+        if z > 0 and 0 <= u < 320 and 0 <= v < 240:
+            inside.append((u, v, z))
+    measured = np.array([abs(np.log(z / depth[v, u])) for u, v, z in inside if depth[v, u] > 0])
+    if (measured > np.log(1.1)).sum() > len(measured) / 2:
+        return {}
+    for u, v, z in inside:
+        nearest[v, u] = max(nearest[v, u], 1 / z)
+    for u, v, z in inside:
+        hole = not (depth[max(v - 2, 0) : v + 3, max(u - 2, 0) : u + 3] > 0).any()
+        if hole and z <= 1.1 / nearest[max(v - 5, 0) : v + 6, max(u - 5, 0) : u + 6].max():
+            cells[28 * v // 240, 28 * u // 320] = z
+    return cells
+
+
+def test_the_points_are_those_of_the_loops():
+    rng = np.random.default_rng(3)
+    memory, depth, points = SensorMemory(), plane(z=3.0), []
+    depth[40:200, 60:140], depth[80:220, 180:300] = 1.5, 2.2
+    for i in range(4):
+        T, left = seen_from(x=0.02 * i), depth.copy()
+        for row, column in rng.integers(0, 240, (6, 2)):
+            left[max(row - 20, 0) : row + 20, max(column - 20, 0) : column + 60] = 0
+        expected = loops(points, left, T)
+        pixel, z, _ = extended(memory, left, T)
+        column, row = np.rint(pixel.T).astype(int)
+        assert dict(zip(zip(28 * row // 240, 28 * column // 320, strict=True), z, strict=True)) == pytest.approx(
+            expected
+        )
+        points = memory._point.copy()
+        assert i == 0 or len(expected) > 20
+    assert len(points) > 300
+
+
 # ---- ufmstar run
 
 TOUR = "tour:5?frames=10&size=120x160"
@@ -192,6 +308,37 @@ def test_holes_are_filled_and_every_pixel_has_a_sigma(tour, finished):
     assert np.sqrt(squares[0] / squares[1]) < 1 / 3
     z = np.concatenate(z_scores)
     assert 0.1 < np.sqrt(np.mean(np.square(z))) < 2
+
+
+def test_holes_that_move_have_the_depths_of_earlier_frames_without_images(tour):
+    """A hole of 50 columns covers other columns in every frame, and the images show nothing."""
+
+    def moving_hole(entry, index):
+        left = entry.load_depth().copy()
+        column = 37 * index % 110
+        left[:, column : column + 50] = 0
+        return left
+
+    entries = tuple(
+        replace(entry, load_depth=lambda entry=entry, i=i: moving_hole(entry, i))
+        for i, entry in enumerate(tour.entries)
+    )
+    (row, _), squares, counts = sensor_job(replace(tour, entries=entries), tour).row(), np.zeros(2), []
+    with patch.object(row.anchors.tracks, "of", return_value=None):
+        for result in frame_results(replace(tour, entries=entries), range(len(entries)), [row]):
+            found, truth = result.rows[UFM], tour[result.index].depth[::2, ::2]
+            hole = np.zeros(truth.shape, np.bool_)
+            column = 37 * result.index % 110
+            hole[:, -(-column // 2) : (column + 50) // 2] = True
+            hole &= (truth > 0) & found.valid.numpy()
+            u = found.landmarks.pixel[:, 0]
+            counts.append(np.count_nonzero((u > column) & (u < column + 49)))
+            if result.index > 0:
+                before = found.prediction.depth[0].numpy()[hole]
+                squares += [np.square(x - truth[hole]).sum() for x in (found.depth.numpy()[hole], before)]
+    assert counts[0] == 0
+    assert min(counts[2:]) > 50
+    assert np.sqrt(squares[0] / squares[1]) < 0.2
 
 
 def test_depth_that_served_as_anchors_is_not_judged(finished):

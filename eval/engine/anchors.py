@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.landmarks import Landmarks, LandmarkSource
-from ufmstar_torch.anchors.sensor import SENSORS, completed, sensor_landmarks
+from ufmstar_torch.anchors.sensor import SENSORS, SensorMemory, completed, sensor_landmarks
 from ufmstar_torch.anchors.sources import CORNERS, DENSE, FILE_TYPES, LandmarkMap, landmark_source
 from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.anchors.tracker import TrackerConfig
@@ -70,7 +70,8 @@ class Tracks:
 
 class AnchorSource:
     """The anchors of a row, from ``tracks``; None = ground truth at random pixels. With a ``sensor``, a kind of
-    ``SENSORS``, they are the depth of the frame, completed by the tracks; that depth is then no ground truth.
+    ``SENSORS``, they are the depth of the frame, completed by that of earlier frames and the tracks; that depth is then
+    no ground truth.
 
     Noise on tracked positions is applied to the anchors: it moves an anchor in the image, and gives its depth the
     first-order error of that noise in every view (``track_noise`` times the tracker's standard deviation per
@@ -78,7 +79,12 @@ class AnchorSource:
     """
 
     def __init__(self, setting: Setting, tracks: Tracks | None, sensor: str | None = None) -> None:
-        self._setting, self.tracks, self.sensor = setting, tracks, sensor
+        self._setting, self.tracks, self.sensor, self._memory = setting, tracks, sensor, SensorMemory()
+
+    @property
+    def bytes(self) -> int:
+        """Size of the state."""
+        return self._memory.bytes + (0 if self.tracks is None else self.tracks.bytes)
 
     def of(
         self,
@@ -119,7 +125,7 @@ class AnchorSource:
     def _completed(
         self, frame: Frame, T_world_cam: NDArray[np.float64], prediction: DepthPrediction, tracks: Tracks
     ) -> tuple[Landmarks, Anchors, float]:
-        """As :meth:`of`, from the frame's depth where it has one and from the tracks elsewhere."""
+        """As :meth:`of`, from the frame's depth where it has one, and from earlier frames' and the tracks elsewhere."""
         assert self.sensor is not None
         started, landmarks, depth = perf_counter(), _NO_DEPTH, None
         if frame.depth is not None:
@@ -128,6 +134,7 @@ class AnchorSource:
             if frame.image is not None:
                 size = frame.image.shape[0], frame.image.shape[1]
                 depth = resample_nearest(frame.depth, K_depth, frame.intrinsics, size)
+                landmarks = self._memory.extended(landmarks, depth, T_world_cam, frame.intrinsics)
         tracked = tracks.of(frame, T_world_cam)
         if tracked is not None:
             landmarks = tracked[0] if depth is None else completed(landmarks, tracked[0], depth, self.sensor)

@@ -145,7 +145,6 @@ class RowRunner:
     ) -> None:
         self.key, self.source, self.estimator, self.every, self.setting = key, source, estimator, every, setting
         self.anchors = anchors
-        self._tracks = None if anchors is None else anchors.tracks
         self.images = 0
         self._drift = Drift(setting) if setting.pose_noise else None
 
@@ -181,8 +180,8 @@ class RowRunner:
     def memory(self) -> dict[str, float]:
         """``Estimator.memory``, with the bytes of the anchors' tracks or evidence."""
         memory = self.estimator.memory()
-        if self._tracks is not None:
-            memory["bytes"] += self._tracks.bytes
+        if self.anchors is not None:
+            memory["bytes"] += self.anchors.bytes
         return memory
 
 

@@ -1,8 +1,9 @@
 """Anchors of a depth camera: its depth, thinned to what the posterior can use, with the variance of its kind of sensor.
 
-The sensor's depth has holes, ends at a range and is wrong at edges. There, landmarks of the images complete it
-(:func:`completed`), less the common errors that the sensor shows where both measure. With rho an inverse depth, u and v
-from -1 to 1, and wrong poses that shift and turn the images' inverse depths,
+The sensor's depth has holes, ends at a range and is wrong at edges. There, its depths of earlier frames
+(:class:`SensorMemory`) and landmarks of the images complete it (:func:`completed`), the latter less the common errors
+that the sensor shows where both measure. With rho an inverse depth, u and v from -1 to 1, and wrong poses that shift
+and turn the images' inverse depths,
 
     rho_image - rho_sensor = b . (1, u, v, rho_image) + e.
 
@@ -34,6 +35,15 @@ _SIDE, _SHARE, _SIGMAS = 5, 0.02, 3.0
 _FREEDOM, _ITERATIONS, _LEAST = 2.0, 8, 1e-10
 # Least share of a landmark's variance that is independent; least inverse depth, as a share of that measured.
 _INDEPENDENT, _NEAREST_ZERO = 0.1, 0.1
+# Number of stored points; width to which depth maps are reduced to store and show points [px]; share of the depth that
+# wrong poses add to its standard deviation.
+_STORED, _WIDTH, _POSES = 4096, 320, 0.01
+# A point is stored if its surroundings of this side [px] have a depth everywhere: a hole may begin at an edge. In a
+# hole it is visible if nothing in these surroundings [px] is nearer by more than this factor.
+_WHOLE, _AROUND, _NEARER = 7, 11, 1.1
+# Least share of the points on measured pixels that lie within this factor of the measured depth; with less, the poses
+# contradict the depths, and all points are deleted.
+_LEAST_AGREEING, _AGREEING = 0.5, 1.1
 
 
 # Standard deviation of a depth z, sigma = a + b z + c z^2 [m], by kind of sensor. Stereo and structured light measure a
@@ -80,7 +90,7 @@ def sensor_landmarks(
     z = depth[v, u].astype(np.float64)
     mapping = K @ np.linalg.inv(K_depth)
     pixel = np.stack([u, v, np.ones_like(u)], axis=-1) @ mapping.T
-    return Landmarks(pixel[:, :2], z, np.square(_sigma(z, kind)), len(z), none="no depth of the sensor")
+    return Landmarks(pixel[:, :2], z, np.square(sensor_sigma(z, kind)), len(z), none="no depth of the sensor")
 
 
 def completed(sensor: Landmarks, others: Landmarks, depth: NDArray[np.float32], kind: str = "stereo") -> Landmarks:
@@ -121,6 +131,93 @@ def completed(sensor: Landmarks, others: Landmarks, depth: NDArray[np.float32], 
     )
 
 
+class SensorMemory:
+    """The last points that a depth camera has measured, for the holes of later frames; none at first."""
+
+    def __init__(self) -> None:
+        self._point, self._sigma = np.empty((0, 3)), np.empty(0)  # in the world, and of their depths [m]
+
+    @property
+    def bytes(self) -> int:
+        """Size of the points."""
+        return self._point.nbytes + self._sigma.nbytes
+
+    def extended(
+        self, sensor: Landmarks, depth: NDArray[np.float32], T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
+    ) -> Landmarks:
+        """The sensor's landmarks, and in its holes the points of earlier frames, at most one in each of 28 x 28 cells.
+        Points on measured pixels are deleted, and the landmarks are stored.
+
+        Args:
+            sensor: in the pixels of the image.
+            depth: [H, W] of the sensor at the image's pixels, 0 = none [m].
+            T_world_cam: [4, 4] of the image [m]; if it is not finite, nothing is added or stored.
+            K: [3, 3] of the image [px].
+        """
+        if not np.isfinite(T_world_cam).all():
+            return sensor
+        step = max(1, round(depth.shape[1] / _WIDTH))
+        small = np.where(depth > 0, depth, np.float32(0))[::step, ::step]
+        pixel, z, row, column = self._projected(T_world_cam, K, step, small.shape)
+        found = np.where(row >= 0, small[row, column], 0)
+        measured = found > 0
+        off = np.abs(np.log(z[measured] / found[measured])) > np.log(_AGREEING)
+        chosen = self._visible(small, z, row, column)
+        if off.sum() > (1 - _LEAST_AGREEING) * len(off):
+            chosen, measured = chosen[:0], np.ones(len(z), np.bool_)
+        variance = np.square(self._sigma[chosen]) + np.square(_POSES * z[chosen])
+        self._store(sensor, small, T_world_cam, K, step, ~measured)
+        return replace(
+            sensor,
+            pixel=np.concatenate([sensor.pixel, pixel[chosen]]),
+            depth=np.concatenate([sensor.depth, z[chosen]]),
+            variance=np.concatenate([sensor.variance, variance]),
+        )
+
+    def _projected(
+        self, T: NDArray[np.float64], K: NDArray[np.float64], step: int, size: tuple[int, ...]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+        """Pixels [N, 2] of the points and their depths [N]; row and column [N] in the reduced depth map of this size,
+        -1 outside."""
+        in_camera = (self._point - T[:3, 3]) @ T[:3, :3]
+        z = in_camera[:, 2]
+        ahead = z > 0
+        pixel = (in_camera @ K.T)[:, :2] / np.where(ahead, z, 1)[:, None]
+        column, row = np.rint(pixel.T / step)
+        inside = ahead & (row >= 0) & (row < size[0]) & (column >= 0) & (column < size[1])
+        row, column = (np.where(inside, x, -1).astype(np.int64) for x in (row, column))
+        return pixel, np.where(ahead, z, 1), row, column
+
+    def _visible(
+        self, depth: NDArray[np.float32], z: NDArray[np.float64], row: NDArray[np.int64], column: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
+        """Indices of the newest point of each cell among those in holes that nothing hides."""
+        inside, rho = row >= 0, (1 / z).astype(np.float32)
+        nearest = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0).astype(np.float32)
+        np.maximum.at(nearest, (row[inside], column[inside]), rho[inside])
+        hole = _spread((depth > 0).astype(np.float32)) == 0
+        shown = inside & hole[row, column] & (_NEARER * rho >= _spread(nearest, _AROUND)[row, column])
+        index = np.flatnonzero(shown)[::-1]  # the newest first
+        cell = (_CELLS * row[index] // depth.shape[0]) * _CELLS + _CELLS * column[index] // depth.shape[1]
+        return index[np.unique(cell, return_index=True)[1]]
+
+    def _store(
+        self, sensor: Landmarks, depth: NDArray[np.float32], T: NDArray[np.float64], K: NDArray[np.float64], step: int,
+        retained: NDArray[np.bool_],
+    ) -> None:  # fmt: skip
+        """Store the landmarks away from holes behind the ``retained`` points."""
+        height, width = depth.shape
+        column, row = (
+            np.rint(x / step).astype(int).clip(0, size - 1)
+            for x, size in zip(sensor.pixel.T, (width, height), strict=True)
+        )
+        whole = (_spread((depth <= 0).astype(np.float32), _WHOLE) == 0)[row, column]
+        ray = np.concatenate([sensor.pixel[whole], np.ones((int(whole.sum()), 1))], axis=1) @ np.linalg.inv(K).T
+        point = (sensor.depth[whole, None] * ray) @ T[:3, :3].T + T[:3, 3]
+        self._point = np.concatenate([self._point[retained], point])[-_STORED:]
+        self._sigma = np.concatenate([self._sigma[retained], np.sqrt(sensor.variance[whole])])[-_STORED:]
+
+
 def _without_common_errors(others: Landmarks, z: NDArray[np.float64], size: tuple[int, int], kind: str) -> Landmarks:
     """The landmarks less b . x, with the variances after that (the module's equation).
 
@@ -138,7 +235,7 @@ def _without_common_errors(others: Landmarks, z: NDArray[np.float64], size: tupl
     x = np.stack([np.ones_like(rho), u, v, rho], axis=-1)
     independent = np.maximum(total - shared - scale * rho**2, _INDEPENDENT * total)
     x_seen, z = x[seen], z[seen]
-    noise = independent[seen] + np.square(_sigma(z, kind) / z**2)
+    noise = independent[seen] + np.square(sensor_sigma(z, kind) / z**2)
     prior, weight = np.diag(1 / np.maximum([shared, shared, shared, scale], _LEAST)), 1 / noise
     for _ in range(_ITERATIONS):
         covariance = np.linalg.inv(prior + (x_seen.T * weight) @ x_seen)
@@ -150,8 +247,8 @@ def _without_common_errors(others: Landmarks, z: NDArray[np.float64], size: tupl
     return replace(others, depth=depth, variance=variance)
 
 
-def _sigma(z: NDArray[np.float64], kind: str) -> NDArray[np.float64]:
-    """Standard deviations of depths, of the same shape [m]."""
+def sensor_sigma(z: NDArray[np.float64], kind: str) -> NDArray[np.float64]:
+    """Standard deviations of depths z that a kind of ``SENSORS`` measures, of the same shape [m]."""
     a, b, c = _SIGMA[kind]
     return a + b * z + c * np.square(z)
 
@@ -162,10 +259,10 @@ def _away_from_edges(depth: NDArray[np.float32], kind: str) -> NDArray[np.bool_]
     farthest = _spread(np.where(valid, depth, 0).astype(np.float32))
     nearest = 1 / _spread(np.where(valid, 1 / np.where(valid, depth, 1), 1e-6).astype(np.float32))
     z = np.where(valid, depth, 0).astype(np.float64)
-    return valid & (farthest - nearest <= _SHARE * z + _SIGMAS * _sigma(z, kind))
+    return valid & (farthest - nearest <= _SHARE * z + _SIGMAS * sensor_sigma(z, kind))
 
 
-def _spread(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[H, W] the largest value within ``_SIDE`` pixels."""
-    largest = max_pool2d(torch.from_numpy(np.ascontiguousarray(values))[None, None], _SIDE, 1, _SIDE // 2)
+def _spread(values: NDArray[np.float32], side: int = _SIDE) -> NDArray[np.float32]:
+    """[H, W] the largest value in a square of ``side`` pixels."""
+    largest = max_pool2d(torch.from_numpy(np.ascontiguousarray(values))[None, None], side, 1, side // 2)
     return np.asarray(largest[0, 0].numpy())
