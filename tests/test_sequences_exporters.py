@@ -112,6 +112,31 @@ def test_an_export_that_no_reader_opens_gets_a_line_with_the_remedy(tmp_path, fi
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("layout", "file", "change"),
+    [
+        ("tum", "rgb.txt", lambda text: text.replace("# color images", "timestamp filename")),
+        ("tum", "rgb.txt", lambda text: text.replace(" ", ",").replace("#", "timestamp,filename #")),
+        ("euroc", "mav0/cam0/data.csv", lambda text: text.replace("#", "")),
+        ("euroc", "mav0/state_groundtruth_estimate0/data.csv", lambda text: text.replace("#", "")),
+        ("generic", "K.txt", lambda text: "a b c\n" + text),
+        ("arkitscenes", "*/*.traj", lambda text: "time rx ry rz tx ty tz\n" + text),
+        ("tartanair", "pose_left.txt", lambda text: "tx ty tz qx qy qz qw\n" + text),
+    ],
+)
+def test_a_table_may_begin_with_the_names_of_its_columns(tmp_path, layout, file, change):
+    """Without a #, as tables of pandas."""
+    path = LAYOUTS[layout](tmp_path)[0]
+    before = open_sequence(path)
+    (table,) = path.glob(file)
+    table.write_text(change(table.read_text()))
+    after = open_sequence(path)
+    assert after.names == before.names
+    for old, new in zip(before, after, strict=True):
+        np.testing.assert_array_equal(new.T_world_cam, old.T_world_cam)
+        np.testing.assert_array_equal(new.intrinsics, old.intrinsics)
+
+
 def test_eth3d(tmp_path):
     """SLAM: TUM's files and calibration.txt; multi-view: a COLMAP model in dslr_calibration_undistorted/."""
     slam, scene = layouts.write_tum(tmp_path, folder="cables_1")
