@@ -18,7 +18,6 @@ from ufmstar_torch.files.read import DAMAGE as DAMAGE
 from ufmstar_torch.files.read import CheckpointError as CheckpointError
 from ufmstar_torch.files.read import read_tensors
 from ufmstar_torch.files.write import write_atomic
-from ufmstar_torch.frames.arguments import as_path, require_kind
 from ufmstar_torch.runtime.kinds import check_kinds
 from ufmstar_torch.runtime.optional import optional
 
@@ -144,9 +143,7 @@ def save_checkpoint(
         CheckpointError: another suffix.
         ModuleNotFoundError: .safetensors without the package safetensors.
     """
-    path = as_path("path", path)
-    require_kind("weights", weights, (nn.Module, Mapping), "a module or its state_dict")
-    metadata = {} if metadata is None else require_kind("metadata", metadata, Mapping, "a mapping")
+    path = Path(path)
     if not isinstance(weights, nn.Module) and not all(isinstance(value, Tensor) for value in weights.values()):
         raise TypeError("weights must be a module or its state_dict, tensors by name")
     state = weights.state_dict() if isinstance(weights, nn.Module) else dict(weights)

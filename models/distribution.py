@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 from ufmstar_torch.frames.prediction import DepthPrediction
@@ -18,8 +19,9 @@ class _Maps:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if len(shapes := {tuple(value.shape) for value in vars(self).values()}) > 1:
-            raise ValueError(f"{type(self).__name__} must hold maps of one shape, got {sorted(shapes)}")
+        shapes = [()] if torch.jit.is_tracing() else [tuple(value.shape) for value in vars(self).values()]
+        if any(shape != shapes[0] for shape in shapes):
+            raise ValueError(f"{type(self).__name__} must hold maps of one shape, got {shapes}")
 
 
 @dataclass(frozen=True)

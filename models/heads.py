@@ -140,7 +140,6 @@ class UncertaintyNetwork(DepthNetwork):
         return (images_of(distribution, slice(len(image))) if self.training else distribution).prediction()
 
 
-@check_kinds
 def with_head(backbone: Backbone, method: str, scales: int = 1) -> UncertaintyNetwork:
     """A backbone with the head of a method: "depth" (none), "aleatoric" or "evidential"; ``scales`` as in
     :class:`UncertaintyNetwork`. Raises TypeError: ``backbone`` is no :class:`Backbone`; ValueError: another method, or

@@ -6,7 +6,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.frames.arguments import as_path
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.runtime.kinds import check_kinds
 
@@ -58,11 +57,10 @@ def load_network(name: str, weights: str | Path | None = None, **options: Any) -
         TypeError: an unknown option of this network.
         FileNotFoundError, ModuleNotFoundError: a file or an optional package is missing.
     """
-    if not isinstance(name, str) or name not in _LOADERS:
+    if name not in _LOADERS:
         raise ValueError(f"name: unknown network {name!r:.60}, expected one of {list(_LOADERS)}")
     if weights is None:
         raise ValueError(f"network {name!r} needs weights: the file to load")
-    weights = as_path("weights", weights)
     module, loader = _LOADERS[name]
-    network: DepthNetwork = getattr(import_module(f"ufmstar_torch.models.{module}"), loader)(weights, **options)
+    network: DepthNetwork = getattr(import_module(f"ufmstar_torch.models.{module}"), loader)(Path(weights), **options)
     return network.eval()

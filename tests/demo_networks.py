@@ -21,7 +21,7 @@ def members(count=3, spec=SPEC):
     return networks
 
 
-def write_members(path):
-    """Write three of these networks to a file, and return its path."""
-    save_trained(path, members(), SPEC, info={"note": "a test"})
+def write_members(path, count=3):
+    """Write some of these networks to a file, and return its path."""
+    save_trained(path, members(count), SPEC, info={"note": "a test"})
     return path

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import oracle_field as field
 import oracle_interval as interval
+import oracle_overlap as overlap
 import oracle_spread as spreads
 from oracle_held_out import discs
 from oracle_motion import moving, plausible, surfaces
@@ -15,9 +16,9 @@ from oracle_motion import moving, plausible, surfaces
 CLIP = 9.0
 
 
-def update(state, depth, claimed, pixel, g, variance, motion=None):
+def update(state, depth, claimed, pixel, g, variance, motion=None, view=overlap.LEVEL):
     """One frame: depth [H, W] (0 = not valid), claimed V [m^2], anchors (pixel [N, 2], depth, variance), all valid.
-    ``motion`` [M, 3]: u, v and log likelihood field.ratio of motion.
+    ``motion`` [M, 3]: u, v and log likelihood field.ratio of motion. ``view``: pose [4, 4] and K [3, 3].
 
     Returns the state after it, posterior depth, variance, variance on the evidence's surface, and probability of
     another [H, W].
@@ -29,6 +30,7 @@ def update(state, depth, claimed, pixel, g, variance, motion=None):
     seen = observed(state, depth, logs, pixel, g, variance)
     fit = fitted(state, logs, *prior, seen)
     after = learnt(state, logs, *prior, seen, fit)
+    overlap.confirmed(state, after, logs, depth.shape, fit.away, view)
     offset, alone, spread, p, share = at_nodes(state, after, depth.shape, logs, seen, fit, motion, beyond)
     b = fit.mean[:4]
     posterior, variance, outlier = read(depth, np.nan_to_num(claimed), logs, b, offset, spread, p, share)
@@ -104,15 +106,17 @@ def at_nodes(state, after, size, logs, seen, fit, motion, beyond):
     HX = field.design(X, np.arange(n), n)
     unsure, unseen = np.einsum("ij,jk,ik->i", HX, C, HX), fit.away * field.ratio(after, "unseen")
     scale = spreads.local_scale(logs.shape, seen.node, fit.z2, seen.noise, used)
-    steep, unmeasured = spreads.steepness(logs.shape, mean[field.FEATURES :]), min(C[0, 0] / field.PRIOR[0], 1) ** 2
+    steep, of_scale = spreads.steepness(logs.shape, mean[field.FEATURES :]), overlap.scale_elsewhere(after, fit.away)
+    unmeasured = np.minimum((C[0, 0] + of_scale) / field.PRIOR[0], 1) ** 2
     factor = spreads.inlier_factor(after, fit.away)
-    spread = scale * spreads.at_pixels(factor, unsure, field.ratio(after, "roughness"), unseen, steep, unmeasured)
+    spread = spreads.at_pixels(factor, unsure, field.ratio(after, "roughness"), unseen, steep, unmeasured) + of_scale
+    spread = scale * spread
     offset, share = HX[:, 4:] @ mean[4:], fit.away / field.REACH
     around = spreads.y_variance(logs.shape, seen.node, seen.y, seen.noise, used, mean[0])
     p = np.minimum(field.ratio(after, "wrong") * spreads.wrong_factor(share, scale), 0.5)
     wide = [spreads.elsewhere(*each) for each in zip(around, unseen, strict=True)]
     p = np.where(p < 0.1, p + unmeasured * (0.1 - p), p)
-    wide = [each + unmeasured * (2 - each) for each in wide]
+    wide = np.array(wide) + unmeasured * (2 - np.array(wide))
     alone = [spreads.second_moment(0.0, *each) for each in zip(spread, offset, wide, strict=True)]
     spread = [spreads.second_moment(*each) for each in zip(p, spread, offset, wide, strict=True)]
     if motion is not None:

@@ -64,8 +64,15 @@ def test_a_call_that_lacks_an_argument_raises_the_functions_own_error():
 
 
 # Functions that check their own arguments, with the same result.
-OWN = {"interpolate_pose", "landmark_source", "loss_sums", "make_movers", "make_tour", "read_trajectory"}
-OWN |= {"wrap_network"}
+OWN = {
+    "wrap_network",
+    "interpolate_pose",
+    "landmark_source",
+    "make_movers",
+    "make_tour",
+    "read_trajectory",
+    "with_head",
+}
 
 
 def public_functions():

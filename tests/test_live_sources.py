@@ -41,7 +41,7 @@ POSE = [1, 2, 3, 0, 0, 0, 1]
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
-    return write_members(tmp_path_factory.mktemp("weights") / "three.safetensors")
+    return write_members(tmp_path_factory.mktemp("weights") / "one.safetensors", 1)
 
 
 @pytest.fixture
@@ -162,14 +162,14 @@ def test_a_folder_that_grows(tmp_path, monkeypatch):
             steps.pop(0)()
         return 0.0
 
-    events = growing_folder(folder, PoseFile(tmp_path / "poses.txt"), clock=clock)
+    events = (event for event in growing_folder(folder, PoseFile(tmp_path / "poses.txt"), clock=clock) if event)
     found = [next(events) for _ in range(3)]
     (folder / "front.png").write_bytes(content(image))
     found.append(next(events))
     assert [event.stamp for event in found[:3]] == [2.5, 2.0, 3.0]
     assert found[0].image is None
     assert abs(found[3].stamp - time.time()) < 60  # the file's metadata
-    assert list(growing_folder(folder, PoseFile(tmp_path / "none"), idle=0.05)) == []
+    assert set(growing_folder(folder, PoseFile(tmp_path / "none"), idle=0.05)) == {None}
     with pytest.raises(FileNotFoundError, match="no such folder"):
         next(growing_folder(tmp_path / "nowhere", PoseFile(tmp_path / "none")))
 
@@ -269,7 +269,7 @@ def test_a_recording_live(ufmstar, tmp_path):
     assert (code, sorted((tmp_path / "out").iterdir())) == (2, before)  # refused before anything is replaced
     assert "another process is writing" in err
     lock.release()
-    assert ufmstar("tour:4?frames=2&size=64x96", "--plain", "--out", tmp_path / "out", "--overwrite")[0] == 0
+    assert ufmstar("tour:3?frames=2&size=64x96", "--plain", "--out", tmp_path / "out", "--overwrite")[0] == 0
     assert not any((tmp_path / "out" / f"{line['stamp']:.6f}.npz").exists() for line in lines[2:])
     for content, text in ((b"no state", "it begins with b'no state'"), (malicious(tmp_path), "never loaded because")):
         (tmp_path / "state.pt").write_bytes(content)
@@ -300,6 +300,39 @@ def test_a_recording_waits_for_a_network_that_starts_slowly(ufmstar, monkeypatch
     assert code == 0, err + out
     assert too_early == [False]
     assert running.is_set()
+
+
+@pytest.mark.parametrize("source", ["-", "folder"])
+def test_seconds_and_silence_of_a_source_that_stays_open(ufmstar, tmp_path, monkeypatch, source):
+    """A client that sends one image and then nothing does not hold the command; before the first image, a line says
+    that there is none."""
+    monkeypatch.setattr("ufmstar_torch.eval.commands.live._SILENCE", 0.0)
+    image, camera = content(np.full((48, 64, 3), 7, np.uint8)), (50, 50, 31.5, 23.5)
+    words = ("--plain", "--seconds", "0.1", "--intrinsics", *camera)
+    if source == "-":
+        read, write = os.pipe()
+        embedded = "data:;base64," + base64.b64encode(image).decode()
+        lines = [{"stamp": 1, "pose": POSE}, {"stamp": 1, "pose": POSE, "image": embedded}]
+        os.write(write, "".join(f"{json.dumps(line)}\n" for line in lines).encode())
+        with os.fdopen(read) as stream:
+            monkeypatch.setattr(sys, "stdin", stream)
+            code, out, err = ufmstar("-", *words)
+            os.close(write)
+    else:
+        (tmp_path / "images").mkdir()
+        (tmp_path / "poses.txt").write_text("1 0 0 0 0 0 0 1\n")
+        new = sources.PoseFile.new
+
+        def written_later(poses):
+            yield from new(poses)
+            if not list((tmp_path / "images").iterdir()):
+                (tmp_path / "images" / "1.0.png").write_bytes(image)
+
+        monkeypatch.setattr(sources.PoseFile, "new", written_later)
+        code, out, err = ufmstar(tmp_path / "images", "--follow", "--trajectory", tmp_path / "poses.txt", *words)
+    assert code == 0, err + out
+    assert "1 of 1 images" in out
+    assert "ufmstar live: no image yet from" in err
 
 
 def test_lines_on_standard_input_live(ufmstar, tmp_path, monkeypatch):

@@ -42,11 +42,28 @@ def scene(seed, size=(36, 48), n=60):
     return depth, factor, np.full(size, 0.04), pixel, g, (rng.uniform(0.01, 0.3, n) * g) ** 2
 
 
-def checked(depth, pixel, g, variance):
-    frame = check_frame(torch.from_numpy(depth)[None], torch.eye(4)[None], K[None], None, None, None, None,
+LEVEL = np.eye(4)
+
+
+def checked(depth, pixel, g, variance, pose=LEVEL):
+    frame = check_frame(torch.from_numpy(depth)[None], torch.from_numpy(pose)[None], K[None], None, None, None, None,
                         feature_count=0, rotation_tolerance=0.01)  # fmt: skip
     anchors = Anchors(*(torch.from_numpy(x)[None] for x in (pixel, g, variance)))
     return frame, check_anchors(anchors, frame)
+
+
+def turned(degrees):
+    """Pose of a camera that has turned to the right."""
+    c, s, pose = np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), np.eye(4)
+    pose[[0, 0, 2, 2], [0, 2, 0, 2]] = c, s, -s, c
+    return pose
+
+
+def moved_by(x):
+    """Pose of a camera that has moved to the right [m]."""
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return pose
 
 
 def ratios(packed):
@@ -58,17 +75,23 @@ def ratios(packed):
 
 def test_values_against_the_oracle_over_frames():
     state, packed = oracle_field.start(), torch.zeros(1, SIZE, dtype=torch.float64)
-    for seed in range(2):
-        depth, _, claimed, *anchors = scene(seed, (12, 16), 40)
-        state, expected, variance, inlier, outlier = oracle.update(state, depth, claimed, *anchors)
-        packed, out = update(packed, *checked(depth, *anchors), torch.from_numpy(claimed)[None], MODEL)
+    for seed, n in enumerate((40, 40, 6)):  # the camera turns and moves
+        depth, _, claimed, *anchors = scene(seed, (12, 16), n)
+        pose = turned(20 * seed) @ moved_by(0.1 * seed)
+        state, expected, variance, inlier, outlier = oracle.update(
+            state, depth, claimed, *anchors, view=(pose, K.double().numpy())
+        )
+        packed, out = update(packed, *checked(depth, *anchors, pose), torch.from_numpy(claimed)[None], MODEL)
         np.testing.assert_allclose(out.depth[0], expected, rtol=1e-8)
         np.testing.assert_allclose(out.variance[0], variance, rtol=1e-7)
         np.testing.assert_allclose(out.inlier[0], inlier, rtol=1e-7)
         np.testing.assert_allclose(out.outlier[0], outlier, rtol=1e-7)
         assert float(out.calibration) == pytest.approx(oracle_field.ratio(state, "calibration"), rel=1e-7)
         assert float(out.unseen) == pytest.approx(oracle_field.ratio(state, "unseen"), rel=1e-7)
-        np.testing.assert_allclose(views(packed[0].numpy()).intervals, state["intervals"], rtol=1e-7)
+        memory = views(packed[0].numpy())
+        np.testing.assert_allclose(memory.intervals, state["intervals"], rtol=1e-7)
+        np.testing.assert_allclose(memory.frames[2], state["unconfirmed"], rtol=1e-7, atol=1e-15)
+    assert memory.frames[2] > 0.01
 
 
 solve, distance, divided = kernel(field.solve), kernel(field.distance), kernel(divide)
@@ -213,6 +236,62 @@ def test_without_anchors_the_slopes_of_the_correction_revert_and_its_scale_remai
     assert np.abs(b[0][1:]).max() > 0.1
     logs = out.depth[0].log()
     assert float(logs.std()) == pytest.approx(float(np.log(room).std()), rel=0.1)
+
+
+def away_from_evidence(degrees, frames, metres=0.0, config=MODEL):
+    """Relative variance, mean over the image, after three frames of a wall with anchors everywhere, and ``frames``
+    frames without any in which the camera turns and moves to the right, by so much each; and the share of its view
+    whose scale is unconfirmed."""
+    depth, packed = np.full((12, 16), 2.0), None
+    pixel = np.stack([x.ravel() for x in np.mgrid[1:16:3, 1:12:3]], -1).astype(float)
+    for _ in range(3):
+        packed, _ = updated(depth, (pixel, np.full(len(pixel), 2.0), np.full(len(pixel), 1e-4)), packed=packed)
+    for k in range(1, frames + 1):
+        pose = turned(degrees * k) @ moved_by(metres * k)
+        frame, _ = checked(depth, np.zeros((0, 2)), np.zeros(0), np.zeros(0), pose)
+        packed, out = update(packed, frame, None, torch.zeros(1, 12, 16, dtype=torch.float64), config)
+    return float(relative(out).mean()), float(views(packed[0].numpy()).frames[2])
+
+
+def test_in_a_turn_away_from_the_evidence_the_scale_becomes_uncertain_and_at_rest_it_does_not():
+    """The image is 44 degrees wide. The share of the view that is new, not the number of frames, decides."""
+    rest, turn, slow, far = (away_from_evidence(*each) for each in ((0, 5), (4, 5), (2, 10), (4, 30)))
+    assert rest[1] == pytest.approx(0, abs=1e-12)
+    assert 0.3 < turn[1] < 0.5
+    assert slow[1] == pytest.approx(turn[1], rel=0.05)
+    assert far[1] > 0.85
+    assert rest[0] + 0.02 < turn[0] < far[0]
+    without = type("Certain", (PosteriorConfig,), {"places": 0.0})()
+    assert away_from_evidence(4, 5, config=without)[0] == pytest.approx(rest[0], rel=1e-9)
+
+
+def test_a_camera_that_approaches_sees_nothing_new_and_one_that_moves_sideways_does():
+    depth = np.full((12, 16), 2.0)
+    pixel, g = np.array([[8.0, 6.0]]), np.full(1, 2.0)
+    ahead, back = np.eye(4), np.eye(4)
+    ahead[2, 3], back[2, 3] = 0.3, -0.3
+    shares = []
+    for pose in (ahead, back, moved_by(0.3)):
+        packed, _ = updated(depth, (pixel, g, np.full(1, 1e-4)))
+        frame, _ = checked(depth, np.zeros((0, 2)), np.zeros(0), np.zeros(0), pose)
+        packed, _ = update(packed, frame, None, torch.zeros(1, 12, 16, dtype=torch.float64), MODEL)
+        shares.append(float(views(packed[0].numpy()).frames[2]))
+    assert shares[0] == pytest.approx(0, abs=1e-12)
+    assert shares[1] == pytest.approx(1 - (1.7 / 2) ** 2, rel=0.02)  # the last frame sees the same wall at 1.7 m
+    assert shares[2] == pytest.approx(0.3 / 2 * 20 / 16, rel=0.1)  # shift [px] over the width
+
+
+def test_anchors_everywhere_confirm_the_scale_of_a_view_and_one_anchor_does_not():
+    depth, pose = np.full((12, 16), 2.0), turned(25)
+    everywhere = np.stack([x.ravel() for x in np.mgrid[1:16:3, 1:12:3]], -1).astype(float)
+    shares = []
+    for pixel in (everywhere, everywhere[:1]):
+        packed, _ = updated(depth, (everywhere, np.full(len(everywhere), 2.0), np.full(len(everywhere), 1e-4)))
+        frame, anchors = checked(depth, pixel, np.full(len(pixel), 2.0), np.full(len(pixel), 1e-4), pose)
+        packed, _ = update(packed, frame, anchors, torch.zeros(1, 12, 16, dtype=torch.float64), MODEL)
+        shares.append(float(views(packed[0].numpy()).frames[2]))
+    assert shares[0] < 0.01
+    assert shares[1] > 0.1
 
 
 def relative(out, name="variance"):

@@ -188,11 +188,13 @@ def test_the_same_figure_gives_the_same_file_and_no_global_state(tmp_path):
     import matplotlib
 
     before, pyplot = dict(matplotlib.rcParams), "matplotlib.pyplot" in sys.modules
-    for name in ("one.svg", "two.svg"):
-        figure = new_figure(3, 2, "title")
-        figure.subplots().plot([0, 1], [0, 1])
-        save_figure(figure, tmp_path / name)
-    assert (tmp_path / "one.svg").read_bytes() == (tmp_path / "two.svg").read_bytes()
+    for kind in ("svg", "png", "jpg"):
+        files = [tmp_path / f"{name}.{kind}" for name in ("one", "two")]
+        for file in files:
+            figure = new_figure(3, 2, "title")
+            figure.subplots().plot([0, 1], [0, 1])
+            save_figure(figure, file)
+        assert files[0].read_bytes() == files[1].read_bytes()
     assert dict(matplotlib.rcParams) == before
     assert ("matplotlib.pyplot" in sys.modules) == pyplot
 

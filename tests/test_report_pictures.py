@@ -23,6 +23,7 @@ from ufmstar_torch.eval.report.pictures import (
     OVERVIEW,
     STRIP,
     draw_comparison,
+    draw_overview,
     draw_strip,
     fit_strip_scales,
     pictures_of,
@@ -74,6 +75,20 @@ class TestExample:
         judged = (truth > 0) & (variance > 0)
         np.testing.assert_array_equal(np.isfinite(one.nll), judged)
         np.testing.assert_array_equal(np.isfinite(one.error), (truth > 0) & (variance >= 0))
+
+    def test_a_posteriors_sigma_is_striped_where_it_has_no_evidence(self, tmp_path: Path) -> None:
+        stored = {"depth": full(2.0), "variance": full(0.1), "measured": full(0.0)}
+        evidence, none = {"posterior_outlier": halves(np.nan, 0.1)}, {"posterior_outlier": full(np.nan)}
+        rows = {"plain": stored, "half": stored | evidence, "none": stored | none}
+        one = replace(example({}), rows={name: RowMaps.of(maps, full(3.0)) for name, maps in rows.items()})
+        assert (one.rows["half"].assumed == (halves(1, 0) > 0)).all()
+        assert one.rows["half"].unmeasured is not None
+        assert one.rows["half"].unmeasured.all()
+        grey = np.full(3, INVALID_GREY)
+        half, whole = (
+            pixels(tmp_path / draw_overview(tmp_path, one, "plain", row).file, grey) for row in ("half", "none")
+        )
+        assert whole - half == pytest.approx(CELL / 6, rel=0.1)
 
 
 class TestFindExamples:

@@ -12,10 +12,10 @@ import cv2
 import layouts
 import layouts_bag
 import layouts_calibrated as written
-import layouts_more
 import numpy as np
 import pytest
 from imageio_ffmpeg import get_ffmpeg_exe
+from recordings import LAYOUTS
 
 from ufmstar_torch import cli
 from ufmstar_torch.eval.run.scale import network_scale
@@ -32,30 +32,10 @@ RNG = np.random.default_rng(0)
 # ---- macOS's sidecars, Windows' paths
 
 
-def write_scan(root):
-    layouts_more.write_sens(root / "scan" / "scene.sens")
-    return root / "scan"
-
-
-def write_drive(root):
-    layouts_more.write_kitti360(root)
-    return root
-
-
-LAYOUTS = {
-    "tum": layouts.write_tum, "7scenes": layouts.write_seven_scenes, "scannet": layouts.write_scannet,
-    "tartanair": layouts.write_tartanair, "generic": layouts.write_generic, "sens": write_scan,
-    "colmap": written.write_colmap, "transforms": written.write_transforms, "euroc": written.write_euroc,
-    "stray": written.write_stray, "arkitscenes": written.write_arkitscenes, "bag": layouts_bag.write_bag,
-    "nyu": layouts_more.write_nyu, "kitti360": write_drive,
-}  # fmt: skip
-
-
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_files_whose_names_begin_with_a_dot_are_no_frames(tmp_path, layout):
     """Such as those that macOS adds, and unfinished downloads."""
     path = LAYOUTS[layout](tmp_path)
-    path = path[0] if isinstance(path, tuple) else path
     before = open_sequence(path)
     for file in [file for file in tmp_path.rglob("*") if file.is_file()]:
         for prefix in ("._", "."):
@@ -130,6 +110,31 @@ def test_an_export_that_no_reader_opens_gets_a_line_with_the_remedy(tmp_path, fi
     with pytest.raises(ValueError, match=remedy) as error:
         open_sequence(tmp_path)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("layout", "file", "change"),
+    [
+        ("tum", "rgb.txt", lambda text: text.replace("# color images", "timestamp filename")),
+        ("tum", "rgb.txt", lambda text: text.replace(" ", ",").replace("#", "timestamp,filename #")),
+        ("euroc", "mav0/cam0/data.csv", lambda text: text.replace("#", "")),
+        ("euroc", "mav0/state_groundtruth_estimate0/data.csv", lambda text: text.replace("#", "")),
+        ("generic", "K.txt", lambda text: "a b c\n" + text),
+        ("arkitscenes", "*/*.traj", lambda text: "time rx ry rz tx ty tz\n" + text),
+        ("tartanair", "pose_left.txt", lambda text: "tx ty tz qx qy qz qw\n" + text),
+    ],
+)
+def test_a_table_may_begin_with_the_names_of_its_columns(tmp_path, layout, file, change):
+    """Without a #, as tables of pandas."""
+    path = LAYOUTS[layout](tmp_path)[0]
+    before = open_sequence(path)
+    (table,) = path.glob(file)
+    table.write_text(change(table.read_text()))
+    after = open_sequence(path)
+    assert after.names == before.names
+    for old, new in zip(before, after, strict=True):
+        np.testing.assert_array_equal(new.T_world_cam, old.T_world_cam)
+        np.testing.assert_array_equal(new.intrinsics, old.intrinsics)
 
 
 def test_eth3d(tmp_path):

@@ -13,6 +13,7 @@ from ufmstar_torch.eval.bench import measure as measurement
 from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.commands.options import joined
 from ufmstar_torch.eval.methods.suite import names, suite_named
+from ufmstar_torch.eval.report import write
 from ufmstar_torch.eval.suite.tasks import warned_once
 
 
@@ -35,12 +36,14 @@ def test_list_names_every_suite(ufmstar):
     assert "Table 4: every member on every image" in out
 
 
-def test_an_evaluation_ends_with_its_table_and_report(ufmstar, rooms, tmp_path):
+def test_an_evaluation_ends_with_its_table_and_report(ufmstar, rooms, tmp_path, monkeypatch):
+    monkeypatch.setattr(write, "_draw", lambda *_: ([], []))  # takes most of the time
     out = tmp_path / "out"
     code, text, err = ufmstar(*words_for(rooms, out, "--frames", "0:2", "--examples", "1"))
     assert code == 0, err
     assert all(name in text for name in ("DepthOnly", "UfM-DepthOnly-100K", "UfM*-DepthOnly"))
     assert (out / "tables" / "main.tex").is_file()
+    assert (out / "report.html").is_file()
     assert err.count("rooms/") == 3
     about = json.loads((out / "eval.json").read_text())
     assert about["settings"] == {"frames": [0, 2, None]}

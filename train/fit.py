@@ -74,13 +74,14 @@ def fit(job: Job, *, overwrite: bool = False, command: Sequence[str] = ()) -> di
 
 
 def plan(job: Job) -> str:
-    """The values of a training, and the number of its frames and steps, as lines. Writes nothing, and renders no tour.
-    Raises OSError, ValueError: as ``DepthDataModule.setup``."""
+    """The values of a training by their names in ``--set``, and the number of its frames and steps, as lines. Writes
+    nothing, and renders no tour. Raises OSError, ValueError: as ``DepthDataModule.setup``."""
     d, r = job.data, job.recipe
     tours = [d.tour_frames * count for count in (d.tours, d.validation_tours)]
     frames, validated = tours if d.kind == "tour" else [len(part) for part in sources(d)]
     values = identity(job)
-    rows = [(name, str(value)) for name, value in flat({**values.pop("recipe"), **values}).items()]
+    by_name = flat({**values.pop("recipe"), "session.precision": values.pop("precision"), **values})
+    rows = [(name.replace("data.augmentation.", "augment."), str(value)) for name, value in by_name.items()]
     steps = f"{r.max_steps or r.epochs * (frames // r.batch_size)} steps for each of {r.members} trained networks"
     return f"{text_table(rows)}\n{frames} frames to train on, {validated} to validate on; at most {steps}"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, nullcontext, suppress
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from ufmstar_torch.uncertain_depth import UncertainDepth
 
 _STANDARD_INPUT, _SUMMARY = "-", "realtime.json"
+_SILENCE = 10.0  # [s] without an image after the start, until a line says so
 # Options for opening that are also valid for a source that is no recording.
 _OF_LIVE = ("intrinsics", "trajectory", "poses", "pose_scale", "max_pose_gap")
 
@@ -182,14 +184,21 @@ def _shown_by(
     return on_result
 
 
-def _run(options: LiveOptions, live: LiveDepth, events: Iterator[LiveEvent]) -> tuple[LiveStatistics, Exception | None]:
+def _run(
+    options: LiveOptions, live: LiveDepth, events: Iterator[LiveEvent | None]
+) -> tuple[LiveStatistics, Exception | None]:
     """Push the events until they end, the time is over, or a signal comes. Returns the counts, and the error if any."""
-    deadline, warm = monotonic() + options.seconds, False
+    deadline, told, warm = math.inf, monotonic() + _SILENCE, False
     try:
         with interrupted_by_sigterm(), live, suppress(KeyboardInterrupt):
             for event in events:
                 if monotonic() >= deadline:
                     break
+                if not warm and monotonic() >= told:
+                    told = math.inf
+                    print(f"ufmstar live: no image yet from {options.source}", file=sys.stderr, flush=True)
+                if event is None:
+                    continue
                 if event.T_world_cam is not None:
                     live.push_pose(event.stamp, event.T_world_cam)
                 if event.image is not None:
@@ -204,7 +213,7 @@ def _run(options: LiveOptions, live: LiveDepth, events: Iterator[LiveEvent]) -> 
     return live.statistics, None
 
 
-def _events(options: LiveOptions, K: NDArray[np.float64] | None) -> Iterator[LiveEvent]:
+def _events(options: LiveOptions, K: NDArray[np.float64] | None) -> Iterator[LiveEvent | None]:
     """The source's images and poses; errors as ``open_sequence``. ``K``: intrinsics of the option."""
     from ufmstar_torch.eval.check.image_fit import image_fit, track_corners
     from ufmstar_torch.eval.sequences import live as sources
@@ -221,8 +230,7 @@ def _events(options: LiveOptions, K: NDArray[np.float64] | None) -> Iterator[Liv
         return sources.replay(sequence, options.speed)
     scale = 1.0 if opening.pose_scale is None else opening.pose_scale
     if options.source == _STANDARD_INPUT:
-        lines = iter(lambda: sys.stdin.readline(sources.LONGEST_LINE), "")
-        return sources.json_lines(lines, ".", opening.poses, scale, K)
+        return sources.json_lines(sources.lines_of(sys.stdin), ".", opening.poses, scale, K)
     poses = sources.PoseFile(str(opening.trajectory), opening.poses, scale)
     if options.follow:
         return sources.growing_folder(options.source, poses, options.idle)

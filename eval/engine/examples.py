@@ -3,9 +3,9 @@
 They are written while a sequence is evaluated, below its folder::
 
     examples/FRAME.npz      image [h, w, 3] uint8, truth [h, w] float32 [m] (0 = none), K [3, 3] [px], index
-    examples/FRAME@ROW.npz  depth [m], and if the row has them variance, aleatoric, epistemic, disagreement [m^2] and
-                            measured (share of the disagreement from two places), each [h, w] float32;
-                            also image, truth and K if the row's differ from the frame's
+    examples/FRAME@ROW.npz  depth [m], and if the row has them variance, aleatoric, epistemic, disagreement [m^2],
+                            measured (share of the disagreement from two places) and posterior_outlier, each [h, w]
+                            float32; also image, truth and K if the row's differ from the frame's
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from ufmstar_torch.files.write import write_atomic
 
 _EXAMPLES = 3  # frames, evenly spaced
 _POINTS = 4  # along each side of a pixel, for the picture
-_MAPS = ("depth", "variance", "aleatoric", "epistemic", "disagreement", "measured")
+_MAPS = ("depth", "variance", "aleatoric", "epistemic", "disagreement", "measured", "posterior_outlier")
 
 
 class ExampleWriter:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.run.colours import known_where, striped
+from ufmstar_torch.eval.run.colours import known_where
 from ufmstar_torch.files.read import read_npz_whole
 from ufmstar_torch.steps.regress import HALF
 
@@ -31,6 +31,8 @@ class RowMaps:
         nll: (g - d)^2 / (2 v) + 0.5 ln(2 pi v) [nats], NaN also where v = 0; float64.
         roots: square roots of the parts of the variance that the row has, by their names in ``PARTS`` [m].
         unmeasured: bool, True where M has one view only; None if the row has no M.
+        assumed: bool, True where sigma has no evidence: that of a posterior before the first anchor, else where M is
+            unmeasured; None if the row has neither.
     """
 
     depth: Map
@@ -39,6 +41,7 @@ class RowMaps:
     nll: NDArray[np.float64]
     roots: Mapping[str, Map]
     unmeasured: NDArray[np.bool_] | None
+    assumed: NDArray[np.bool_] | None
 
     @classmethod
     def of(cls, stored: Mapping[str, NDArray], truth: Map) -> RowMaps:
@@ -49,6 +52,7 @@ class RowMaps:
             judged = valid & (truth > 0) & np.isfinite(truth)
             v = np.where(judged & (variance > 0), variance, np.nan).astype(np.float64)
             error = known_where(judged, np.abs(depth - truth))
+        unmeasured = stored["measured"] < HALF if "measured" in stored else None
         exact = np.where(judged, depth, 0).astype(np.float64) - np.where(judged, truth, 0)
         return cls(
             depth=known_where(valid, depth),
@@ -56,7 +60,8 @@ class RowMaps:
             sigma=_root(variance, valid),
             nll=exact**2 / (2 * v) + 0.5 * np.log(2 * math.pi * v),
             roots={name: _root(stored[name], valid) for name in PARTS if name in stored},
-            unmeasured=stored["measured"] < HALF if "measured" in stored else None,
+            unmeasured=unmeasured,
+            assumed=np.isnan(stored["posterior_outlier"]) if "posterior_outlier" in stored else unmeasured,
         )
 
     @property
@@ -64,10 +69,6 @@ class RowMaps:
         """The mean NLL [nats]; None if no pixel has an NLL."""
         judged = self.nll[np.isfinite(self.nll)]
         return float(judged.mean()) if judged.size else None
-
-    def striped(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """A picture [h, w, 3] of M or sigma, striped where M was not measured."""
-        return rgb if self.unmeasured is None else striped(rgb, self.unmeasured)
 
 
 def _root(variance: Map, valid: NDArray[np.bool_]) -> Map:

@@ -17,7 +17,7 @@ from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.examples import PARTS, Example, RowMaps, find_examples
 from ufmstar_torch.eval.report.quantities import row_labels
-from ufmstar_torch.eval.run.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range
+from ufmstar_torch.eval.run.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range, striped
 from ufmstar_torch.eval.run.panels import Bar, GridRow, Panel, draw_grid
 
 OVERVIEW, STRIP, BREAKDOWN, COMPARE = "overview", "strip", "breakdown", "compare"
@@ -164,7 +164,7 @@ def draw_breakdown(folder: Path, example: Example, rows: Sequence[str]) -> Pictu
     for row in rows:
         maps = example.rows[row]
         a, e, m = (length.rgb(maps.roots[part]) if part in maps.roots else None for part in PARTS)
-        parts = [Panel(rgb, absent="none") for rgb in (a, e, None if m is None else maps.striped(m))]
+        parts = [Panel(rgb, absent="none") for rgb in (a, e, None if m is None else striped(m, maps.unmeasured))]
         judged = (_sigma(maps, length), length.rgb(maps.error), NLL_SCALE.rgb(maps.nll))
         body.append(GridRow(example.labels[row], figures_of(maps), [*parts, *map(Panel, judged)]))
     captions = ("√A, aleatoric", "√E, epistemic", "√M, between views", "σ = √V, V = A + E + M", "|error|", "NLL")
@@ -202,7 +202,7 @@ def draw_comparison(folder: Path, example: Example, pair: Sequence[str], base: s
 
 
 def _sigma(maps: RowMaps, scale: ColourScale) -> np.ndarray:
-    return maps.striped(scale.rgb(maps.sigma))
+    return striped(scale.rgb(maps.sigma), maps.assumed)
 
 
 def figures_of(maps: RowMaps) -> list[str]:

@@ -105,9 +105,9 @@ def legend_below(figure: Any) -> None:
 
 
 def save_figure(figure: Any, path: Path) -> None:
-    """Write a figure in the format of the suffix (.svg or .png); the same figure gives the same bytes."""
+    """Write a figure in the format of the suffix; the same figure gives the same bytes of .svg, .png and .jpg."""
     matplotlib = require_matplotlib()
     kind = path.suffix.removeprefix(".")
-    plain = {"Date": None} if kind == "svg" else {"Software": None}
+    plain = {"svg": {"Date": None}, "png": {"Software": None}}.get(kind)
     with matplotlib.rc_context({"svg.hashsalt": "ufmstar"}):
         write_atomic(path, lambda file: figure.savefig(file, format=kind, metadata=plain))

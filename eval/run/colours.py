@@ -77,8 +77,10 @@ def known_where(condition: NDArray[np.bool_], values: NDArray[Any]) -> NDArray[n
     return np.where(condition, values, np.nan).astype(np.float32)
 
 
-def striped(rgb: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """A picture [h, w, 3] with diagonal grey stripes over a third of the pixels ``where`` [h, w]."""
+def striped(rgb: NDArray[np.uint8], where: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
+    """A picture [h, w, 3] with diagonal grey stripes over a third of the pixels ``where`` [h, w]; None = nowhere."""
+    if where is None:
+        return rgb
     third = max(2, len(rgb) // 110)
     across = np.add.outer(np.arange(where.shape[0]), np.arange(where.shape[1])) // third % 3 == 0
     return np.where((where & across)[..., None], np.uint8(INVALID_GREY), rgb)

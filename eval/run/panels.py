@@ -209,7 +209,7 @@ class MapColumn(NamedTuple):
         rgb = self.scale.rgb(panel.maps[self.field])
         of_ufm = "ufm_sigma" if "ufm_sigma" in panel.maps else "sigma"
         measured = panel.maps.get("measured") if self.field == of_ufm else None
-        return rgb if measured is None else colours.striped(rgb, measured < HALF)
+        return colours.striped(rgb, None if measured is None else measured < HALF)
 
 
 def map_columns(panels: Sequence[FramePanel]) -> list[MapColumn]:

@@ -15,7 +15,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, BinaryIO
+from queue import Empty, Queue
+from threading import Thread
+from typing import Any, BinaryIO, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,10 +141,11 @@ def camera(index: int, poses: PoseFile) -> Iterator[LiveEvent]:
 
 def growing_folder(
     folder: str | Path, poses: PoseFile, idle: float = math.inf, clock: Callable[[], float] = time.monotonic
-) -> Iterator[LiveEvent]:
+) -> Iterator[LiveEvent | None]:
     """Yield new images of a folder, also those that replace earlier ones, in the order of their names, and the poses of
     a file. The time of an image is its name if that is a number ([s], or [ns], [us] as ``stem_times``), else that of
-    the file. Ends after ``idle`` seconds without a new image. Raises FileNotFoundError: no such folder."""
+    the file; None after every look. Ends after ``idle`` seconds without a new image. Raises FileNotFoundError: no such
+    folder."""
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"no such folder: {folder}")
@@ -168,7 +171,34 @@ def growing_folder(
             seen[path.name] = changed
             last, times = clock(), stem_times([path.stem])
             yield LiveEvent(written if times is None else float(times[0]), image)
+        yield None
         time.sleep(_POLL)
+
+
+def lines_of(file: TextIO) -> Iterator[str | None]:
+    """The lines of a stream such as the standard input, and None while none comes. Raises the errors of the stream."""
+    lines: Queue[str | Exception] = Queue(1)
+
+    def read() -> None:
+        try:
+            while line := file.readline(LONGEST_LINE):
+                lines.put(line)
+            lines.put("")
+        except (OSError, ValueError) as error:
+            lines.put(error)
+
+    Thread(target=read, daemon=True).start()
+    while True:
+        try:
+            line = lines.get(timeout=_POLL)
+        except Empty:
+            yield None
+            continue
+        if isinstance(line, Exception):
+            raise line
+        if not line:
+            return
+        yield line
 
 
 def _changed(path: Path) -> int | None:
@@ -180,12 +210,12 @@ def _changed(path: Path) -> int | None:
 
 
 def json_lines(
-    lines: Iterable[str],
+    lines: Iterable[str | None],
     folder: str | Path = ".",
     convention: str = OURS,
     scale: float = 1.0,
     intrinsics: NDArray[np.float64] | None = None,
-) -> Iterator[LiveEvent]:
+) -> Iterator[LiveEvent | None]:
     """Events from lines such as ``{"stamp": 1.5, "pose": [x, y, z, qx, qy, qz, qw], "image": "a.jpg"}``.
 
     ``pose`` has 7 numbers, or the 12 or 16 of a matrix (nested or not). ``image`` is a file, or its content as
@@ -193,10 +223,15 @@ def json_lines(
     line. Another line has a stamp and at least one of pose and image. Relative files are in ``folder``; poses are as in
     :class:`PoseFile`. An image that cannot be read is left out; the first one and their number are logged, and so is a
     last line that ends in its middle, as of a program that was killed. Raises ValueError: a line has another form or
-    ``LONGEST_LINE`` characters, or an image is without intrinsics; the message has the line's number.
+    ``LONGEST_LINE`` characters, or an image is without intrinsics; the message has the line's number. For a line None
+    there is None, so that a caller can stop while none comes.
     """
-    convert, unreadable, K = CONVENTIONS[convention].convert, 0, intrinsics
-    for number, line in enumerate(lines, start=1):
+    convert, unreadable, number, K = CONVENTIONS[convention].convert, 0, 0, intrinsics
+    for line in lines:
+        if line is None:
+            yield None
+            continue
+        number += 1
         if not line.strip():
             continue
         try:

@@ -37,8 +37,8 @@ _UNIT, _AT_ONCE = 8.0, 2
 _INVERSE, _RANKED, _SPREAD = -0.3, 20, 0.1
 _COMPARED = 200  # largest number of anchors of which the order is compared
 
-# Frames that are all judged, and the interval of those after them: a frame takes .1 ms.
-_FIRST, _EVERY = 64, 16
+# A frame takes .2 ms: the interval of the judged ones grows by one with so many frames, to the largest one.
+_FIRST, _EVERY = 16, 16
 
 # Pixel, depth and variance, the mask of usable anchors, and the frame -> the checked fields of ``Anchors``: pixel,
 # index, predicted, depth, variance, valid, rejected and contradiction.
@@ -144,15 +144,18 @@ class AnchorDoubts:
     def judge(self, anchors: Anchors, checked: Anchors, size: tuple[int, int]) -> None:
         """Warn of implausible anchors [B, N] of a frame of ``size`` (H, W), given to the step and as checked."""
         self._calls += 1
-        seldom = self._calls > _FIRST and self._calls % _EVERY
+        seldom = self._calls % max(1, min(self._calls // _FIRST, _EVERY))
         if seldom or not checked.mask.is_cpu or not checked.mask.shape[1]:
             return
-        log_once(self._logged, (*self._pixels(anchors, size), *self._depths(checked)))
+        log_once(self._logged, (*self._pixels(anchors, checked, size), *self._depths(checked)))
 
-    def _pixels(self, anchors: Anchors, size: tuple[int, int]) -> Iterator[tuple[int, str, str]]:
+    def _pixels(self, anchors: Anchors, checked: Anchors, size: tuple[int, int]) -> Iterator[tuple[int, str, str]]:
         height, width = size
-        for b, (pixel, depth) in enumerate(zip(array(anchors.pixel), array(anchors.depth), strict=True)):
-            pixel = pixel[np.isfinite(pixel).all(1) & (depth > 0) & array(anchors.mask[b])]
+        arrays = (array(x) for x in (anchors.pixel, anchors.depth, anchors.mask, checked.mask, checked.pixel))
+        for b, (pixel, depth, given, usable, at) in enumerate(zip(*arrays, strict=True)):
+            if np.count_nonzero(usable) >= (1 - _EXCHANGED) * np.count_nonzero(given) and at.max() > 1:
+                continue  # as good as always, and found fast
+            pixel = pixel[np.isfinite(pixel).all(1) & (depth > 0) & given]
             if (count := len(pixel)) < _FEW:
                 continue
             nearest = np.rint(pixel)
@@ -197,8 +200,8 @@ class AnchorDoubts:
         anchors, predicted = np.log(array(checked.depth[b])[used]), array(checked.predicted[b])[used]
         if len(used) < _RANKED or anchors.std() < _SPREAD:
             return ""
-        ranks = [values.argsort().argsort() - (len(used) - 1) / 2 for values in (anchors, predicted)]
-        order = float(ranks[0] @ ranks[1] / (ranks[0] @ ranks[0]))
+        rank = np.arange(len(used)) - (len(used) - 1) / 2
+        order = float(rank @ predicted[anchors.argsort()].argsort().argsort() / (rank @ rank))
         self._inverse[b] += 1 if order < _INVERSE else -1
         if self._inverse[b] != _SUCCESSIVE:
             return ""

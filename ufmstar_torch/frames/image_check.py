@@ -8,7 +8,7 @@ the same as the last one although the camera moved. The depth of such an image i
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -32,6 +32,7 @@ _IMAGES = 8
 _SAME_SCENE = 0.5
 _BLACK = {torch.uint8: 1, torch.float32: 1 / 255, torch.float64: 1 / 255}  # largest value of a black image
 _BRIGHTEST = 8.0  # largest value of a normalised image, by a wide margin
+Values = Any  # an array or a tensor
 
 
 def warn_of_range(image: Tensor) -> None:
@@ -70,16 +71,32 @@ def _means_of_bytes(image: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.divide(grey, image.shape[1] * _CELL**2, dtype=np.float32)
 
 
-def shows_something(grey: Tensor) -> Tensor:
+def shows_something(grey: Values) -> Values:
     """[B] False where a reduced image [B, 1, h, w] lacks detail, or is almost everywhere black or saturated."""
-    around = avg_pool2d(grey, 3, 1, 1, count_include_pad=False)
-    detail = (grey - around).square().mean((1, 2, 3)).sqrt()
-    exposed = ((grey > _DARK) & (grey < _BRIGHT)).float().mean((1, 2, 3))
-    return (detail >= _DETAIL) & (exposed >= _SHARE)
+    one = _library(grey).ones_like(grey)
+    off = grey - _around(grey) / _around(one)
+    exposed = ((grey > _DARK) & (grey < _BRIGHT)).sum((1, 2, 3)) / (grey.shape[2] * grey.shape[3])
+    return ((off * off).mean((1, 2, 3)) >= _DETAIL**2) & (exposed >= _SHARE)
+
+
+def _around(values: Values) -> Values:
+    """The sums of maps [B, 1, h, w] over 3 x 3 cells, fewer at the border."""
+    rows = values + 0
+    rows[..., 1:, :] += values[..., :-1, :]
+    rows[..., :-1, :] += values[..., 1:, :]
+    total = rows + 0
+    total[..., 1:] += rows[..., :-1]
+    total[..., :-1] += rows[..., 1:]
+    return total
+
+
+def _library(values: Values) -> Any:
+    """The module whose functions take these values: small maps take a few times longer as tensors."""
+    return np if isinstance(values, np.ndarray) else torch
 
 
 class _Seen(NamedTuple):
-    """The last image of B streams, and what they have shown.
+    """The last image of B streams, and what they have shown: arrays, or tensors where images are on an accelerator.
 
     Attributes:
         grey: [B, 1, h, w] of the last image (``reduced``); NaN before it.
@@ -90,24 +107,34 @@ class _Seen(NamedTuple):
         frozen: [B] number of images in a row that are the same as the one before under another pose.
     """
 
-    grey: Tensor
-    pose: Tensor
-    first: Tensor
-    still: Tensor
-    empty: Tensor
-    frozen: Tensor
+    grey: Values
+    pose: Values
+    first: Values
+    still: Values
+    empty: Values
+    frozen: Values
 
     @classmethod
-    def before(cls, grey: Tensor, pose: Tensor) -> _Seen:
+    def before(cls, grey: Values, pose: Values) -> _Seen:
         """The streams before their first image."""
-        zero = torch.zeros(len(grey), dtype=torch.int64, device=grey.device)
-        nothing = torch.full_like(grey, torch.nan)
-        return cls(nothing, torch.full_like(pose, torch.nan), nothing, zero, zero, zero)
+        library = _library(grey)
+        zero, nothing = library.zeros_like(grey[:, 0, 0, 0], dtype=library.int64), grey * library.nan
+        return cls(nothing, pose * library.nan, nothing, zero, zero, zero)
 
-    def where(self, mask: Tensor, other: _Seen) -> _Seen:
-        """This for the streams of ``mask`` [B], ``other`` for the rest."""
-        pairs = zip(self, other, strict=True)
-        return _Seen(*(torch.where(mask.view(-1, *[1] * (a.dim() - 1)), a, b) for a, b in pairs))
+    def fits(self, grey: Values, pose: Values) -> bool:
+        """True if an image and its pose are of the same kind, device and shape."""
+        pairs = (self.grey, grey), (self.pose, pose)
+        if not all(type(a) is type(b) and a.shape == b.shape for a, b in pairs):
+            return False
+        return isinstance(grey, np.ndarray) or bool(self.grey.device == grey.device)
+
+    def without(self, streams: Sequence[int], before: _Seen) -> _Seen:
+        """These streams as they were ``before``, the others as they are; an index that the images lack is ignored."""
+        forgotten = _Seen(*(value + 0 for value in self))
+        for b in streams:
+            for value, old in zip(forgotten, before, strict=True) if b < len(self.still) else ():
+                value[b] = old[b]
+        return forgotten
 
 
 class ImageCheck:
@@ -124,16 +151,16 @@ class ImageCheck:
             self._examined = False  # whether an image waits for UfM*'s verdict
             self._logged = set[tuple[int, str]]()
         elif self._seen is not None:
-            self._seen = _Seen.before(self._seen.grey, self._seen.pose).where(_mask(streams, self._seen), self._seen)
+            self._seen = self._seen.without(streams, _Seen.before(self._seen.grey, self._seen.pose))
 
     def undo(self, streams: Sequence[int] | None = None) -> None:
         """Forget the last image of all streams, or of some, because UfM* refused or skipped it; once an image."""
         if self._examined and (streams is None or streams):
             now, before = self._seen, self._undone
-            if streams is None or now is None or before is None or before.grey.shape != now.grey.shape:
+            if streams is None or now is None or before is None or not before.fits(now.grey, now.pose):
                 self._seen = before
             else:
-                self._seen = _Seen(*(value.to(now.still.device) for value in before)).where(_mask(streams, now), now)
+                self._seen = now.without(streams, before)
         self._examined = False
 
     def informative(self, image: Tensor, pose: Tensor) -> Tensor | None:
@@ -147,48 +174,41 @@ class ImageCheck:
         fits = pose.dim() == 2 or len(pose) in (1, len(image))  # if not, UfM* names it
         if image.is_meta or not fits or not (image.dtype == torch.uint8 or _in_unit_range(image)):
             return None
-        grey = reduced(image.detach())
-        T = pose.detach().to(grey.device).double().expand(len(grey), *pose.shape[-2:]).clone()
+        values: tuple[Values, Values] = reduced(image.detach()), pose.detach().to(image.device).double()
+        grey, T = (value.numpy() for value in values) if image.is_cpu else values
+        T = _library(T).broadcast_to(T, (len(grey), *T.shape[-2:])) + 0.0
         self._undone = last = self._seen
-        if last is None or last.grey.shape != grey.shape or last.pose.shape != T.shape:
+        if last is None or not last.fits(grey, T):
             last = _Seen.before(grey, T)
-        last = _Seen(*(value.to(grey.device) for value in last))
-        changed = (last.pose != T).flatten(1).any(1)
-        same = (grey == last.grey).flatten(1).all(1)
+        where, b = _library(grey).where, len(grey)
+        changed = (last.pose != T).reshape(b, -1).any(1)
+        same = (grey == last.grey).reshape(b, -1).all(1)
         shows, frozen = shows_something(grey), same & changed
-        still = torch.where(changed, 0, last.still + 1)
-        first = torch.where(changed[:, None, None, None], grey, last.first)
-        empty = torch.where(shows, 0, last.empty + 1)
-        repeated = torch.where(changed, torch.where(same, last.frozen + 1, 0), last.frozen)
+        still = where(changed, 0, last.still + 1)
+        first = where(changed[:, None, None, None], grey, last.first)
+        empty = where(shows, 0, last.empty + 1)
+        repeated = where(changed, where(same, last.frozen + 1, 0), last.frozen)
         self._seen = _Seen(grey, T, first, still, empty, repeated)
         self._examined = True
-        if image.is_cpu:  # on an accelerator, reading the counts would synchronise
-            log_once(self._logged, (*_findings(self._seen), *_moving(self._seen)))
-        return shows & ~frozen
-
-
-def _mask(streams: Sequence[int], seen: _Seen) -> Tensor:
-    """[B] True for the streams; an index that the images do not have is ignored."""
-    mask = torch.zeros(len(seen.still), dtype=torch.bool)
-    mask[[b for b in streams if b < len(mask)]] = True
-    return mask.to(seen.still.device)
+        informative = shows & ~frozen
+        if not image.is_cpu:  # reading the counts would synchronise
+            return informative
+        log_once(self._logged, _findings(self._seen))
+        return torch.from_numpy(informative)
 
 
 def _findings(seen: _Seen) -> Iterator[tuple[int, str, str]]:
-    for b in (seen.empty == _IMAGES).nonzero().flatten().tolist():
-        text = f"{_IMAGES} images in a row show nothing (black, saturated, blurred, or a covered lens): their "
-        yield b, "empty", text + "depth is a guess, so it counts as unmeasured"
-    for b in (seen.frozen == _IMAGES).nonzero().flatten().tolist():
-        text = f"the image was the same in {_IMAGES + 1} frames of a moving camera: is it updated? Its depth counts "
-        yield b, "frozen", text + "as unmeasured"
-
-
-def _moving(seen: _Seen) -> Iterator[tuple[int, str, str]]:
-    due = (seen.still > 0) & (seen.still % _IMAGES == 0)
-    for b in due.nonzero().flatten().tolist():
-        both = torch.stack([seen.grey[b].flatten(), seen.first[b].flatten()])
-        if float(torch.corrcoef(both)[0, 1]) < _SAME_SCENE:
-            text = f"the pose was the same in {int(seen.still[b]) + 1} images, which show different scenes: is the "
+    for b, (empty, frozen, still) in enumerate(zip(seen.empty, seen.frozen, seen.still, strict=True)):
+        if empty == _IMAGES:
+            text = f"{_IMAGES} images in a row show nothing (black, saturated, blurred, or a covered lens): their "
+            yield b, "empty", text + "depth is a guess, so it counts as unmeasured"
+        if frozen == _IMAGES:
+            text = f"the image was the same in {_IMAGES + 1} frames of a moving camera: is it updated? Its depth "
+            yield b, "frozen", text + "counts as unmeasured"
+        if still == 0 or still % _IMAGES:
+            continue
+        if np.corrcoef(seen.grey[b].ravel(), seen.first[b].ravel())[0, 1] < _SAME_SCENE:
+            text = f"the pose was the same in {still + 1} images, which show different scenes: is the "
             yield b, "pose", text + "pose updated, and has SLAM started?"
 
 

@@ -6,7 +6,8 @@ function.
 This is the only file that uses numba's private interfaces (``tests/test_warm_up.py`` fails where numba changes them).
 numba optimises each function, makes machine code of it, and repeats both in every function that calls it. Here only
 kernels are optimised and made machine code, together with their parts, and only those of numba's passes run that such
-plain code needs. This halves the time of the first start.
+plain code needs. What numba has found out about a call's types is not found out again. This more than halves the time
+of the first start.
 
 A cached kernel is valid while its code, its parts and their constants are unchanged, wherever their files lie
 (:func:`code_stamp`): numba itself compares the time of the kernel's file, and would use an outdated part. A damaged
@@ -15,6 +16,7 @@ file, or one that cannot be written, is reported once (logger ``ufmstar_torch``)
 
 from __future__ import annotations
 
+import copy
 import functools
 import hashlib
 import inspect
@@ -42,7 +44,6 @@ _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wra
 _PASSES = (
     untyped_passes.TranslateByteCode,
     untyped_passes.FixupArgs,
-    untyped_passes.IRProcessing,
     untyped_passes.GenericRewrites,
     untyped_passes.ReconstructSSA,
     typed_passes.NopythonTypeInference,
@@ -87,7 +88,13 @@ def _optimisation(generator: Any) -> tuple[Any, Any]:
 
 
 class _Library(codegen.JITCodeLibrary):
-    """LLVM's code of a kernel with its parts, optimised once."""
+    """LLVM's code of a kernel with its parts, each linked once, optimised once."""
+
+    def add_linking_library(self, library: Any) -> None:
+        parts = library._linking_libraries if isinstance(library, _PartLibrary) else []
+        for needed in (library, *parts):  # in this order: LLVM drops a function that nothing uses yet
+            if needed not in self._linking_libraries:
+                super().add_linking_library(needed)
 
     def _optimize_functions(self, ll_module: Any) -> None:
         ll_module.data_layout = self._codegen._data_layout
@@ -100,10 +107,9 @@ class _Library(codegen.JITCodeLibrary):
 class _PartLibrary(_Library):
     """LLVM's code of a part, which kernels link."""
 
-    def _optimize_final_module(self) -> None:
-        """Do nothing: the kernel is optimised with its parts."""
-
-    def _finalize_final_module(self) -> None:
+    def finalize(self) -> None:
+        """Leave linking and optimising to the kernels: they link a part's own parts too."""
+        self._raise_if_finalized()
         self._finalize_dynamic_globals()
         self._finalized = True
 
@@ -137,6 +143,12 @@ class _PartLowering(typed_passes.NativeLowering):
         return super().run_pass(state)
 
 
+@functools.cache
+def _call_type(typing: Any, function: Any, arguments: tuple[types.Type, ...]) -> Any:
+    """The signature of a call. numba tries a dozen implementations for every use of an operator."""
+    return typing.resolve_function_type(function, arguments, {})
+
+
 class _Kernel(compiler.CompilerBase):
     """Compiler passes over a kernel."""
 
@@ -144,6 +156,16 @@ class _Kernel(compiler.CompilerBase):
 
     def __init__(self, typingctx, targetctx, library, args, return_type, flags, locals) -> None:
         super().__init__(typingctx, targetctx, library, args, return_type, _Flags(flags), locals)
+        # Both contexts are this compilation's own, so that others are not changed.
+        self.state.targetctx.refresh = functools.cache(self.state.targetctx.refresh)  # not once for each call
+        self.state.typingctx = copy.copy(typingctx)
+        self.state.typingctx.resolve_function_type = functools.partial(self._resolve, typingctx)
+
+    @staticmethod
+    def _resolve(typingctx: Any, function: Any, arguments: tuple[Any, ...], keywords: Mapping[str, Any]) -> Any:
+        if keywords or not all(isinstance(x, types.Type) and x.is_precise() for x in arguments):
+            return typingctx.resolve_function_type(function, arguments, keywords)
+        return _call_type(typingctx, function, tuple(arguments))
 
     def define_pipelines(self) -> list[PassManager]:
         manager = PassManager("ufmstar_torch")

@@ -88,6 +88,10 @@ class PosteriorConfig(Checked):
     prior_sigma: ClassVar[float] = 0.5
     # tau [1/frame^.5]: standard deviation of the change of b's constant from frame to frame
     drift: ClassVar[float] = 0.05
+    # c_1 [1]: variance of the scale in a view that shares nothing with the evidence, over ``between``
+    places: ClassVar[float] = 3.0
+    # c_2 [1]: power of the mean distance from evidence by which a frame with anchors confirms the scale of its view
+    confirmed: ClassVar[float] = 4.0
 
     @property
     def prior_variance(self) -> tuple[float, float, float, float]:

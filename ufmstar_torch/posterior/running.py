@@ -75,21 +75,24 @@ def priors(config: PosteriorConfig) -> Floats:
     return np.ascontiguousarray(np.array([columns[ratio] for ratio in range(RATIOS)]).T)
 
 
-SIZE = 2 + 2 * RATIOS + SLOPES + FEATURES + _MATRIX + 1 + len(LEVELS)
-_PARTS = (2, 2 * RATIOS, SLOPES, FEATURES, _MATRIX, 1 + len(LEVELS))
+_POSE = 12
+_PARTS = (3, 2 * RATIOS, SLOPES, FEATURES, _MATRIX, 1 + len(LEVELS), _POSE)
+SIZE = sum(_PARTS)
 
 
 class Memory(NamedTuple):
     """The memory of one stream. Zeros are the start.
 
     Attributes:
-        frames: [2] number of frames with anchors, and m_0 of the last frame.
+        frames: [3] number of frames with anchors; m_0 of the last frame; and the share of its view whose scale no
+            evidence has confirmed (``overlap``).
         sums: [2, R] numerators and denominators of the ratios.
         slopes: [3] mean of the slopes in the coefficients over the frames with anchors, with the half-life and with
             ``slope_weight`` frames of 0.
         coefficients: [4] of the features in the last frame.
         covariance: [4, 4] of the coefficients.
         intervals: [4] (``conformal.adapt``).
+        pose: [12] first three rows of the last frame's pose [4, 4], camera-to-world [m].
     """
 
     frames: Floats
@@ -98,20 +101,21 @@ class Memory(NamedTuple):
     coefficients: Floats
     covariance: Floats
     intervals: Floats
+    pose: Floats
 
 
 def views(packed: Floats) -> Memory:
     """The parts of a memory [SIZE], which share its numbers."""
     ends = np.cumsum(_PARTS)
-    frames, sums, slopes, b, covariance, intervals = (
+    frames, sums, slopes, b, covariance, intervals, pose = (
         packed[end - size : end] for size, end in zip(_PARTS, ends.tolist(), strict=True)
     )
-    return Memory(frames, sums.reshape(2, RATIOS), slopes, b, covariance.reshape(FEATURES, FEATURES), intervals)
+    return Memory(frames, sums.reshape(2, RATIOS), slopes, b, covariance.reshape(FEATURES, FEATURES), intervals, pose)
 
 
 def require(packed: Tensor) -> None:
     """Raise a ValueError if no anchors can have led to the memory [B, SIZE]."""
-    frames, sums, _, _, covariance, intervals = packed.split(_PARTS, 1)
+    frames, sums, _, _, covariance, intervals, _ = packed.split(_PARTS, 1)
     matrix = covariance.reshape(-1, FEATURES, FEATURES)
     counts = torch.cat([frames[:, :1], sums], 1)[:, [i for i in range(1 + 2 * RATIOS) if i != 1 + CENTRE]]
     scale = matrix.abs().amax((1, 2)).clamp(1e-300, 1e300)
@@ -121,6 +125,7 @@ def require(packed: Tensor) -> None:
         f"values beyond {LARGEST:g}": packed.abs() > LARGEST,
         "negative sums": counts < 0,
         "a mean log depth out of range": frames[:, 1].abs() > LARGEST_LOG,
+        "a share outside of [0, 1]": (frames[:, 2] - 0.5).abs() > 0.5,
         "a covariance with negative eigenvalues": low < -1e-6,
         "a number of frames with scores that is not whole": (scored < 0) | (scored != scored.round()),
         "quantiles beyond a factor of 10": factors.abs() > math.log(LARGEST_FACTOR) + 1e-9,
@@ -159,7 +164,7 @@ def after_frame(memory, priors, ratio, above, below, config):
 def restart(memory: Memory, config: PosteriorConfig) -> None:
     """Return to the initial coefficients and slopes: wrong poses can have corrupted them. The ratios depend on network
     and scene and remain."""
-    memory.slopes[:], memory.coefficients[:] = 0, 0
+    memory.slopes[:], memory.coefficients[:], memory.frames[2] = 0, 0, 0
     memory.covariance[:] = np.diag(config.prior_variance) if memory.frames[0] > 0 else 0
 
 

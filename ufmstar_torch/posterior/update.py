@@ -92,6 +92,7 @@ from ufmstar_torch.posterior.field import at
 from ufmstar_torch.posterior.learn import sums_of
 from ufmstar_torch.posterior.moments import divide, second_moments
 from ufmstar_torch.posterior.motion import in_image, plausible, probability, surfaces, tested, tests_at
+from ufmstar_torch.posterior.overlap import confirm, scale_elsewhere
 from ufmstar_torch.posterior.running import (
     BETWEEN,
     CALIBRATION,
@@ -182,7 +183,8 @@ def update(
     if device.type == "meta":
         one, levels = packed[:, 0], packed[:, : len(LEVELS)]
         return packed, Posterior(frame.depth, claimed, frame.depth, claimed, one, one, levels)
-    before, *maps = (array(x) for x in (packed, frame.depth, frame.valid, claimed))
+    view = frame.T_world_cam, frame.intrinsics
+    before, *maps = (array(x) for x in (packed, frame.depth, frame.valid, claimed, *view))
     after, outputs = before.copy(), np.empty((4, *maps[0].shape), maps[0].dtype)
     shown = np.empty((len(before), _SHOWN))
     streams = zip(after, *maps, _anchors(anchors, len(before)), zip(*outputs, strict=True), shown, strict=True)
@@ -206,7 +208,7 @@ def _anchors(anchors: Anchors | None, streams: int) -> list[_Found]:
 
 def _of_stream(
     config: PosteriorConfig, floor: float, packed: Floats, depth: NDArray[Any], valid: NDArray[np.bool_],
-    claimed: NDArray[Any], found: _Found, outputs: tuple[NDArray[Any], ...], shown: Floats,
+    claimed: NDArray[Any], pose: Floats, K: Floats, found: _Found, outputs: tuple[NDArray[Any], ...], shown: Floats,
 ) -> None:  # fmt: skip
     """Change the memory [SIZE]; write depth, variance, probability of another surface and inlier variance [H, W] to the
     ``outputs``, and the figures [5] that ``Posterior`` has of a stream."""
@@ -222,18 +224,19 @@ def _of_stream(
         memory = views(packed)
         if math.isinf(shared[0]):
             restart(memory, config)
-        of_frame(memory, maps, anchors, motion, priors(config), constants(config), outputs, shown)
+        of_frame(memory, maps, (pose, K), anchors, motion, priors(config), constants(config), outputs, shown)
         np.exp(factor, out=factor)
     finish(depth, factor, variance, inlier, (*shared, config.prior_sigma**2), floor)
 
 
 @kernel
-def of_frame(memory, maps, anchors, motion, priors, config, outputs, shown):
+def of_frame(memory, maps, view, anchors, motion, priors, config, outputs, shown):
     """The frame of one stream.
 
     Args:
         memory: :class:`~ufmstar_torch.posterior.running.Memory`; changed.
         maps: depth, valid, log of the depth, claimed variance [H, W].
+        view: pose [4, 4] camera-to-world [m], and K [3, 3] [px].
         anchors: :class:`AnchorRows`.
         motion: [M, 3] tests of motion (``motion.tests_at``); none if no value is finite.
         priors: [4, R] (``running.priors``).
@@ -259,8 +262,9 @@ def of_frame(memory, maps, anchors, motion, priors, config, outputs, shown):
     elif frames > 0 and _any(valid):
         b, covariance = expected(memory, grid.mean, config)
         drift(memory, grid.mean, b, covariance, config)
+    confirm(memory, view, depth.shape, grid, scene.noise.size, away, config)
     write_ratios(memory, priors, ratios)
-    nodes, x, mean, wide = _nodes(scene, field, left_out, away, ratios, config)
+    nodes, x, mean, wide = _nodes(scene, field, left_out, away, memory.frames[2], ratios, config)
     if tested(motion):
         _add_motion(nodes, x, mean, c, wide, motion, beyond, depth.shape, scene, field.coefficients, ratios, config)
     slopes = empty(FEATURES - 1, np.float64)
@@ -285,7 +289,7 @@ def _any(valid):
 
 
 @part
-def _nodes(scene, field, left_out, away, ratios, config):
+def _nodes(scene, field, left_out, away, unconfirmed, ratios, config):
     """The nodes of :func:`ufmstar_torch.posterior.cells.interpolate` without motion [6, n], their features [n, F], mean
     of y [n], and its variance on another surface [n]."""
     grid, b, n = scene.grid, field.coefficients, away.size
@@ -294,7 +298,7 @@ def _nodes(scene, field, left_out, away, ratios, config):
     for k in range(every.size):
         every[k] = True
     around, scales = spread_around(scene, every, b[0], config), local_scale(scene, left_out, every, config)
-    steep, share = steepness(field.offset, grid.rows, grid.cols), unmeasured(config, field.covariance[0, 0])
+    steep, scale = steepness(field.offset, grid.rows, grid.cols), scale_elsewhere(config, unconfirmed, ratios)
     for i in range(n):
         row = i // grid.cols
         features(
@@ -305,7 +309,9 @@ def _nodes(scene, field, left_out, away, ratios, config):
         for f in range(FEATURES):
             offset -= x[i, f] * b[f]
         unseen, factor = away[i] * ratios[UNSEEN], inlier_factor(config, ratios, away[i])
-        variance = at_pixels(config, factor, variance, ratios[ROUGHNESS], unseen, steep[i], share)
+        of_scale = scale * away[i] / config.reach
+        share = unmeasured(config, field.covariance[0, 0] + of_scale)
+        variance = at_pixels(config, factor, variance, ratios[ROUGHNESS], unseen, steep[i], share) + of_scale
         p = min(ratios[WRONG] * wrong_factor(config, away[i], scales[i]), MOST_WRONG)
         p, wide = misscaled(config, share, p, elsewhere_variance(config, around[i], unseen))
         means[i], wides[i], nodes[0, i], nodes[1, i] = mean, wide, grid.log_depth[i], offset

@@ -102,8 +102,8 @@ def along_wall(evidence: LandmarkTracker | DenseEvidence) -> None:
 
 @contextmanager
 def _no_collection() -> Iterator[None]:
-    """Disable garbage collection, which takes a tenth of a compilation's time; collect afterwards, because a collection
-    during a later frame would take half a second."""
+    """Disable garbage collection, which takes a tenth of a compilation's time. Afterwards collect what was made
+    meanwhile, 3 million objects after a compilation, before a frame has to; older objects would take .2 s more."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -111,4 +111,4 @@ def _no_collection() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
-            gc.collect()
+            gc.collect(1)

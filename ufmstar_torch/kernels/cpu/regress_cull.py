@@ -93,7 +93,12 @@ class View(NamedTuple):
 
 
 def in_view(
-    seen: Seen, depth: NDArray[np.floating], K: NDArray[np.float64], prior: tuple[float, float], *epsilon: float
+    seen: Seen,
+    depth: NDArray[np.floating],
+    K: NDArray[np.float64],
+    prior: tuple[float, float],
+    epsilon: float,
+    error: float,
 ) -> View:
     """The components that can matter in an image.
 
@@ -102,13 +107,13 @@ def in_view(
         depth: [H, W], not positive where invalid.
         K: [3, 3].
         prior: its weight and mean.
-        epsilon: of the culling for the image and for anchors, and of that for maps.
+        epsilon, error: of :class:`Settings`.
     """
     n, dtype = len(seen.disagreement), depth.dtype
     slot, fields, packed = np.empty(n, np.int64), np.empty((n, FIELDS)), np.empty((ROWS, padded(n)), dtype)
     terms = np.empty((n, TERMS), dtype)
     least = math.log2(prior[0]), math.log2(prior[0] * max(prior[1], _LEAST))
-    settings = Settings(*prior, *epsilon, *least, n)
+    settings = Settings(*prior, epsilon, error, *least, n)
     count = _in_view(*seen, K, depth, settings, slot, fields, packed, terms)
     return View(slot[:count], fields[:count], packed, terms[:count], settings)
 
