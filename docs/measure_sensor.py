@@ -5,7 +5,8 @@
 prints for each sequence figures on the removed half: of the network, and of the posterior with the rest of the depth as
 anchors alone, with dense anchors of the images alone, and with both (``--anchors sensor``), also by the cause of
 the removal. In each frame, a sixth of the depth is removed at depth edges, a sixth because it is farthest, and the
-remainder in discs of .03 to .12 image widths.
+remainder in discs of .03 to .12 image widths. The exact depth of tours gets the noise of ``--sensor``, blurred over 3
+pixels.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import torch
 from numpy.typing import NDArray
 
 from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStarConfig
+from ufmstar_torch.anchors.sensor import sensor_sigma
 from ufmstar_torch.eval.engine.judge import UFM
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.stream import FrameResult, frame_results
@@ -29,6 +31,7 @@ from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.open import open_sequence
+from ufmstar_torch.eval.tour.sequence import PREFIX
 
 SHARE, EACH = 0.5, 1 / 6  # of the depth: removed, and removed for each of the first two reasons
 DISCS = 0.03, 0.12  # radii [widths]
@@ -58,11 +61,18 @@ def removed(depth: NDArray[np.float32], seed: int) -> dict[str, NDArray[np.bool_
     return {EDGE: edge, FAR: far, DISC: disc}
 
 
-def rest(entry: Entry, seed: int) -> NDArray[np.float32]:
-    """The depth that serves as anchors."""
+def rest(entry: Entry, seed: int, noise: str | None) -> NDArray[np.float32]:
+    """The depth that serves as anchors, with the noise of a kind of sensor."""
+    import cv2
+
     assert entry.load_depth is not None
     depth = entry.load_depth()
-    return np.where(np.any([*removed(depth, seed).values()], axis=0), np.float32(0), depth)
+    left = np.where(np.any([*removed(depth, seed).values()], axis=0), np.float32(0), depth)
+    if noise is None:
+        return left
+    noises = cv2.GaussianBlur(np.random.default_rng([seed, 1]).standard_normal(depth.shape), (0, 0), 1.0)
+    noisy = left + sensor_sigma(left.astype(np.float64), noise) * noises / noises.std()
+    return np.where(left > 0, noisy.clip(0.01), 0).astype(np.float32)
 
 
 class RemovedHalf:
@@ -95,8 +105,9 @@ def measure(path: str, weights: str, sensor: str | None, images: bool, frames: i
     whole = open_sequence(path)
     if frames is not None:
         whole = replace(whole, entries=whole.entries[:frames])
+    noise = sensor if path.startswith(PREFIX) else None
     entries = tuple(
-        replace(entry, load_depth=entry.load_depth and partial(rest, entry, seed), load_image=entry.load_image)
+        replace(entry, load_depth=entry.load_depth and partial(rest, entry, seed, noise), load_image=entry.load_image)
         for seed, entry in enumerate(whole.entries)
     )
     source = NetworkChoice("", "fastdepth", (weights,), None).load(torch.device("cpu"))

@@ -157,7 +157,7 @@ def main() -> None:
     parser.add_argument("--noise", type=float, default=0.0, help="rotation noise of every pose [degrees]")
     parser.add_argument("--fit", action="store_true", help="fit TRANSFER; on tours only")
     parser.add_argument("--figure", type=Path, help="PNG or SVG")
-    parser.add_argument("--picture", type=Path, help="PNG")
+    parser.add_argument("--picture", type=Path, help="PNG, SVG or JPG")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     errors, stops, curves = list[Tensor](), dict[str, Stops](), {}

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from ufmstar_torch import PosteriorConfig
+from ufmstar_torch.eval.sequences.frame import Entry
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 # A camera of 70 degrees.
@@ -173,3 +174,25 @@ def test_stated_outliers_are_found_where_the_mixture_is_right(script: Any) -> No
     np.testing.assert_allclose(found, stated, atol=0.01)
     assert share.sum() == pytest.approx(1)
     assert (found[2:] < 0.75 * mean[2:]).all()
+
+
+@pytest.mark.parametrize(
+    ("noise", "sigma"), [(None, 0.0), ("stereo", 0.001 + 0.003 * 2.5**2), ("tof", 0.01 + 0.01 * 2.5)]
+)
+def test_half_of_a_depth_camera_s_depth_is_removed(script: Any, noise: str | None, sigma: float) -> None:
+    """Each reason removes about a sixth, no pixel is removed twice, and the rest has the noise of the sensor."""
+    sensor, depth = script("measure_sensor"), np.full((240, 320), 2.5, np.float32)
+    depth[100:180, 200:300], depth[:80], depth[220:, :30] = 1.5, np.linspace(5, 4, 80)[:, None], 0
+    causes = sensor.removed(depth, 0)
+    gone = np.stack([*causes.values()])
+    assert gone.sum(0).max() == 1
+    assert not gone[:, depth == 0].any()
+    shares = gone.sum((1, 2)) / (depth > 0).sum()
+    assert shares.sum() == pytest.approx(0.5, abs=0.03)
+    assert causes["far"].any()
+    assert depth[causes["far"]].min() > 4
+    left = sensor.rest(Entry("0", np.eye(4), None, depth.copy), 0, noise)
+    np.testing.assert_array_equal(left > 0, (depth > 0) & ~gone.any(0))
+    wall = left[(left > 0) & (depth == 2.5)]
+    assert wall.std() == pytest.approx(sigma, rel=0.1)
+    assert wall.mean() == pytest.approx(2.5, abs=0.01)

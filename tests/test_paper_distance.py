@@ -48,7 +48,7 @@ def distance(frames):
 @pytest.mark.numerics
 @pytest.mark.parametrize("seed", [200, pytest.param(31, marks=pytest.mark.slow)])
 def test_the_distance_on_rendered_tours(seed):
-    tour = open_sequence(f"tour:{seed}?frames=150&size=112x112&sensor=0")
+    tour = open_sequence(f"tour:{seed}?frames=150&size=88x88&sensor=0")
     rng, frames = np.random.default_rng(seed), []
     for n in range(0, 15, 5):
         frame = tour[n]

@@ -52,7 +52,6 @@ def test_files_whose_names_begin_with_a_dot_are_no_frames(tmp_path, layout):
 def test_names_in_another_case_are_found(tmp_path, layout):
     """As of files that were copied from Windows or a camera's card: IMG_0.JPG, where a list names IMG_0.jpg."""
     path = LAYOUTS[layout](tmp_path)
-    path = path[0] if isinstance(path, tuple) else path
     before = open_sequence(path)
     names, frame = before.names, before[0]
     for file in [file for file in tmp_path.rglob("*") if file.suffix in (".png", ".jpg", ".npy", ".txt")]:
@@ -110,6 +109,31 @@ def test_an_export_that_no_reader_opens_gets_a_line_with_the_remedy(tmp_path, fi
     with pytest.raises(ValueError, match=remedy) as error:
         open_sequence(tmp_path)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("layout", "file", "change"),
+    [
+        ("tum", "rgb.txt", lambda text: text.replace("# color images", "timestamp filename")),
+        ("tum", "rgb.txt", lambda text: text.replace(" ", ",").replace("#", "timestamp,filename #")),
+        ("euroc", "mav0/cam0/data.csv", lambda text: text.replace("#", "")),
+        ("euroc", "mav0/state_groundtruth_estimate0/data.csv", lambda text: text.replace("#", "")),
+        ("generic", "K.txt", lambda text: "a b c\n" + text),
+        ("arkitscenes", "*/*.traj", lambda text: "time rx ry rz tx ty tz\n" + text),
+        ("tartanair", "pose_left.txt", lambda text: "tx ty tz qx qy qz qw\n" + text),
+    ],
+)
+def test_a_table_may_begin_with_the_names_of_its_columns(tmp_path, layout, file, change):
+    """Without a #, as tables of pandas."""
+    path = LAYOUTS[layout](tmp_path)
+    before = open_sequence(path)
+    (table,) = path.glob(file)
+    table.write_text(change(table.read_text()))
+    after = open_sequence(path)
+    assert after.names == before.names
+    for old, new in zip(before, after, strict=True):
+        np.testing.assert_array_equal(new.T_world_cam, old.T_world_cam)
+        np.testing.assert_array_equal(new.intrinsics, old.intrinsics)
 
 
 def test_eth3d(tmp_path):

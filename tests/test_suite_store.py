@@ -90,32 +90,6 @@ def enter(*arguments, **how):
         pass
 
 
-def test_a_folder_is_begun_continued_and_replaced_only_as_asked(tmp_path):
-    out = tmp_path / "out"
-    enter(out, ABOUT)
-    made = out / "records" / "d" / "s" / "A.json"
-    made.parent.mkdir(parents=True)
-    made.write_text("{}")
-    enter(out, ABOUT)
-    assert made.exists(), "the same evaluation continues"
-    with pytest.raises(FolderError, match="--overwrite replaces it"):
-        enter(out, {**ABOUT, "suite": "y"})
-    enter(out, {**ABOUT, "suite": "y"}, overwrite=True)
-    assert json.loads((out / "eval.json").read_text())["suite"] == "y"
-    assert not made.exists()
-
-
-def test_files_of_someone_else_are_not_touched(tmp_path):
-    (tmp_path / "thesis.tex").write_text("x")
-    with pytest.raises(FolderError, match="files of someone else"):
-        enter(tmp_path, ABOUT)
-    with pytest.raises(FolderError, match="files of someone else"):
-        enter(tmp_path, ABOUT, overwrite=True)
-    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
-    with pytest.raises(FolderError, match="is a file"):
-        enter(tmp_path / "thesis.tex", ABOUT)
-
-
 def test_overwriting_removes_our_files_alone(tmp_path):
     root, out = write_rooms(tmp_path / "rooms", ["ash"]), tmp_path / "out"
     go(job_on(root, out))
@@ -131,15 +105,6 @@ def test_overwriting_removes_our_files_alone(tmp_path):
     assert [file.exists() for file in made] == [False, False, True]
     after = {path.name for path in out.rglob("*") if path.is_file()}
     assert after == {"eval.json", "eval.lock", "kept", *(file.name for file in users)}
-
-
-def test_a_folder_is_evaluated_by_one_process(tmp_path):
-    out = tmp_path / "out"
-    with evaluation_folder(out, ABOUT):
-        for how in ({}, {"overwrite": True}):
-            with pytest.raises(FolderError, match="another evaluation is writing there now"):
-                enter(out, ABOUT, **how)
-    enter(out, ABOUT, overwrite=True)
 
 
 @pytest.mark.parametrize(

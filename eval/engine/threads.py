@@ -1,4 +1,4 @@
-"""One thread that reads frames ahead of the loop, and one that judges and writes them behind it.
+"""One thread that reads frames ahead of the loop, and threads that write and judge them behind it.
 
 Decoding, compressing and writing release Python's lock, while network and step process the next frames.
 """
@@ -12,8 +12,7 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 _AHEAD = 2  # frames
-# Largest number of waiting calls; each holds the maps of a frame, about 3 MB at 224 x 224.
-_WAITING = 4
+_WAITING = 2  # largest number of waiting calls of a thread; each holds the maps of a frame, about 3 MB at 224 x 224
 Read = TypeVar("Read")
 
 

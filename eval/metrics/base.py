@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -22,37 +22,49 @@ LOW, HIGH = 1e-8, 1e4
 
 
 class Selection:
-    """The values of some pixels, flat and float64. On the CPU they are the selected ones alone. On other devices, where
-    their number is unknown without waiting, they are all pixels, with 1 where ``mask`` is False.
+    """The values of some pixels, flat and float64, and what several metrics compute from them, once. On the CPU they
+    are the selected ones alone. On other devices, where their number is unknown without waiting, they are all pixels,
+    with 1 where ``mask`` is False. Iterating yields d, v and g.
 
     Args:
-        maps: [P] each; [0] = missing.
+        maps: d, v, g, inlier, outlier and level of ``Pixels``, [P] each; [0] = missing.
         mask: [P] True = selected.
     """
 
     def __init__(self, maps: Sequence[Tensor], mask: Tensor) -> None:
+        self._maps, self._selected = maps, dict[int, Tensor]()
         self.mask: Tensor | None = None
-        if _compacts(mask.device):
-            index = None if bool(mask.all()) else mask.nonzero()[:, 0]
-            parts = (x if index is None or not len(x) else x.index_select(0, index) for x in maps)
-            self.maps = tuple(part.double() for part in parts)
-        else:
-            self.maps = tuple(x.double().masked_fill(~mask, 1.0) if len(x) else x for x in maps)
+        self._index: Tensor | None = None
+        if not _compacts(mask.device):
             self.mask = mask
+        elif not bool(mask.all()):
+            self._index = mask.nonzero()[:, 0]
+
+    def map(self, number: int) -> Tensor:
+        """[P] the values of one of the maps, selected when they are first read."""
+        if number not in self._selected:
+            values = self._maps[number]
+            if self._index is not None and len(values):
+                values = values.index_select(0, self._index)
+            elif self.mask is not None and len(values):
+                values = values.masked_fill(~self.mask, 1.0)
+            self._selected[number] = values.double()
+        return self._selected[number]
 
     def __iter__(self) -> Iterator[Tensor]:
-        return iter(self.maps)
+        return map(self.map, range(3))
 
-    def where(self, condition: Tensor) -> Self:
+    def where(self, condition: Tensor) -> Selection:
         """The selected pixels with a condition [P] on their values."""
         if self.mask is None and _compacts(condition.device) and bool(condition.all()):
             return self
-        return type(self)(self.maps, condition if self.mask is None else condition & self.mask)
+        maps = [self.map(number) for number in range(len(self._maps))]
+        return Selection(maps, condition if self.mask is None else condition & self.mask)
 
     def number(self, condition: Tensor | None = None) -> Tensor:
         """[] int64 number of the selected pixels, or of those with a condition [P]."""
         if condition is None:
-            return torch.tensor(len(self.maps[0])) if self.mask is None else self.mask.sum()
+            return torch.tensor(len(self.map(0))) if self.mask is None else self.mask.sum()
         return (condition if self.mask is None else condition & self.mask).count_nonzero()
 
     def total(self, value: Tensor) -> Tensor:
@@ -71,23 +83,10 @@ class Selection:
         counts = self.histogram(2 * index + condition, 2 * bins).reshape(bins, 2)
         return counts.sum(1), counts[:, 1]
 
-
-def _compacts(device: torch.device) -> bool:
-    """True on the CPU, where selecting pixels needs no wait for a device."""
-    return device.type == "cpu"
-
-
-class Judged(Selection):
-    """Pixels with ground truth: d, v and g, and what several metrics compute from them, once. ``maps`` also has those
-    of a mixture and of intervals."""
-
-    def __iter__(self) -> Iterator[Tensor]:
-        return iter(self.maps[:3])
-
     @cached_property
     def error(self) -> Tensor:
         """|d - g| [m]."""
-        return (self.maps[0] - self.maps[2]).abs()
+        return (self.map(0) - self.map(2)).abs()
 
     @cached_property
     def squared(self) -> Tensor:
@@ -97,17 +96,17 @@ class Judged(Selection):
     @cached_property
     def relative(self) -> Tensor:
         """|d - g| / g."""
-        return self.error / self.maps[2]
+        return self.error / self.map(2)
 
     @cached_property
     def sigma(self) -> Tensor:
         """Root of v [m]."""
-        return self.maps[1].sqrt()
+        return self.map(1).sqrt()
 
     @cached_property
     def log_variance(self) -> Tensor:
         """ln v; -inf for 0."""
-        return self.maps[1].log()
+        return self.map(1).log()
 
     @cached_property
     def variance_bins(self) -> Tensor:
@@ -122,12 +121,17 @@ class Judged(Selection):
     @cached_property
     def within(self) -> Tensor:
         """True where |d - g| <= ``TOLERANCE`` g."""
-        return self.error <= TOLERANCE * self.maps[2]
+        return self.error <= TOLERANCE * self.map(2)
 
     @cached_property
-    def certain(self) -> Judged:
+    def certain(self) -> Selection:
         """Those with v > 0."""
-        return self.where(self.maps[1] > 0)
+        return self.where(self.map(1) > 0)
+
+
+def _compacts(device: torch.device) -> bool:
+    """True on the CPU, where selecting pixels needs no wait for a device."""
+    return device.type == "cpu"
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,17 +157,20 @@ class Pixels:
         """[P] True where there are depth and variance."""
         return self.use & (self.depth.abs() < torch.inf) & (self.variance >= 0) & (self.variance < torch.inf)
 
-    @cached_property
-    def depths(self) -> Judged:
-        """The pixels where d and g are valid."""
+    def select(self, mask: Tensor) -> Selection:
+        """The pixels where a mask [P] is True."""
         variance = self.variance if len(self.variance) else torch.full_like(self.depth, torch.nan)
-        maps = self.depth, variance, self.target, self.inlier, self.outlier, self.level
-        return Judged(maps, self.with_truth & (self.depth.abs() < torch.inf))
+        return Selection((self.depth, variance, self.target, self.inlier, self.outlier, self.level), mask)
 
     @cached_property
-    def judged(self) -> Judged:
+    def depths(self) -> Selection:
+        """The pixels where d and g are valid."""
+        return self.select(self.with_truth & (self.depth.abs() < torch.inf))
+
+    @cached_property
+    def judged(self) -> Selection:
         """The pixels where d, v and g are valid."""
-        v = self.depths.maps[1]
+        v = self.depths.map(1)
         return self.depths.where((v >= 0) & (v < torch.inf))
 
 

@@ -44,7 +44,7 @@ class ECEDelta(SumMetric):
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
         chosen = pixels.judged
         delta, bins = self.settings["delta"], self.settings["bins"]
-        tolerance = delta * chosen.maps[0].abs()
+        tolerance = delta * chosen.map(0).abs()
         # Bin b is [b/B, (b+1)/B); a confidence of exactly 1, as of v = 0, belongs to the last.
         confidence = torch.erf(tolerance / (math.sqrt(2.0) * chosen.sigma)).nan_to_num(1.0)
         b = (confidence * bins).long().clamp_max(bins - 1)

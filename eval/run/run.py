@@ -59,9 +59,9 @@ def run(
             warm_up_job(job, progress)
             shown = frame_progress(progress, len(job.indices))
             results = frame_results(job.sequence, job.indices, [row], cache=cache, stop=stop)
-            with closing(results), call_behind() as call:
+            with closing(results), call_behind() as judge, call_behind() as write:
                 for result in results:  # read, predict, find anchors, update
-                    call(folder.write, result)
+                    write(folder.write, result, judge)
                     shown(result)
             _write_outputs(folder, ufm, progress, stop)
     return read_summary(path)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -85,17 +85,22 @@ class RunFolder:
         (path / FRAMES).mkdir(exist_ok=True)
         write_bytes_atomic(path / RECORDS, b"")
 
-    def write(self, result: FrameResult) -> None:
-        """Judge, write and record a frame. Raises OSError."""
-        started, judged = perf_counter(), 0.0
+    def write(self, result: FrameResult, then: Callable[..., None]) -> None:
+        """Write a frame's files, and ``then`` call :meth:`record`. Raises OSError."""
+        started = perf_counter()
         if (row := result.rows.get(UFM)) is not None:
-            judge_run(self.metrics, row, self._plugins)
-            judged = perf_counter() - started
             arrays = frame_arrays(result.frame, row)
             write_frame(frame_file(self.path, result.name), arrays)
             self._unit = write_pngs(self.path, result.name, arrays, self._unit)
+        then(self.record, result, 1000 * (perf_counter() - started))
+
+    def record(self, result: FrameResult, write_ms: float) -> None:
+        """Judge and record a frame, whose files took ``write_ms`` [ms]. Raises OSError."""
+        started = perf_counter()
+        if (row := result.rows.get(UFM)) is not None:
+            judge_run(self.metrics, row, self._plugins)
+        ms = {"metrics": 1000 * (perf_counter() - started), "write": write_ms}
         keep_first_map(self.job, result, self.first_maps)
-        ms = {"metrics": 1000 * judged, "write": 1000 * (perf_counter() - started - judged)}
         record: dict[str, Any] = to_json(frame_record(result, UFM, ms))
         with (self.path / RECORDS).open("ab") as file:
             file.write(json.dumps(record, allow_nan=False).encode() + b"\n")

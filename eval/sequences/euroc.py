@@ -18,12 +18,12 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_image
-from ufmstar_torch.eval.sequences.frame import FrameSequence, Size
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped
 from ufmstar_torch.eval.sequences.images import first_image_size
 from ufmstar_torch.eval.sequences.lens import FISHEYE, Lens
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.paths import listed_file
-from ufmstar_torch.eval.sequences.poses import csv_rows, number, numbers, read_matrix, trajectory_of
+from ufmstar_torch.eval.sequences.poses import csv_rows, is_header, number, numbers, read_matrix, trajectory_of
 from ufmstar_torch.gaussians.trajectory import Trajectory
 
 LOOKED_FOR = "mav0/cam0/data.csv and sensor.yaml (also in mav0, or in a camera's folder itself)"
@@ -44,8 +44,11 @@ def read(path: Path, options: Options) -> FrameSequence:
     a malformed file (named), no ground truth and no ``trajectory``, or no usable frame."""
     folder = _camera_folder(path)
     assert folder is not None
-    images, frames = [], []
+    images: list[Path] = []
+    frames: list[Entry | Skipped] = []
     for words, where in csv_rows(folder / "data.csv"):
+        if not images and is_header(words):
+            continue
         images.append(listed_file(folder / "data", words[1] if len(words) > 1 else f"{words[0]}.png"))
         time = number(words[0], where) * _NANOSECOND
         frames.append(frame_of_image(images[-1].stem, images[-1], timestamp=time))

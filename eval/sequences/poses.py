@@ -253,11 +253,13 @@ def _require_consistent(T_world_cam: np.ndarray, first: np.ndarray, same: np.nda
 
 def _numbers(path: str | Path, words_of: Callable[[str, str], list[str]]) -> tuple[list[list[float]], list[str]]:
     """The numbers of each non-empty line, whose words ``words_of`` its text and FILE:LINE returns, and its
-    FILE:LINE."""
-    rows, lines = [], []
+    FILE:LINE. Lines of words before the first number are headers."""
+    rows: list[list[float]] = []
+    lines: list[str] = []
     for line, text in numbered_lines(path):
         where = f"{path}:{line}"
-        if tokens := words_of(text, where):
+        tokens = words_of(text, where)
+        if tokens and (rows or not is_header(tokens)):
             rows.append([number(token, where) for token in tokens])
             lines.append(where)
     return rows, lines
@@ -272,6 +274,11 @@ def _named_columns(text: str) -> list[int] | None:
     found = [next((i for i, name in enumerate(names) if form.fullmatch(name)), None) for form in (_TIME, *_NAMES)]
     order = [column for column in found if column is not None]
     return order if None not in found[1:] and len(set(order)) == len(order) else None
+
+
+def is_header(words: list[str]) -> bool:
+    """True if none of the words is a number, as in a line that names columns."""
+    return not any(re.match(r"[-+.]?\d|[-+]?(nan|inf)", word, re.IGNORECASE) for word in words)
 
 
 def _tokens(text: str) -> list[str]:

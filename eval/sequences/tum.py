@@ -57,12 +57,14 @@ def read(path: Path, options: Options) -> FrameSequence:
 
 
 def read_file_list(path: Path) -> tuple[np.ndarray, list[str]]:
-    """Timestamps [N] [s] and file names of lines ``timestamp filename``; ``#`` starts a comment line. Raises
+    """Timestamps [N] [s] and file names of lines ``timestamp filename``, with spaces or a comma between them; ``#``
+    starts a comment line, and the first line may name the columns. Raises
     ValueError: a line (named by file and number) has another form."""
-    times, files = [], []
+    times: list[float] = []
+    files: list[str] = []
     for number, text in numbered_lines(path):
-        words = text.split(maxsplit=1)
-        if not words or words[0].startswith("#"):
+        words = re.split(r"[\s,;]+", text.strip(), maxsplit=1)
+        if not words[0] or words[0].startswith("#") or (not times and words[0].lower().startswith("time")):
             continue
         try:
             times.append(float(words[0]))

@@ -7,6 +7,7 @@ pixel. ``evidence`` describes how these errors are accumulated and spread over t
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -131,15 +132,18 @@ class Anchors:
             TypeError: ``pixel`` has no floating dtype.
             ValueError: ``pixel`` is not [B, N, 2].
         """
-        pixel = require_float("anchors.pixel", self.pixel).detach().double()
+        pixel = require_float("anchors.pixel", self.pixel)
         if pixel.dim() != 3 or pixel.shape[2] != 2:
             raise ValueError(f"anchors.pixel must be [B, N, 2], got {tuple(pixel.shape)}")
-        (f, c), (f_to, c_to) = (_focal_and_centre(K, pixel.device) for K in (K_from, K_to))
-        scale = f_to / f
-        offset, motion = c_to - scale * c, self.motion
+        at, before, after = (_numbers(value, pixel.device) for value in (pixel, K_from, K_to))
+        scale = after[..., (0, 1), (0, 1)] / before[..., (0, 1), (0, 1)]
+        offset = after[..., :2, 2] - scale * before[..., :2, 2]
+        scale, offset, motion = scale[..., None, :], offset[..., None, :], self.motion
         if motion is not None:
-            motion = torch.cat([motion[..., :2] * scale + offset, motion[..., 2:]], -1)
-        return replace(self, pixel=pixel * scale + offset, motion=motion)
+            placed = _numbers(motion, pixel.device) + 0
+            placed[..., :2] = placed[..., :2] * scale + offset
+            motion = torch.as_tensor(placed)
+        return replace(self, pixel=torch.as_tensor(at * scale + offset), motion=motion)
 
     def to(self, device: torch.device | str) -> Anchors:
         """The anchors on a device."""
@@ -149,10 +153,10 @@ class Anchors:
         return replace(self, **moved)
 
 
-def _focal_and_centre(K: Tensor, device: torch.device) -> tuple[Tensor, Tensor]:
-    """The focal lengths and the principal point [..., 1, 2] of intrinsics [..., 3, 3] [px], float64."""
-    K = K.detach().to(device, torch.float64)[..., :2, :]
-    return K[..., :2].diagonal(dim1=-2, dim2=-1)[..., None, :], K[..., None, :, 2]
+def _numbers(value: Tensor, device: torch.device) -> Any:
+    """float64 values on a device, on the CPU as an array: small tensors take a few times longer."""
+    value = value.detach().to(device, torch.float64)
+    return value.numpy() if value.is_cpu else value
 
 
 def require_anchors(anchors: object) -> Anchors:

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ufmstar_torch.anchors.kernels.bundle import Learnt, refine
 from ufmstar_torch.anchors.saved_state import POSITIVE, SavedState
 from ufmstar_torch.anchors.time_offset import TimeOffset
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
@@ -105,8 +106,6 @@ class PoseRefinement(SavedState):
         Returns:
             [W, 4, 4] refined poses; the input poses if too few corners are seen, or after a jump.
         """
-        from ufmstar_torch.anchors.kernels.bundle import Learnt, refine  # compiles when it is first needed
-
         self.shared, self.jumped = 0.0, False
         views = np.flatnonzero(seen.any(0))
         if len(views) < _VIEWS:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.anchors.kernels.tracks import brightness_ratio, cover, returned
 from ufmstar_torch.anchors.landmarks import opencv
 
 # Lucas-Kanade on patches 8 px wide and 16 px high, over four octaves of at most ten iterations. OpenCV processes eight
@@ -53,8 +54,6 @@ def follow(
     Returns:
         Positions [N, 2] in ``after`` [px], and [N] True where reliable: tracked both ways and inside the image.
     """
-    from ufmstar_torch.anchors.kernels.tracks import brightness_ratio  # compiles when it is first needed
-
     found, fine = _followed(before, after, position, back_tolerance, expected)
     gain = 1.0
     for _ in range(_ROUNDS):
@@ -95,8 +94,6 @@ def _there_and_back(
     levels: int, back_tolerance: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:  # fmt: skip
     """As :func:`follow`, from a ``first`` guess of the positions, over ``levels`` octaves beyond the first."""
-    from ufmstar_torch.anchors.kernels.tracks import returned  # compiles when it is first needed
-
     cv2 = opencv()
     # The first flag replaces the difference of the patches, which takes a separate pass, by the patch's eigenvalue.
     # Neither is used.
@@ -123,8 +120,6 @@ def find(gray: NDArray[np.uint8], count: int, spacing: float, followed: NDArray[
     Returns:
         [n, 2] positions (u, v), the strongest first [px].
     """
-    from ufmstar_torch.anchors.kernels.tracks import cover  # compiles when it is first needed
-
     cv2 = opencv()
     # Searching a large image at half its size takes a tenth of the time. The position of a corner need not be exact,
     # only the same from frame to frame.

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,15 +25,17 @@ from torch import Tensor
 from ufmstar_torch.anchors.dense_keyframes import Keyframes, halved
 from ufmstar_torch.anchors.dense_memory import Memory
 from ufmstar_torch.anchors.dense_poses import PoseErrors
+from ufmstar_torch.anchors.kernels.check import check_anchors, confirmed, farther
+from ufmstar_torch.anchors.kernels.dense import Search, Views, free_pixels, measure
+from ufmstar_torch.anchors.kernels.landmarks import SCALE
+from ufmstar_torch.anchors.kernels.reduce import reduce
+from ufmstar_torch.anchors.kernels.windows import MARGIN
 from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, OtherCameraError, checked, opencv
 from ufmstar_torch.anchors.motion import LANDMARK, LINE, OFF_LINE, SEARCH, MotionTest, MotionTests, located, moves
 from ufmstar_torch.anchors.saved_state import POSITIVE, SavedState
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.runtime.checked import Checked, number
 from ufmstar_torch.runtime.kinds import check_kinds
-
-if TYPE_CHECKING:
-    from ufmstar_torch.anchors.kernels.dense import Search, Views
 
 # Baselines of the keyframes with which a frame is compared, as shares of the median depth.
 _BASELINES = np.array([0.04, 0.1, 0.22, 0.45])
@@ -225,8 +227,6 @@ class DenseEvidence(SavedState):
     ) -> Landmarks:
         """Measure the depths in a reduced image, and add corners where there are none. ``half`` is the image at half
         the size."""
-        from ufmstar_torch.anchors.kernels.check import check_anchors  # kernels compile when they are first needed
-
         cell, K = _cell(small.shape[1]), self._errors.camera(K)
         trusted = not corners.contradicted
         precise = self._tracker.refined_variance * self._depth**2 <= self.config.corner_sigma**2
@@ -272,9 +272,6 @@ class DenseEvidence(SavedState):
             The depths; the number of searched pixels; False if the views contradict each other; tests of whether
             surfaces stand still; the number of pixels where views, or old and new measurements, disagree.
         """
-        from ufmstar_torch.anchors.kernels.check import confirmed
-        from ufmstar_torch.anchors.kernels.dense import measure
-
         sighted = self._memory.sighted(small, T, K, cell)
         count, searched = len(sighted.slot), len(sighted.searched)
         tests = [MotionTest(LANDMARK, sighted.compared, sighted.hidden, np.ones(len(sighted.hidden), np.bool_))]
@@ -309,11 +306,6 @@ class DenseEvidence(SavedState):
         On a blank surface beside an edge, such a window measures the edge. The anchor is moved to the texture that was
         matched.
         """
-        from ufmstar_torch.anchors.kernels.check import confirmed
-        from ufmstar_torch.anchors.kernels.dense import free_pixels, measure
-        from ufmstar_torch.anchors.kernels.landmarks import SCALE
-        from ufmstar_torch.anchors.kernels.windows import MARGIN
-
         pixel = free_pixels(half, cell // 2, (occupied - 0.5) / 2)
         found = measure(half, pixel, views, self._search())
         variance = _COARSE_NOISE * found.variance + np.square(SCALE * found.rho)
@@ -324,8 +316,6 @@ class DenseEvidence(SavedState):
 
     def _apart(self, corners: Landmarks, occupied: NDArray[np.float64], width: int) -> NDArray[np.int64]:
         """Indices of the corners that become anchors: precise ones, away from the ``occupied`` positions [N, 2]."""
-        from ufmstar_torch.anchors.kernels.check import farther
-
         line_error = self._tracker.remaining_error / max(self._tracker.baseline, 1e-9) / self._tracker.focal
         stated = np.sqrt(corners.variance) / corners.depth
         sigma = np.maximum(stated, line_error * np.maximum(corners.depth, self._depth))
@@ -333,8 +323,6 @@ class DenseEvidence(SavedState):
         return precise[farther(corners.pixel[precise], occupied, self.config.corner_distance * width)]
 
     def _search(self) -> Search:
-        from ufmstar_torch.anchors.kernels.dense import Search
-
         config, rho = self.config, 1 / self._depth
         accepted = config.sigmas, config.least_score, config.rival, config.match_noise
         return Search(rho, _FARTHEST * rho, _NEAREST * rho, *accepted)
@@ -360,8 +348,6 @@ def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], ND
         cv2 = opencv()
         small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
     else:
-        from ufmstar_torch.anchors.kernels.reduce import reduce  # compiles when it is first needed
-
         small = np.empty(size[::-1], np.uint8)
         reduce(gray, small)
     along, down = size[0] / gray.shape[1], size[1] / gray.shape[0]

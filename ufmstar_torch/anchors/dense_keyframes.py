@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ufmstar_torch.anchors.kernels.dense import Views
+from ufmstar_torch.anchors.kernels.keyframes import compare
 from ufmstar_torch.anchors.landmarks import opencv
 from ufmstar_torch.anchors.saved_state import SavedState, saved_images
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
-
-if TYPE_CHECKING:
-    from ufmstar_torch.anchors.kernels.dense import Views
 
 # A frame becomes a keyframe if the camera has moved by this share of the median depth, or turned by this angle [rad].
 _MOVED, _TURNED = 0.015, math.radians(4.0)
@@ -92,9 +91,6 @@ class Keyframes(SavedState):
         Returns:
             V <= B keyframes; the same at half the size; and their longest baseline [m].
         """
-        from ufmstar_torch.anchors.kernels.dense import Views  # kernels compile when they are first needed
-        from ufmstar_torch.anchors.kernels.keyframes import compare
-
         b, ring = len(baselines), self._count + 1
         whole, half = (
             Views(

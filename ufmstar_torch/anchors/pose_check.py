@@ -15,6 +15,7 @@ from ufmstar_torch.anchors.landmarks import checked
 from ufmstar_torch.anchors.pose_fit import UNCHANGED, Cameras, CornerTrack, FollowedCorners, pose_fit
 from ufmstar_torch.anchors.streams import as_bytes
 from ufmstar_torch.frames.warnings import LOGGER
+from ufmstar_torch.kernels.cpu.check import camera_faults
 
 
 class PoseCheck:
@@ -43,8 +44,6 @@ class PoseCheck:
         """Add the next image [B, 3, H, W] with its pose [B, 4, 4] or [4, 4] and K [B, 3, 3] or [3, 3]."""
         if not self._left or image.is_meta:
             return
-        from ufmstar_torch.kernels.cpu.check import camera_faults  # kernels compile when they are first needed
-
         T_first, K_first = (x.detach().reshape(-1, *x.shape[-2:])[:1].cpu().double() for x in (pose, intrinsics))
         if any(camera_faults(T_first.numpy(), K_first.numpy(), (torch.inf, torch.inf), self._tolerance)):
             return

@@ -90,7 +90,7 @@ def sensor_landmarks(
     z = depth[v, u].astype(np.float64)
     mapping = K @ np.linalg.inv(K_depth)
     pixel = np.stack([u, v, np.ones_like(u)], axis=-1) @ mapping.T
-    return Landmarks(pixel[:, :2], z, np.square(_sigma(z, kind)), len(z), none="no depth of the sensor")
+    return Landmarks(pixel[:, :2], z, np.square(sensor_sigma(z, kind)), len(z), none="no depth of the sensor")
 
 
 def completed(sensor: Landmarks, others: Landmarks, depth: NDArray[np.float32], kind: str = "stereo") -> Landmarks:
@@ -235,7 +235,7 @@ def _without_common_errors(others: Landmarks, z: NDArray[np.float64], size: tupl
     x = np.stack([np.ones_like(rho), u, v, rho], axis=-1)
     independent = np.maximum(total - shared - scale * rho**2, _INDEPENDENT * total)
     x_seen, z = x[seen], z[seen]
-    noise = independent[seen] + np.square(_sigma(z, kind) / z**2)
+    noise = independent[seen] + np.square(sensor_sigma(z, kind) / z**2)
     prior, weight = np.diag(1 / np.maximum([shared, shared, shared, scale], _LEAST)), 1 / noise
     for _ in range(_ITERATIONS):
         covariance = np.linalg.inv(prior + (x_seen.T * weight) @ x_seen)
@@ -247,8 +247,8 @@ def _without_common_errors(others: Landmarks, z: NDArray[np.float64], size: tupl
     return replace(others, depth=depth, variance=variance)
 
 
-def _sigma(z: NDArray[np.float64], kind: str) -> NDArray[np.float64]:
-    """Standard deviations of depths, of the same shape [m]."""
+def sensor_sigma(z: NDArray[np.float64], kind: str) -> NDArray[np.float64]:
+    """Standard deviations of depths z that a kind of ``SENSORS`` measures, of the same shape [m]."""
     a, b, c = _SIGMA[kind]
     return a + b * z + c * np.square(z)
 
@@ -259,10 +259,12 @@ def _away_from_edges(depth: NDArray[np.float32], kind: str) -> NDArray[np.bool_]
     farthest = _spread(np.where(valid, depth, 0).astype(np.float32))
     nearest = 1 / _spread(np.where(valid, 1 / np.where(valid, depth, 1), 1e-6).astype(np.float32))
     z = np.where(valid, depth, 0).astype(np.float64)
-    return valid & (farthest - nearest <= _SHARE * z + _SIGMAS * _sigma(z, kind))
+    return valid & (farthest - nearest <= _SHARE * z + _SIGMAS * sensor_sigma(z, kind))
 
 
 def _spread(values: NDArray[np.float32], side: int = _SIDE) -> NDArray[np.float32]:
     """[H, W] the largest value in a square of ``side`` pixels."""
-    largest = max_pool2d(torch.from_numpy(np.ascontiguousarray(values))[None, None], side, 1, side // 2)
+    largest = torch.from_numpy(np.ascontiguousarray(values))[None, None]
+    for size in ((1, side), (side, 1)):
+        largest = max_pool2d(largest, size, 1, (size[0] // 2, size[1] // 2))
     return np.asarray(largest[0, 0].numpy())

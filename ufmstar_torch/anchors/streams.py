@@ -20,6 +20,7 @@ from ufmstar_torch.anchors.sources import landmark_source
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.frames.frame import FRAME_FAULTS
 from ufmstar_torch.kernels.cpu.calls import array
+from ufmstar_torch.kernels.cpu.check import camera_faults
 
 _LOG = logging.getLogger("ufmstar_torch")
 _CAUSES = (
@@ -114,8 +115,6 @@ class StreamLandmarks:
         self._require(b)
         before, faults = self._snapshots(), [0] * b
         if rotation_tolerance is not None:
-            from ufmstar_torch.kernels.cpu.check import camera_faults  # kernels compile when they are first needed
-
             size = (torch.inf, torch.inf) if images is None else images.shape[1:3]
             faults = camera_faults(T, K, size, rotation_tolerance)
         if not skip and (faulty := [f"stream {i}: {FRAME_FAULTS[fault]}" for i, fault in enumerate(faults) if fault]):

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.anchors.saved_state import SavedState
+from ufmstar_torch.kernels.compile_cpu import empty, reordered, reordered_leaf
 
 # Share of the sums over earlier windows that remains after an image.
 _MEMORY = 0.9
@@ -59,11 +60,9 @@ class TimeOffset(SavedState):
         along the world's [m]. The motion at the newest pose is extrapolated."""
         if not self.lag:
             return np.zeros((len(T_world_cam), 6))
-        from ufmstar_torch.anchors.kernels.time_offset import steps  # compiles when it is first needed
-
         result = np.empty((len(T_world_cam), 6))
         motion = result[1:] if self.lag < 0 else result[:-1]
-        steps(T_world_cam, motion)
+        _steps(T_world_cam, motion)
         result[0 if self.lag < 0 else -1] = motion[0 if self.lag < 0 else -1]
         return self.lag * result
 
@@ -79,9 +78,7 @@ class TimeOffset(SavedState):
             error: [6 W] e, beyond :meth:`shift`.
             covariance: [6 W, 6 W] C.
         """
-        from ufmstar_torch.anchors.kernels.time_offset import late  # compiles when it is first needed
-
-        window_information, beyond = late(T_world_cam, precision, error, covariance)
+        window_information, beyond = _late(T_world_cam, precision, error, covariance)
         lag = self.lag + beyond
         if not (window_information > 0 and math.isfinite(lag)):
             return
@@ -90,3 +87,53 @@ class TimeOffset(SavedState):
         self._information = _MEMORY * self._information + information
         mean = self._sum / (self._information + 1 / _PRIOR**2)
         self.lag = mean * max(0.0, 1 - _SIGNIFICANT / max(mean**2 * self._information, 1e-9))
+
+
+@reordered
+def _steps(T, out):
+    """Write the motion [W - 1, 6] from each pose [W, 4, 4] to the next one: rotation vector in the camera's axes [rad],
+    shift along the world's [m]."""
+    axis = empty(3, np.float64)
+    for k in range(len(T) - 1):
+        _motion(T[k], T[k + 1], 1.0, axis, out[k])
+
+
+@reordered
+def _late(T, precision, error, covariance):
+    """The information of a window on the lag, and the lag by it beyond the present one [images]; arguments as
+    :meth:`TimeOffset.learn`."""
+    views, size = len(T), 6 * len(T)
+    motion, axis = empty((views, 6), np.float64), empty(3, np.float64)
+    for k in range(views):  # before and after each view; neighbours of the first and the last view
+        before, after = max(k - 1, 0), min(k + 1, views - 1)
+        if k == 0:
+            before, after = 1, 2
+        elif k == views - 1:
+            before, after = views - 3, views - 2
+        _motion(T[before], T[after], 0.5 if 0 < k < views - 1 else 1.0, axis, motion[k])
+    information = total = 0.0
+    for i in range(size):
+        m = motion[i // 6, i % 6]
+        expected = m
+        for j in range(size):
+            expected -= covariance[i, j] * precision[j] * motion[j // 6, j % 6]
+        information += precision[i] * m * expected
+        total += precision[i] * m * error[i]
+    information /= views  # windows overlap: each pose is in W windows
+    return information, total / views / information
+
+
+@reordered_leaf
+def _motion(T, T_next, share, axis, out):
+    """Write a share of the motion between two poses [4, 4] to ``out`` [6]; ``axis`` is a buffer [3]."""
+    trace = 0.0
+    for i in range(3):
+        one, other = (i + 1) % 3, (i + 2) % 3
+        axis[i] = 0.0
+        for m in range(3):
+            trace += T[m, i] * T_next[m, i]
+            axis[i] += (T[m, other] * T_next[m, one] - T[m, one] * T_next[m, other]) / 2
+    sine = np.sqrt(axis[0] * axis[0] + axis[1] * axis[1] + axis[2] * axis[2])
+    over = share * np.arctan2(sine, (trace - 1) / 2) / max(sine, 1e-12)
+    for i in range(3):
+        out[i], out[3 + i] = axis[i] * over, share * (T_next[i, 3] - T[i, 3])

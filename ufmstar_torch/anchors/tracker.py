@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -17,14 +17,13 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.bundle import PoseRefinement
 from ufmstar_torch.anchors.corners import find, follow
+from ufmstar_torch.anchors.kernels.tracks import Limits, accept, compare, predict
+from ufmstar_torch.anchors.kernels.triangulate import Triangulated, triangulate
 from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, OtherCameraError, checked
 from ufmstar_torch.anchors.saved_state import POSITIVE, SavedState, saved_image
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
 from ufmstar_torch.runtime.checked import Checked, number
 from ufmstar_torch.runtime.kinds import check_kinds
-
-if TYPE_CHECKING:
-    from ufmstar_torch.anchors.kernels.triangulate import Triangulated
 
 # Why an image has no landmark.
 _NO_TRACK, _NO_DEPTH = "no corner followed from the frame before", "no parallax, or no track that fits the poses"
@@ -264,8 +263,6 @@ class LandmarkTracker(SavedState):
 
     def _compare_with_poses(self) -> None:
         """Update the distance of corners from their epipolar lines, each in its first view, and the scene's depth."""
-        from ufmstar_torch.anchors.kernels.tracks import compare  # compiles when it is first needed
-
         camera = self._poses, self._K, inverse_intrinsics(self._K), self._gray.shape[::-1]
         newest, baseline, rho = compare(self._pixel, self._seen, *camera, self._depth, self.config.pixel_noise)
         if newest < 0:
@@ -279,8 +276,6 @@ class LandmarkTracker(SavedState):
 
     def _followed(self, gray: NDArray[np.uint8], T: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
         """Positions [N, 2] in the new image, and [N] True for corners that were tracked there and back."""
-        from ufmstar_torch.anchors.kernels.tracks import predict  # compiles when it is first needed
-
         position, alive = self._pixel[:, -1].copy(), self._seen[:, -1].copy()
         corners = np.flatnonzero(alive)
         if len(corners):
@@ -312,8 +307,6 @@ class LandmarkTracker(SavedState):
         self._point = np.full((self.config.max_points, 3), np.nan)
         if not len(chosen):
             return chosen, None
-        from ufmstar_torch.anchors.kernels.triangulate import triangulate  # compiles when it is first needed
-
         result = triangulate(self._pixel[chosen], self._seen[chosen], self._poses, self._K)
         fine = result.ahead & (result.error <= self.config.max_error)
         self._point[chosen] = np.where(fine[:, None], result.point, np.nan)
@@ -331,8 +324,6 @@ class LandmarkTracker(SavedState):
             pixel = np.zeros((0, 2))
             judged = self.pose_error, shared, self.contradicted
             return Landmarks(pixel, nothing, nothing, tracked, none, *judged, lag=self.lag)
-        from ufmstar_torch.anchors.kernels.tracks import Limits, accept  # compiles when it is first needed
-
         depth, variance, fine = *np.empty((2, len(chosen))), np.empty(len(chosen), np.bool_)
         limits = Limits(config.pixel_noise, config.max_relative_sigma, config.max_error, config.min_share)
         arguments = result, self._seen[chosen], self._poses[-1], limits, self._noise
