@@ -264,5 +264,7 @@ def _away_from_edges(depth: NDArray[np.float32], kind: str) -> NDArray[np.bool_]
 
 def _spread(values: NDArray[np.float32], side: int = _SIDE) -> NDArray[np.float32]:
     """[H, W] the largest value in a square of ``side`` pixels."""
-    largest = max_pool2d(torch.from_numpy(np.ascontiguousarray(values))[None, None], side, 1, side // 2)
+    largest = torch.from_numpy(np.ascontiguousarray(values))[None, None]
+    for size in ((1, side), (side, 1)):
+        largest = max_pool2d(largest, size, 1, (size[0] // 2, size[1] // 2))
     return np.asarray(largest[0, 0].numpy())
