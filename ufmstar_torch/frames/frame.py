@@ -205,10 +205,7 @@ def check_frame(
     e = None if epistemic is None else converted("epistemic", epistemic)
     extra = _features(features, feature_count, plain) if feature_count or features is not None else None
     if variances_in_h:
-        if a is None and e is None:
-            raise ValueError("aleatoric or epistemic must be given with config.variances_in_h, which averages them")
-        averaged = (torch.zeros_like(plain) if value is None else _constant(value) for value in (a, e))
-        in_h = torch.stack([*averaged, torch.ones_like(plain)], 1)
+        in_h = _variances(a, e, plain)
         extra = in_h if extra is None else torch.cat([extra, in_h], 1)
     T, K = _of_depth("pose", as_pose(pose), plain), _of_depth("intrinsics", as_intrinsics(intrinsics), plain)
     mask = None
@@ -260,6 +257,14 @@ def _features(features: Array | None, count: int, plain: Tensor) -> Tensor:
     return _as(
         _constant(require_float("features", as_tensor("features", features), [expected], plain)), expected, plain.dtype
     )
+
+
+def _variances(aleatoric: Tensor | None, epistemic: Tensor | None, plain: Tensor) -> Tensor:
+    """[B, 3, H, W] A, E and 1, which are averaged with the features; 0 for one that the network does not predict."""
+    if aleatoric is None and epistemic is None:
+        raise ValueError("aleatoric or epistemic must be given with config.variances_in_h, which averages them")
+    maps = (torch.zeros_like(plain) if value is None else _constant(value) for value in (aleatoric, epistemic))
+    return torch.stack([*maps, torch.ones_like(plain)], 1)
 
 
 def _of_depth(name: str, value: Tensor, plain: Tensor) -> Tensor:

@@ -123,10 +123,10 @@ class _Seen(NamedTuple):
 
     def fits(self, grey: Values, pose: Values) -> bool:
         """True if an image and its pose are of the same kind, device and shape."""
-        pairs = (self.grey, grey), (self.pose, pose)
-        if not all(type(a) is type(b) and a.shape == b.shape for a, b in pairs):
-            return False
-        return isinstance(grey, np.ndarray) or bool(self.grey.device == grey.device)
+        last, present = (
+            [(type(x), x.shape, getattr(x, "device", None)) for x in pair] for pair in (self[:2], (grey, pose))
+        )
+        return last == present
 
     def without(self, streams: Sequence[int], before: _Seen) -> _Seen:
         """These streams as they were ``before``, the others as they are; an index that the images lack is ignored."""

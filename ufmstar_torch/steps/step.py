@@ -153,16 +153,8 @@ def step(
         smoothed, maps["disagreement"] = regress.moving_average(
             smoothed, maps["disagreement"], frame.size, config.ema_alpha, pixels
         )
-    counts = {
-        "components": mixture.components,
-        "segments": current_cam.components,
-        "matched": pairs.match.any(2).sum(1),
-        "pairs": pairs.match.sum((1, 2)),
-        "new": new.sum(1) - without_slot,
-        "dropped": gone + without_slot + (current_cam.valid & ~far_enough).sum(1),
-        "unmeasured": (maps["measured"] < regress.HALF).flatten(1).sum(1),
-        "single_view": (mixture.valid & (mixture.views == 0)).sum(1),
-    }
+    dropped = gone + without_slot + (current_cam.valid & ~far_enough).sum(1)
+    counts = _counts(mixture, current_cam, pairs, maps["measured"], new.sum(1) - without_slot, dropped)
     of_anchors = {} if learnt is None else learnt.tensors()
     updated = state.with_tensors({
         **mixture.tensors(), **sums, **of_anchors, "T_world_first": first, "started": state.started | fine,
@@ -252,6 +244,23 @@ def _regress(
         features, columns = features.split([features.shape[-1] - anchors.COLUMNS, anchors.COLUMNS], -1)
         residual = learnt.residual(columns)
     return {"disagreement": result.disagreement, "measured": measured, "features": features}, residual
+
+
+def _counts(
+    mixture: GaussianMixture, current_cam: GaussianMixture, pairs: Correspondence, measured: Tensor, new: Tensor,
+    dropped: Tensor,
+) -> dict[str, Tensor]:  # fmt: skip
+    """The numbers [B] of a step by their name in ``frames.output.COUNTS``."""
+    return {
+        "components": mixture.components,
+        "segments": current_cam.components,
+        "matched": pairs.match.any(2).sum(1),
+        "pairs": pairs.match.sum((1, 2)),
+        "new": new,
+        "dropped": dropped,
+        "unmeasured": (measured < regress.HALF).flatten(1).sum(1),
+        "single_view": (mixture.valid & (mixture.views == 0)).sum(1),
+    }
 
 
 def _room(

@@ -379,17 +379,7 @@ def equations(
             right, down = ray[n, k, 0] - u, ray[n, k, 1] - w
             p = precision[n, k]
             p *= (student + 2) / (student + p * (right * right + down * down))
-            for i in range(2):
-                at = u if i == 0 else w
-                r0, r1, r2 = R[i, 0] - at * R[2, 0], R[i, 1] - at * R[2, 1], R[i, 2] - at * R[2, 2]
-                # -R [n]x with n = (x, y, 1): the derivative by w of the newest view.
-                J[i, 0], J[i, 1], J[i, 2] = (r2 * y - r1) * over, (r0 - r2 * x) * over, (r1 * x - r0 * y) * over
-                for c in range(3):
-                    J[i, 3 + c] = rho[n] * (to[i, c] - at * to[2, c]) * over
-                    J_k[i, 3 + c] = -J[i, 3 + c]
-            # [q]x: the derivative by w_k.
-            J_k[0, 0], J_k[0, 1], J_k[0, 2] = u * w, -(1 + u * u), w
-            J_k[1, 0], J_k[1, 1], J_k[1, 2] = 1 + w * w, -u * w, -u
+            _derivatives(R, to, x, y, rho[n], u, w, over, J, J_k)
             du, dv = (t[0] - u * t[2]) * over, (t[1] - w * t[2]) * over
             total += p * (du * du + dv * dv)
             above += p * (du * right + dv * down)
@@ -411,3 +401,21 @@ def equations(
             h[n, i] = weighted[n, i] / total
             b[i] -= weighted[n, i] * v[n]
     reduced(A, weighted, h)
+
+
+@reordered_leaf
+def _derivatives(R, to, x, y, rho, u, w, over, J, J_k):
+    """Write the derivatives of a position (u, w) in a view by the errors of the newest pose and of the view's, J and
+    J_k [2, 6]; (x, y) is the ray in the newest view, ``over`` is 1/z, R and ``to`` are the view's of
+    :func:`between`."""
+    for i in range(2):
+        at = u if i == 0 else w
+        r0, r1, r2 = R[i, 0] - at * R[2, 0], R[i, 1] - at * R[2, 1], R[i, 2] - at * R[2, 2]
+        # -R [n]x with n = (x, y, 1): the derivative by w of the newest view.
+        J[i, 0], J[i, 1], J[i, 2] = (r2 * y - r1) * over, (r0 - r2 * x) * over, (r1 * x - r0 * y) * over
+        for c in range(3):
+            J[i, 3 + c] = rho * (to[i, c] - at * to[2, c]) * over
+            J_k[i, 3 + c] = -J[i, 3 + c]
+    # [q]x: the derivative by w_k.
+    J_k[0, 0], J_k[0, 1], J_k[0, 2] = u * w, -(1 + u * u), w
+    J_k[1, 0], J_k[1, 1], J_k[1, 2] = 1 + w * w, -u * w, -u
