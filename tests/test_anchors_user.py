@@ -76,7 +76,7 @@ def test_the_mask_and_padding_are_respected():
     [
         ({"points_cam": torch.zeros(4, 3)}, ValueError, r"points_cam must be \[B, N, 3\], got \(4, 3\)"),
         ({"points_cam": torch.zeros(1, 4, 3).long()}, TypeError, "points_cam must have a floating-point dtype"),
-        ({"points_cam": np.zeros((1, 4, 3))}, TypeError, "points_cam must be a torch.Tensor, got ndarray"),
+        ({"points_cam": np.zeros((1, 4, 3))}, TypeError, "points_cam must be a dense torch.Tensor, got ndarray"),
         ({"variance": torch.zeros(4)}, ValueError, r"variance must have shape \(1, 4\), got"),
         ({"intrinsics": torch.zeros(2, 3, 3)}, ValueError, r"intrinsics must have shape \(3, 3\) or \(1, 3, 3\)"),
         ({"valid": torch.ones(1, 4)}, TypeError, "valid must be a torch.bool tensor"),

@@ -321,7 +321,8 @@ def test_a_run_prints_its_table_and_outputs(ufmstar, path, tmp_path, brightness)
     assert lines[3].split()[5] == f"{summary['network_alone']['nll']:.3g}"
     assert f"{summary['mixture']['components']} components in " in out
     assert lines[-1] == "ufmstar run: finished: 6 of 6 frames"
-    assert [line for line in err.splitlines() if "frames" in line] == ["frames: 0 of 6", "frames: done, 6 of 6"]
+    first, *_, last = (line for line in err.splitlines() if "frames" in line)
+    assert (first, last) == ("frames: 0 of 6", "frames: done, 6 of 6")
     assert "%" not in err
     assert [file["name"] for file in summary["source"]["files"]] == ["first.pt", "second.pt"]
 
@@ -408,13 +409,18 @@ def test_fastdepth_on_a_real_sequence(ufmstar, tmp_path):
     assert all((tmp_path / "out" / name).stat().st_size > 500 for name in made)
 
 
-def test_the_progress_of_kernels_states_why_they_take_long(capsys):
+def test_the_progress_of_kernels_states_why_they_take_long(capsys, monkeypatch):
+    """Where standard error is no terminal, it gets a line every half minute."""
     from ufmstar_torch.eval.commands.terminal import Bars
     from ufmstar_torch.eval.engine.progress import Progress
 
+    clock = iter(range(0, 1000, 16))
+    monkeypatch.setattr("ufmstar_torch.eval.commands.terminal.monotonic", lambda: next(clock))
     with Bars() as bars:
-        for done in (0, 2):
-            bars.show(Progress("kernels", done, 2))
-    first, last = capsys.readouterr().err.splitlines()
-    assert first.startswith("kernels: 0 of 2 (the first run on a computer compiles them")
-    assert last == "kernels: done, 2 of 2"
+        for done in range(5):
+            bars.show(Progress("kernels", done, 5))
+        bars.show(Progress("kernels", 5, 5))
+    first, *between, last = capsys.readouterr().err.splitlines()
+    assert first.startswith("kernels: 0 of 5 (the first run on a computer compiles them")
+    assert between == ["kernels: 1 of 5", "kernels: 3 of 5"]
+    assert last == "kernels: done, 5 of 5"

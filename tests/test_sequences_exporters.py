@@ -52,7 +52,6 @@ def test_files_whose_names_begin_with_a_dot_are_no_frames(tmp_path, layout):
 def test_names_in_another_case_are_found(tmp_path, layout):
     """As of files that were copied from Windows or a camera's card: IMG_0.JPG, where a list names IMG_0.jpg."""
     path = LAYOUTS[layout](tmp_path)
-    path = path[0] if isinstance(path, tuple) else path
     before = open_sequence(path)
     names, frame = before.names, before[0]
     for file in [file for file in tmp_path.rglob("*") if file.suffix in (".png", ".jpg", ".npy", ".txt")]:
@@ -126,7 +125,7 @@ def test_an_export_that_no_reader_opens_gets_a_line_with_the_remedy(tmp_path, fi
 )
 def test_a_table_may_begin_with_the_names_of_its_columns(tmp_path, layout, file, change):
     """Without a #, as tables of pandas."""
-    path = LAYOUTS[layout](tmp_path)[0]
+    path = LAYOUTS[layout](tmp_path)
     before = open_sequence(path)
     (table,) = path.glob(file)
     table.write_text(change(table.read_text()))

@@ -85,26 +85,22 @@ def test_two_workers_give_the_bits_of_one_process(rooms, tmp_path, monkeypatch):
     assert not (shared.out / "eval.stop").exists()
 
 
-def test_another_worker_takes_over_from_a_killed_one(tmp_path):
-    folder = tmp_path / "acts"
-    job = job_from(read(acting(folder, TRUTH, "hold", "go", "go")))
-    with cluster(tmp_path) as (address, _):
-        thread, result = in_thread(job, address)
+def test_a_killed_worker_is_replaced_and_a_lost_scheduler_ends_the_evaluation(tmp_path, monkeypatch):
+    """Finished records remain, and the same evaluation goes on without the cluster."""
+    monkeypatch.setattr(tasks, "_CONNECT_SECONDS", 2)
+    with cluster(tmp_path) as (address, scheduler):
+        folder = tmp_path / "killed"
+        thread, result = in_thread(job_from(read(acting(folder, TRUTH, "hold", "go", "go"))), address)
         until(lambda: workers_at(folder, "a"))
         os.kill(workers_at(folder, "a")[0], signal.SIGKILL)
         until(lambda: len(workers_at(folder, "a")) == 2)
         (folder / "release").touch()
         thread.join()
-    outcome, lines = result[0]
-    assert (outcome.finished, dict(outcome.failed)) == (True, {})
-    assert sorted(line.partition(":")[0] for line in lines) == ["d/a", "d/b", "d/c"]
-
-
-def test_a_lost_scheduler_ends_the_evaluation_and_finished_records_remain(tmp_path, monkeypatch):
-    monkeypatch.setattr(tasks, "_CONNECT_SECONDS", 2)
-    folder = tmp_path / "acts"
-    job = job_from(read(acting(folder, TRUTH, "go", "hold", "hold")))
-    with cluster(tmp_path) as (address, scheduler):
+        outcome, lines = result[0]
+        assert (outcome.finished, dict(outcome.failed)) == (True, {})
+        assert sorted(line.partition(":")[0] for line in lines) == ["d/a", "d/b", "d/c"]
+        folder = tmp_path / "lost"
+        job = job_from(read(acting(folder, TRUTH, "go", "hold", "hold")))
         thread, result = in_thread(job, address)
         until(lambda: list(folder.glob("out/records/d/a/*.json")) and workers_at(folder, "b"))
         before = stored_results(job.out)

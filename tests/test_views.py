@@ -167,6 +167,27 @@ def test_images_that_show_nothing_are_found(kind):
     assert not bool(ImageCheck().informative(floats, torch.eye(4)))
 
 
+def test_images_on_an_accelerator_are_judged_alike(monkeypatch):
+    """Their values stay tensors, which nothing reads on the host."""
+    images = [np.roll(scene(), -3 * i, 1) for i in range(3)] + [nothing("black")] * 2 + [scene()] * 3
+    images = [torch.from_numpy(image).permute(2, 0, 1)[None] for image in images]
+    on_host, elsewhere = ImageCheck(), ImageCheck()
+    for i, image in enumerate(images):
+        pose = torch.eye(4)
+        pose[0, 3] = 0.1 * i
+        expected = on_host.informative(image, pose)
+        with monkeypatch.context() as patch:
+            patch.setattr(torch.Tensor, "is_cpu", False)
+            patch.setattr(torch.Tensor, "numpy", None)
+            found = elsewhere.informative(image, pose)
+        assert torch.equal(found, expected)
+        assert bool(expected) == (i in (0, 1, 2, 5))
+        if i == 2:
+            for check in (on_host, elsewhere):
+                check.undo([0])
+    assert int(on_host._seen.frozen[0]) == int(elsewhere._seen.frozen[0]) == 2
+
+
 @pytest.mark.parametrize("shape", [(2, 3, 36, 40), (1, 3, 7, 20), (1, 3, 60, 401)])
 def test_bytes_and_floats_of_an_image_have_the_same_cells(shape):
     image = torch.from_numpy(np.random.default_rng(0).integers(0, 256, shape, np.uint8))

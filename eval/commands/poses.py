@@ -10,7 +10,7 @@ from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.options import Count, Flag, Number, Positional, Text, Texts, arg, reader
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.sequences.frame import parse_slice
-from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics, read_intrinsics
+from ufmstar_torch.eval.sequences.intrinsics import camera_file, parse_intrinsics, read_intrinsics
 from ufmstar_torch.eval.sequences.options import Options, resolve
 
 
@@ -191,9 +191,8 @@ def _lens(options: PosesOptions, root: Path, size: tuple[int, int]) -> Any:
     from ufmstar_torch.eval.sequences.generic import INTRINSICS
     from ufmstar_torch.eval.sequences.lens import Lens, parse_distortion
 
-    source = parse_intrinsics(options.intrinsics, "--intrinsics")
-    if source is None:
-        source = next((str(root / name) for name in INTRINSICS if (root / name).is_file()), None)
+    named = parse_intrinsics(options.intrinsics, "--intrinsics")
+    source = camera_file(root, INTRINSICS) if named is None else named
     if source is None:
         return None
     return Lens.of(read_intrinsics(source), size, *parse_distortion(options.distortion))

@@ -6,23 +6,27 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ufmstar_torch.eval.engine.progress import Progress
 
+_EVERY = 30.0  # [s] between two lines of a stage
 _FIRST_RUN = "the first run on a computer compiles them, which takes about a minute"
 
 
 class Bars:
     """A progress bar of the current stage of a run, or of the current sequence of an evaluation.
 
-    If standard error is no terminal, it prints a line at the start and the end of each stage instead.
+    If standard error is no terminal, it prints a line at the start and the end of each stage instead, and one every
+    half minute.
     """
 
     def __init__(self) -> None:
         self._stage = ""
         self._bar: Any = None
+        self._said = 0.0  # [s] when the last line was printed
 
     def show(self, progress: Progress) -> None:
         """Update the bar of the stage; close that of an earlier stage."""
@@ -49,11 +53,14 @@ class Bars:
         bar.update(progress.done - bar.n)
         if bar.disable and progress.done == progress.total:
             self.say(f"{stage}: done, {progress.total} of {progress.total}")
+        elif bar.disable and monotonic() - self._said >= _EVERY:
+            self.say(f"{stage}: {progress.done} of {progress.total}")
 
     def say(self, text: str) -> None:
         """Print a line without breaking the bar."""
         from tqdm import tqdm
 
+        self._said = monotonic()
         tqdm.write(text, file=sys.stderr)
 
     def __enter__(self) -> Bars:

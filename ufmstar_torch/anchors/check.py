@@ -153,10 +153,10 @@ class AnchorDoubts:
     def _pixels(self, anchors: Anchors, checked: Anchors, size: tuple[int, int]) -> Iterator[tuple[int, str, str]]:
         height, width = size
         arrays = (array(x) for x in (anchors.pixel, anchors.depth, anchors.mask, checked.mask, checked.pixel))
-        for b, (pixel, depth, given, usable, at) in enumerate(zip(*arrays, strict=True)):
-            if np.count_nonzero(usable) >= (1 - _EXCHANGED) * np.count_nonzero(given) and at.max() > 1:
+        for b, (pixel, depth, mask, usable, at) in enumerate(zip(*arrays, strict=True)):
+            if np.count_nonzero(usable) >= (1 - _EXCHANGED) * np.count_nonzero(mask) and at.max() > 1:
                 continue  # as good as always, and found fast
-            pixel = pixel[np.isfinite(pixel).all(1) & (depth > 0) & given]
+            pixel = pixel[np.isfinite(pixel).all(1) & (depth > 0) & mask]
             if (count := len(pixel)) < _FEW:
                 continue
             nearest = np.rint(pixel)

@@ -132,10 +132,12 @@ class _Seen(NamedTuple):
 
 def _alike(seen: _Seen | None, grey: Values, pose: Values) -> TypeGuard[_Seen]:
     """True if an image and its pose are of the kind, device and shape of the ones before."""
-    pairs = () if seen is None else ((seen.grey, grey), (seen.pose, pose))
-    if seen is None or any(type(a) is not type(b) or a.shape != b.shape for a, b in pairs):
+    if seen is None:
         return False
-    return isinstance(grey, np.ndarray) or bool(seen.grey.device == grey.device)
+    last, present = (
+        [(type(x), x.shape, getattr(x, "device", None)) for x in pair] for pair in (seen[:2], (grey, pose))
+    )
+    return last == present
 
 
 class ImageCheck:
