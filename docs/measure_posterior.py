@@ -8,7 +8,8 @@ beyond the 95 % interval of the paired difference). The tours are two homes, a h
 in which the camera turns in place. The networks are FastDepth, the demo's first one, and two that corrupt the ground
 truth: one multiplies the depth in every cube of space by a random factor, the other smooths depth edges. The evidence
 is dense, tracked corners, or the dense evidence in the nearest 40 % of the image. Every frame is predicted once, so
-another value of a constant costs some seconds. ``--clips`` names recordings: FastDepth, from the first anchor on.
+another value of a constant costs some seconds. ``--clips`` names recordings or tours: FastDepth, or without
+``--weights`` the demo's first network, from the first anchor on, also with each ``--change``.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import argparse
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from importlib.resources import as_file, files
-from itertools import islice
+from itertools import islice, product
 from pathlib import Path
 
 import numpy as np
@@ -141,6 +142,12 @@ def changed(config: PosteriorConfig, **values: float) -> PosteriorConfig:
     return type("Changed", (PosteriorConfig,), values)(**settings)
 
 
+def with_change(config: PosteriorConfig, change: str) -> PosteriorConfig:
+    """The config with one NAME=VALUE."""
+    name, _, value = change.partition("=")
+    return changed(config, **{name: type(getattr(config, name))(value)})
+
+
 def by_tour(tours: list[list[list[Prepared]]], config: PosteriorConfig) -> NDArray[np.float64]:
     """[tours, figures] means over networks and evidence."""
     return np.array([np.mean([figures(p, kind, config) for p in tour for kind in KINDS], 0) for tour in tours])
@@ -153,24 +160,30 @@ def interval(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--weights", type=Path, required=True, help="FastDepth's")
+    parser.add_argument("--weights", type=Path, help="FastDepth's")
     parser.add_argument("--frames", type=int, default=20, help="of a tour")
     parser.add_argument("--change", nargs="+", metavar="NAME=VALUE", help="default: each constant halved and doubled")
     parser.add_argument("--clips", nargs="+", default=[], metavar="SEQUENCE", help="recordings instead of tours")
     arguments = parser.parse_args()
-    config, fastdepth = PosteriorConfig(), load_network("fastdepth", arguments.weights).eval()
+    if not (arguments.weights or arguments.clips):
+        parser.error("the tours need --weights")
+    with as_file(files("ufmstar_torch.models") / "weights" / "demo.safetensors") as weights:
+        demo = load_trained([weights])[0].eval()
+    config, network = PosteriorConfig(), demo
+    if arguments.weights:
+        network = load_network("fastdepth", arguments.weights).eval()
     print("| " + " | ".join(["", *FIGURES]) + " |\n" + "|---" * (1 + len(FIGURES)) + "|")
     for source in arguments.clips:
-        prepared = prepare(source, fastdepth)
-        for kind in (DENSE, CORNERS):
+        prepared = prepare(source, network)
+        for kind, change in product((DENSE, CORNERS), ("", *(arguments.change or ()))):
             first = next(i for i, one in enumerate(prepared) if bool(one.anchors[kind].valid.any()))
-            row = figures(prepared[first:], kind, config)
-            print(f"| {Path(source).name}, {kind} | " + " | ".join(f"{x:.3f}" for x in row) + " |", flush=True)
+            row = figures(prepared[first:], kind, with_change(config, change) if change else config)
+            name = " ".join([f"{Path(source).name}, {kind}", change]).strip()
+            print(f"| {name} | " + " | ".join(f"{x:.3f}" for x in row) + " |", flush=True)
     if arguments.clips:
         return
-    with as_file(files("ufmstar_torch.models") / "weights" / "demo.safetensors") as weights:
-        networks = [fastdepth, load_trained([weights])[0].eval(), True, False]
-    tours = [[prepare(tour, network, arguments.frames) for network in networks] for tour in TOURS]
+    networks = [network, demo, True, False]
+    tours = [[prepare(tour, one, arguments.frames) for one in networks] for tour in TOURS]
     start = by_tour(tours, config)
     means = zip(start.mean(0), interval(start), strict=True)
     print("| as it is | " + " | ".join(f"{m:.3f} ± {h:.3f}" for m, h in means) + " |", flush=True)
@@ -181,8 +194,7 @@ def main() -> None:
     }
     halved_and_doubled = [f"{name}={value * by:g}" for name, value in values.items() for by in (0.5, 2)]
     for change in arguments.change or [text for text in halved_and_doubled if not text.startswith("discs=1.5")]:
-        name, _, value = change.partition("=")
-        difference = by_tour(tours, changed(config, **{name: type(values[name])(value)})) - start
+        difference = by_tour(tours, with_change(config, change)) - start
         means = zip(difference.mean(0), interval(difference), strict=True)
         print(f"| {change} | " + " | ".join(f"{m:+.3f}{'*' * bool(abs(m) > h)}" for m, h in means) + " |", flush=True)
 

@@ -102,6 +102,7 @@ def test_settings_and_constants_of_the_posterior_change(script: Any) -> None:
     """Both are changed by name, and the others stay."""
     changed, config = script("measure_posterior").changed, PosteriorConfig()
     assert (changed(config, half_life=10.0).half_life, changed(config, discs=6).discs) == (10.0, 6)
+    assert script("measure_posterior").with_change(config, "discs=6").discs == 6
     one = changed(config, drift=0.1)
     assert (one.drift, one.half_life, one.discs) == (0.1, config.half_life, config.discs)
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.gaussians.fixed_order import apply, congruence
+from ufmstar_torch.runtime.kinds import check_kinds
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,7 @@ class GaussianMixture:
     features: Tensor
 
     @classmethod
+    @check_kinds
     def empty(
         cls, streams: int, capacity: int, *, features: int = 0, dtype: torch.dtype, device: torch.device | str
     ) -> GaussianMixture:

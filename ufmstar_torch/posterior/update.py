@@ -42,6 +42,8 @@ Variance over the squared depth at a node, with share = min(1, distance/reach):
   usual one of the image, a larger output ``outlier`` stands for the difference (``moments.divide``).
 - The ratios include the held-out anchors of this frame.
 
+In views that share little with the evidence, v has a part for the change of the network's scale (``overlap``).
+
 Before the first anchor the network may be off by any factor. The squared share of the variance of b's constant in that
 before the first anchor is ``unmeasured``: with it p is raised towards ``misscaled``, w towards ``widest``, and a_0
 towards 1. At the start the standard deviation is .9 times the depth.
