@@ -52,13 +52,14 @@ def check_anchor_values(
     """Check the values of anchors: pixel [B, N, 2] [px], depth [B, N] [m], variance [B, N] [m^2], all float64, and mask
     [B, N] or None; the caller has checked shapes and dtypes."""
     # Standard deviations are compared, as the square of a large depth overflows.
-    usable = (depth > 0) & (depth < torch.inf) & (variance >= 0) & (variance.sqrt() < depth) & inside(pixel, frame.size)
+    size = frame.size
+    usable = (depth > 0) & (depth < torch.inf) & (variance >= 0) & (variance.sqrt() < depth) & inside(pixel, size)
     if mask is not None:
         usable = usable & mask
     one, zero = torch.ones_like(depth), torch.zeros_like(depth)
     pixel = torch.where(usable[..., None], pixel, zero[..., None])
     u, v = pixel.round().long().unbind(-1)
-    index = v * frame.size[1] + u
+    index = v * size[1] + u
     predicted = torch.gather(frame.depth.flatten(1), 1, index).double()
     usable = usable & torch.gather(frame.valid.flatten(1), 1, index)
     near = (depth <= FARTHEST_OFF * predicted) & (predicted <= FARTHEST_OFF * depth)
@@ -145,7 +146,7 @@ class AnchorDoubts:
         """Warn of implausible anchors [B, N] of a frame of ``size`` (H, W), given to the step and as checked."""
         self._calls += 1
         seldom = self._calls % max(1, min(self._calls // _FIRST, _EVERY))
-        if seldom or not checked.mask.is_cpu or not checked.mask.shape[1]:
+        if seldom or not checked.depth.is_cpu or not checked.depth.shape[1]:
             return
         log_once(self._logged, (*self._pixels(anchors, checked, size), *self._depths(checked)))
 

@@ -103,5 +103,5 @@ def _copied(values: Mapping[str, Any]) -> dict[str, Any]:
         elif kind is dict:
             result[name] = _copied(value)
         elif isinstance(value, SavedState):
-            result[name] = value.snapshot()
+            result[name] = _copied(vars(value))
     return result

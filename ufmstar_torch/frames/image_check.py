@@ -8,7 +8,7 @@ the same as the last one although the camera moved. The depth of such an image i
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 import torch
@@ -121,13 +121,6 @@ class _Seen(NamedTuple):
         zero, nothing = library.zeros_like(grey[:, 0, 0, 0], dtype=library.int64), grey * library.nan
         return cls(nothing, pose * library.nan, nothing, zero, zero, zero)
 
-    def fits(self, grey: Values, pose: Values) -> bool:
-        """True if an image and its pose are of the same kind, device and shape."""
-        last, present = (
-            [(type(x), x.shape, getattr(x, "device", None)) for x in pair] for pair in (self[:2], (grey, pose))
-        )
-        return last == present
-
     def without(self, streams: Sequence[int], before: _Seen) -> _Seen:
         """These streams as they were ``before``, the others as they are; an index that the images lack is ignored."""
         forgotten = _Seen(*(value + 0 for value in self))
@@ -135,6 +128,16 @@ class _Seen(NamedTuple):
             for value, old in zip(forgotten, before, strict=True) if b < len(self.still) else ():
                 value[b] = old[b]
         return forgotten
+
+
+def _alike(seen: _Seen | None, grey: Values, pose: Values) -> TypeGuard[_Seen]:
+    """True if an image and its pose are of the kind, device and shape of the ones before."""
+    if seen is None:
+        return False
+    last, present = (
+        [(type(x), x.shape, getattr(x, "device", None)) for x in pair] for pair in (seen[:2], (grey, pose))
+    )
+    return last == present
 
 
 class ImageCheck:
@@ -157,7 +160,7 @@ class ImageCheck:
         """Forget the last image of all streams, or of some, because UfM* refused or skipped it; once an image."""
         if self._examined and (streams is None or streams):
             now, before = self._seen, self._undone
-            if streams is None or now is None or before is None or not before.fits(now.grey, now.pose):
+            if streams is None or now is None or not _alike(before, now.grey, now.pose):
                 self._seen = before
             else:
                 self._seen = now.without(streams, before)
@@ -178,7 +181,7 @@ class ImageCheck:
         grey, T = (value.numpy() for value in values) if image.is_cpu else values
         T = _library(T).broadcast_to(T, (len(grey), *T.shape[-2:])) + 0.0
         self._undone = last = self._seen
-        if last is None or not last.fits(grey, T):
+        if not _alike(last, grey, T):
             last = _Seen.before(grey, T)
         where, b = _library(grey).where, len(grey)
         changed = (last.pose != T).reshape(b, -1).any(1)

@@ -249,7 +249,7 @@ class StreamWarnings:
             T, focal = poses[b], (cameras[b][0][0] / width, cameras[b][1][1] / height)
             every = pixels[b] == height * width
             mean = totals[b] / rows[b].size if every else _mean(rows[b], totals[b])
-            if text := doubtful_centre(cameras[b], frame.size):
+            if text := doubtful_centre(cameras[b], (height, width)):
                 yield b, "centre", text
             if (track := self._tracks.get(b)) is None:
                 self._tracks[b] = track = _Track(T, T, focal, totals[b], _position(T))
