@@ -8,7 +8,6 @@ from dataclasses import Field, dataclass, field, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from ufmstar_torch.eval.commands.errors import UsageError
 from ufmstar_torch.eval.commands.options import (
     Count,
     File,
@@ -23,6 +22,7 @@ from ufmstar_torch.eval.commands.options import (
     one_of,
     parse,
 )
+from ufmstar_torch.eval.commands.terminal import UsageError
 
 if TYPE_CHECKING:
     from ufmstar_torch.train.presets import Recipe

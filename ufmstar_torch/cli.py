@@ -97,7 +97,7 @@ def _system() -> str:
 
 def _run(name: str, words: Sequence[str]) -> int:
     """Import the command, parse its options, and run it; convert errors to one line and an exit code."""
-    from ufmstar_torch.eval.commands.errors import UsageError
+    from ufmstar_torch.eval.commands.terminal import UsageError
 
     debug = "--debug" in words
     try:

@@ -8,8 +8,8 @@ from datetime import UTC, datetime
 from typing import ClassVar, Literal
 
 from ufmstar_torch.eval.commands.depth import NetworkOptions
-from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.options import File, MachineOptions, as_dict, reader, require_least
+from ufmstar_torch.eval.commands.terminal import usage_errors
 
 
 @dataclass(frozen=True, kw_only=True)

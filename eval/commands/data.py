@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
-from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import Recording
 from ufmstar_torch.eval.commands.options import Flag, Positional, arg, reader
+from ufmstar_torch.eval.commands.terminal import usage_errors
 
 # With one of these options the path is one sequence, whatever is below its folder.
 _OF_ONE = ("trajectory", "images", "drive")

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from ufmstar_torch import models
 from ufmstar_torch.eval.commands import evaluate
-from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.options import File, Flag, MachineOptions, reader, require_least
+from ufmstar_torch.eval.commands.terminal import usage_errors
 
 _WEIGHTS = ("weights", "demo.safetensors")
 _WALK = 150  # frames of a whole walk; the first --frames of them are used, so that consecutive frames overlap

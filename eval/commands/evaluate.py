@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from ufmstar_torch.eval.commands.depth import InferenceOptions
-from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import Recording
 from ufmstar_torch.eval.commands.options import (
     Count,
@@ -24,7 +23,7 @@ from ufmstar_torch.eval.commands.options import (
     reader,
     require_least,
 )
-from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+from ufmstar_torch.eval.commands.terminal import Bars, stop_signals, usage_errors
 from ufmstar_torch.eval.methods.method import UFM_STAR
 from ufmstar_torch.eval.methods.setting import DEFAULTS, started
 from ufmstar_torch.eval.methods.suite import listing, suite_named

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import Recording
 from ufmstar_torch.eval.commands.options import Positional, Text, arg, reader, require_positive
+from ufmstar_torch.eval.commands.terminal import usage_errors
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,6 @@ from time import monotonic
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from ufmstar_torch.eval.commands.depth import NetworkOptions, PosteriorOptions
-from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import Recording
 from ufmstar_torch.eval.commands.options import (
     File,
@@ -25,7 +24,7 @@ from ufmstar_torch.eval.commands.options import (
     require_least,
     require_positive,
 )
-from ufmstar_torch.eval.commands.terminal import Bars, interrupted_by_sigterm
+from ufmstar_torch.eval.commands.terminal import Bars, interrupted_by_sigterm, usage_errors
 from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
 
 if TYPE_CHECKING:

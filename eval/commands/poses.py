@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
-from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.options import Count, Flag, Number, Positional, Text, Texts, arg, reader
-from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+from ufmstar_torch.eval.commands.terminal import Bars, stop_signals, usage_errors
 from ufmstar_torch.eval.sequences.frame import parse_slice
 from ufmstar_torch.eval.sequences.intrinsics import camera_file, parse_intrinsics, read_intrinsics
 from ufmstar_torch.eval.sequences.options import Options, resolve

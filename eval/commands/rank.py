@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.depth import OWN_DEPTH
-from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.options import Count, Flag, Positional, Texts, arg, reader, require_least
 from ufmstar_torch.eval.commands.run import StreamOptions, job_from
-from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+from ufmstar_torch.eval.commands.terminal import Bars, stop_signals, usage_errors
 
 if TYPE_CHECKING:
     from ufmstar_torch.eval.run.rank import ImageScores

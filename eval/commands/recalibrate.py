@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.options import Positional, arg, reader
+from ufmstar_torch.eval.commands.terminal import usage_errors
 from ufmstar_torch.eval.methods.method import UFM_STAR
 
 if TYPE_CHECKING:

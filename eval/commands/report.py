@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.options import Flag, Positional, arg, reader
+from ufmstar_torch.eval.commands.terminal import usage_errors
 
 
 @dataclass(frozen=True, kw_only=True)

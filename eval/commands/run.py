@@ -16,10 +16,9 @@ from ufmstar_torch.eval.commands.depth import (
     PosteriorOptions,
     UfMOptions,
 )
-from ufmstar_torch.eval.commands.errors import usage_errors
 from ufmstar_torch.eval.commands.opening import Recording
 from ufmstar_torch.eval.commands.options import Flag, MachineOptions, Positional, Text, arg, as_dict, reader
-from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+from ufmstar_torch.eval.commands.terminal import Bars, stop_signals, usage_errors
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_slice
 
 if TYPE_CHECKING:

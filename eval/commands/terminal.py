@@ -1,4 +1,4 @@
-"""Long runs in a terminal: progress bars, and Ctrl-C and SIGTERM."""
+"""Commands in a terminal: mistakes of a user in one line, progress bars, Ctrl-C and SIGTERM."""
 
 from __future__ import annotations
 
@@ -14,6 +14,19 @@ if TYPE_CHECKING:
 
 _EVERY = 30.0  # [s] between two lines of a stage
 _FIRST_RUN = "the first run on a computer compiles them, which takes about a minute"
+
+
+class UsageError(Exception):
+    """A mistake of the user; the message is one line with the reason."""
+
+
+@contextmanager
+def usage_errors(*kinds: type[Exception]) -> Iterator[None]:
+    """Convert errors of these kinds to :class:`UsageError`."""
+    try:
+        yield
+    except kinds as error:
+        raise UsageError(error) from error
 
 
 class Bars:

@@ -10,7 +10,7 @@ from functools import partial
 
 import torch
 
-from ufmstar_torch.anchors.landmarks import CORNERS, DENSE
+from ufmstar_torch.anchors.names import CORNERS, DENSE
 from ufmstar_torch.config import UfMStarConfig
 
 

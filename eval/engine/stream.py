@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ufmstar_torch.anchors.landmarks import CORNERS, DENSE
+from ufmstar_torch.anchors.names import CORNERS, DENSE
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.predictions import FramePredictions, PredictionCache, sequence_digest
 from ufmstar_torch.eval.engine.progress import Progress, timed

@@ -13,7 +13,7 @@ from difflib import get_close_matches
 from types import MappingProxyType
 from typing import Any
 
-from ufmstar_torch.anchors.landmarks import CORNERS, DENSE, FILE_TYPES
+from ufmstar_torch.anchors.names import CORNERS, DENSE, FILE_TYPES
 from ufmstar_torch.config import AnchorConfig, ConfidenceConfig, MergeConfig, PosteriorConfig, UfMStarConfig
 from ufmstar_torch.runtime.checked import Checked, choice, flat, number
 

@@ -1,4 +1,4 @@
-"""Landmarks of an image, and the interface and names of landmark sources (``sources``)."""
+"""Landmarks of an image, and the interface of landmark sources (``sources``)."""
 
 from __future__ import annotations
 
@@ -15,9 +15,6 @@ from torch import Tensor
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.runtime.optional import optional
 
-# Names of the sources, as users write them, and types of files of landmarks.
-CORNERS, DENSE = "corners", "dense"
-FILE_TYPES = (".csv", ".txt", ".npz")
 # Imports cv2.
 opencv = partial(optional, "cv2", "landmarks of images need OpenCV", "'ufmstar-torch[eval]'")
 # Why an image has no landmark.

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.dense import DenseEvidence
-from ufmstar_torch.anchors.landmarks import CORNERS, DENSE, FILE_TYPES, Landmarks, LandmarkSource
+from ufmstar_torch.anchors.landmarks import Landmarks, LandmarkSource
+from ufmstar_torch.anchors.names import CORNERS, DENSE, FILE_TYPES
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.files.limits import read_text
 from ufmstar_torch.files.read import read_npz

@@ -130,7 +130,7 @@ class _Seen(NamedTuple):
         return forgotten
 
 
-def _fits(seen: _Seen | None, grey: Values, pose: Values) -> TypeGuard[_Seen]:
+def _same_kind(seen: _Seen | None, grey: Values, pose: Values) -> TypeGuard[_Seen]:
     """True if an image and its pose are of the kind, device and shape of the ones before."""
     if seen is None:
         return False
@@ -160,7 +160,7 @@ class ImageCheck:
         """Forget the last image of all streams, or of some, because UfM* refused or skipped it; once an image."""
         if self._examined and (streams is None or streams):
             now, before = self._seen, self._undone
-            if streams is None or now is None or not _fits(before, now.grey, now.pose):
+            if streams is None or now is None or not _same_kind(before, now.grey, now.pose):
                 self._seen = before
             else:
                 self._seen = now.without(streams, before)
@@ -181,7 +181,7 @@ class ImageCheck:
         grey, T = (value.numpy() for value in values) if image.is_cpu else values
         T = _library(T).broadcast_to(T, (len(grey), *T.shape[-2:])) + 0.0
         self._undone = last = self._seen
-        if not _fits(last, grey, T):
+        if not _same_kind(last, grey, T):
             last = _Seen.before(grey, T)
         where, b = _library(grey).where, len(grey)
         changed = (last.pose != T).reshape(b, -1).any(1)
