@@ -38,13 +38,13 @@ WRONG = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("hint", "values"), [(hint, values) for hint, *values in FITTING], ids=str)
+@pytest.mark.parametrize(("hint", "values"), [pytest.param(hint, values, id=str(hint)) for hint, *values in FITTING])
 def test_a_value_of_the_kind_passes(hint, values):
     for value in values:
         require("x", value, hint)
 
 
-@pytest.mark.parametrize(("hint", "values"), [(hint, values) for hint, *values in WRONG], ids=str)
+@pytest.mark.parametrize(("hint", "values"), [pytest.param(hint, values, id=str(hint)) for hint, *values in WRONG])
 def test_a_value_of_another_kind_is_named(hint, values):
     for value in values:
         with pytest.raises(TypeError, match=f"^x must be .*, got {type(value).__name__}"):
