@@ -115,5 +115,7 @@ def _described(hint: Any) -> str:
         return f"({', '.join(map(_described, args))})" if several else f"a sequence with {_described(args[0])} each"
     if origin is Callable:
         return "a function"
+    if origin is type:
+        return f"a class derived from {args[0].__name__}"
     kind = NoneType if hint is None else origin or hint
     return _NAMES[kind][1] if kind in _NAMES else f"{'an' if kind.__name__[0] in 'AEIOU' else 'a'} {kind.__name__}"
