@@ -410,7 +410,7 @@ def test_fastdepth_on_a_real_sequence(ufmstar, tmp_path):
 
 
 def test_the_progress_of_kernels_states_why_they_take_long(capsys, monkeypatch):
-    """Where standard error is no terminal, it gets a line every half minute."""
+    """Progress is printed every half minute if standard error is a file."""
     from ufmstar_torch.eval.commands.terminal import Bars
     from ufmstar_torch.eval.engine.progress import Progress
 

@@ -145,7 +145,10 @@ def seen_from(x=0.0, z=0.0):
     return T
 
 
-def extended(memory, depth, T=seen_from()):  # noqa: B008
+AT_THE_ORIGIN = seen_from()
+
+
+def extended(memory, depth, T=AT_THE_ORIGIN):
     """The anchors that the memory adds to those of the depth."""
     sensor = sensor_landmarks(depth, K, K)
     found, n = memory.extended(sensor, depth, T, K), len(sensor.depth)
@@ -167,7 +170,7 @@ def test_a_hole_has_the_depths_of_earlier_frames():
 
 
 def test_points_behind_a_nearer_surface_are_hidden():
-    """A box of 1 m stands before the wall of 3 m. A hole covers its left border and the wall beside it."""
+    """A box at 1 m hides part of a wall at 3 m. The hole contains the left border of the box, and wall beside it."""
     memory, depth = SensorMemory(), plane(z=3.0)
     extended(memory, plane(z=3.0))
     depth[:, 160:260] = 1.0

@@ -73,7 +73,7 @@ def layout_of(layout: str, path: Path, explicit: bool = False, plugin: Sequence[
 
 
 def _remedy(path: Path, names: Sequence[str]) -> str:
-    """How to open a path that has none of the layouts ``names``."""
+    """The error message for a path without any of the layouts ``names``: it says how to open it."""
     if remedy := next((remedy for pattern, remedy in _CONVERTED if _holds(path, pattern)), None):
         return remedy
     if below := find_sequences(path):

@@ -37,7 +37,8 @@ _UNIT, _AT_ONCE = 8.0, 2
 _INVERSE, _RANKED, _SPREAD = -0.3, 20, 0.1
 _COMPARED = 200  # largest number of anchors of which the order is compared
 
-# A frame takes .2 ms: the interval of the judged ones grows by one with so many frames, to the largest one.
+# Judging a frame takes .2 ms. At first every frame is judged; the interval grows by one every ``_FIRST`` frames, up to
+# ``_EVERY``.
 _FIRST, _EVERY = 16, 16
 
 # Pixel, depth and variance, the mask of usable anchors, and the frame -> the checked fields of ``Anchors``: pixel,
@@ -155,7 +156,7 @@ class AnchorDoubts:
         arrays = (array(x) for x in (anchors.pixel, anchors.depth, anchors.mask, checked.mask, checked.pixel))
         for b, (pixel, depth, mask, usable, at) in enumerate(zip(*arrays, strict=True)):
             if np.count_nonzero(usable) >= (1 - _EXCHANGED) * np.count_nonzero(mask) and at.max() > 1:
-                continue  # as good as always, and found fast
+                continue  # the usual case, and fast to test
             pixel = pixel[np.isfinite(pixel).all(1) & (depth > 0) & mask]
             if (count := len(pixel)) < _FEW:
                 continue
