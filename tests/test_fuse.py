@@ -29,7 +29,7 @@ def test_agrees_with_the_oracle(backend, weighted, baseline, seed):
     pairs = random_pairs(2, previous, current, seed)
     if weighted:
         pairs = replace(pairs, distance=1 + pairs.overlap)
-    config = UfMStarConfig(overlap_weighted=weighted, features=2, view_baseline=baseline)
+    config = UfMStarConfig(overlap_weighted=weighted, view_baseline=baseline)
     view = views(2, seed)
     fused = backend.kernels.fuse(previous.padded(12), current, pairs.padded(12), view, config)
     fused, dropped = append(fused, current, current.valid & ~pairs.match.any(2), view, config)

@@ -259,7 +259,6 @@ class UfMStarConfig(Checked):
         add_epistemic: add the network's epistemic variance to the result
         variances_in_h: average the network's variances, aleatoric and epistemic, over views in the Gaussians (the
             paper's H), and add these averages instead of the pixel's own
-        features: additional regressed quantities per Gaussian
         initial_capacity: slots for Gaussians at the start; the number grows as needed
         max_components: largest number of Gaussians, beyond which the farthest are dropped, then the oldest; null = no
             limit
@@ -299,7 +298,6 @@ class UfMStarConfig(Checked):
 
     # State
     variances_in_h: bool = False
-    features: int = number(0, "dim H - 1", "1", 0)
     initial_capacity: int = number(256, "K_0", "components", 1)
     max_components: int | None = number(None, "K_max", "components", 1)
 
@@ -361,8 +359,8 @@ class UfMStarConfig(Checked):
 
     @property
     def entries(self) -> int:
-        """Number of entries of H after m: ``features``, and with ``variances_in_h`` also A, E and 1."""
-        return self.features + 3 * self.variances_in_h
+        """Number of entries of H after m: with ``variances_in_h`` A, E and 1."""
+        return 3 * self.variances_in_h
 
     def merges_on(self, device_type: str) -> bool:
         """True if components are merged on a ``torch.device.type``."""

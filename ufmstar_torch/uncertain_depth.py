@@ -25,7 +25,6 @@ from ufmstar_torch.frames.arguments import (
     as_image,
     as_intrinsics,
     as_pose,
-    as_tensor,
     require_flag,
     require_kind,
     require_whole,
@@ -61,7 +60,6 @@ class _Predicted:
     Attributes:
         image, pose, intrinsics: the image and its camera, as tensors.
         prediction, member: as in :class:`UncertaintyOutput`.
-        features: [B, F, H, W] for UfM*, or None.
         ready: recorded after the copies; None = no copy to wait for.
     """
 
@@ -70,7 +68,6 @@ class _Predicted:
     intrinsics: Tensor
     prediction: DepthPrediction
     member: int | None
-    features: Tensor | None
     ready: torch.cuda.Event | None
 
     def copied(self) -> _Predicted:
@@ -193,7 +190,6 @@ class UncertainDepth(NetworksInTurn):
         intrinsics: CameraLike,
         valid: Array | None = None,
         *,
-        features: Array | None = None,
         anchors: Anchors | None = None,
     ) -> UncertaintyOutput:
         """Predict depth and its variance for the next image of every stream.
@@ -204,14 +200,13 @@ class UncertainDepth(NetworksInTurn):
             pose: [B, 4, 4] or [4, 4] camera-to-world [m], or without the last row; a tensor or a NumPy array.
             intrinsics: [B, 3, 3] or [3, 3] of ``image`` [px], or fx, fy, cx, cy; likewise.
             valid: [B, h, w] bool at the depth map's size, True = use.
-            features: [B, F, h, w] likewise, F = ``config.features``.
             anchors: sparse depths of this frame, [B, N] padded and masked, at pixels of ``image`` before the
                 preprocessing. None = of the constructor's source.
 
         Raises:
             ValueError, TypeError: as :meth:`UfMStar.forward`; alternation and landmarks then do not advance.
         """
-        return self._fused(self._predicted(image, pose, intrinsics, features), valid, anchors)
+        return self._fused(self._predicted(image, pose, intrinsics), valid, anchors)
 
     if TYPE_CHECKING:
         __call__ = forward
@@ -221,19 +216,17 @@ class UncertainDepth(NetworksInTurn):
         image: ImageLike,
         pose: CameraLike,
         intrinsics: CameraLike,
-        features: Array | None = None,
         *,
         ahead: bool = False,
     ) -> _Predicted:
         """The prediction for the next image, or, with ``ahead``, for the one after that."""
-        return self._predict(image, pose, intrinsics, features, number=self._next + ahead)
+        return self._predict(image, pose, intrinsics, number=self._next + ahead)
 
     def _predict(
         self,
         image: ImageLike,
         pose: CameraLike,
         intrinsics: CameraLike,
-        features: Array | None = None,
         *,
         number: int,
     ) -> _Predicted:
@@ -252,17 +245,14 @@ class UncertainDepth(NetworksInTurn):
         index = 0 if member is None else number % SAMPLES if self.stochastic else member
         prediction = replace(prediction, member=index)
         tensors = {name: value for name, value in vars(prediction).items() if isinstance(value, Tensor)}
-        if features is not None:
-            tensors["features"] = as_tensor("features", features)
         there, ready = _copied(tensors, self.multiview_device)
-        H = there.pop("features", None)
-        return _Predicted(picture, T, K_image, replace(prediction, **there), member, H, ready)
+        return _Predicted(picture, T, K_image, replace(prediction, **there), member, ready)
 
     def _fused(
         self, predicted: _Predicted, valid: Array | None = None, anchors: Anchors | None = None
     ) -> UncertaintyOutput:
         with self._anchored(predicted, anchors) as (found, p):
-            out = self.update(p, predicted.pose, p.K, valid, features=predicted.features, anchors=found)
+            out = self.update(p, predicted.pose, p.K, valid, anchors=found)
         self._undo(out.statistics)
         return replace(out, member=predicted.member)
 
@@ -295,7 +285,6 @@ class UncertainDepth(NetworksInTurn):
         intrinsics: CameraLike,
         valid: Array | None = None,
         *,
-        features: Array | None = None,
         anchors: Anchors | None = None,
     ) -> UncertaintyOutput:
         """Process an existing prediction, for example a cached one, as :meth:`forward` does after its networks.
@@ -304,7 +293,7 @@ class UncertainDepth(NetworksInTurn):
             prediction: [B, h, w].
             pose: as in :meth:`forward`.
             intrinsics: as in :meth:`forward`, of the depth map [px].
-            valid, features: as in :meth:`forward`.
+            valid: as in :meth:`forward`.
             anchors: [B, N] at pixels of the depth map, with ``config.anchors``; None = no anchors, even with a source.
 
         Raises:
@@ -312,7 +301,7 @@ class UncertainDepth(NetworksInTurn):
         """
         require_kind("prediction", prediction, DepthPrediction, "a DepthPrediction")
         maps = prediction.arguments(confidence=self.ufm.uses_confidence)
-        out = self.ufm(pose=pose, intrinsics=intrinsics, valid=valid, features=features, anchors=anchors, **maps)
+        out = self.ufm(pose=pose, intrinsics=intrinsics, valid=valid, anchors=anchors, **maps)
         self._next += 1
         if prediction.intrinsics is None:
             K = as_intrinsics(intrinsics)
@@ -382,7 +371,6 @@ class UncertainDepth(NetworksInTurn):
         intrinsics: CameraLike,
         valid: Array | None = None,
         *,
-        features: Array | None = None,
         anchors: Anchors | None = None,
         pixels: int | None = None,
         fraction: float | None = None,
@@ -394,17 +382,17 @@ class UncertainDepth(NetworksInTurn):
         calls of :meth:`forward`.
 
         Args:
-            image, pose, intrinsics, valid, features, anchors: as in :meth:`forward`.
+            image, pose, intrinsics, valid, anchors: as in :meth:`forward`.
             pixels, fraction, seed, average: as in :meth:`UfMStar.mean_uncertainty`.
 
         Raises:
             ValueError, TypeError: as :meth:`UfMStar.mean_uncertainty`; alternation and landmarks then do not advance.
         """
-        predicted = self._predicted(image, pose, intrinsics, features)
+        predicted = self._predicted(image, pose, intrinsics)
         with self._anchored(predicted, anchors, search=not self._evidence.by_default) as (found, p):
             maps = p.arguments(confidence=self.ufm.uses_confidence)
             mean = self.ufm.mean_uncertainty(
-                pose=predicted.pose, intrinsics=p.K, valid=valid, features=predicted.features, anchors=found,
+                pose=predicted.pose, intrinsics=p.K, valid=valid, anchors=found,
                 pixels=pixels, fraction=fraction, seed=seed, average=average, **maps,
             )  # fmt: skip
         self._undo(mean.statistics)

@@ -35,7 +35,7 @@ FRAMES = "frames"
 _RESULT = ("depth", "sigma"), ("depth", "variance")
 _BEFORE = ("network_depth", "ufm_sigma"), ("network_depth", "ufm_variance")
 PNGS = (*_RESULT[0], *_BEFORE[0])
-_OF_NETWORK = ("aleatoric", "epistemic", "confidence", "features")  # maps that are not stored
+_OF_NETWORK = ("aleatoric", "epistemic", "confidence")  # maps that are not stored
 # Arrays of every frame, and the texts of every PNG.
 _NEEDED = ("depth", "variance", "disagreement", "valid", "T_world_cam", "intrinsics")
 _TEXTS = {"depth_scale", "unit", "quantity", "invalid", "saturated"}
