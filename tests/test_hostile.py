@@ -121,7 +121,6 @@ def configuration(rng):
             scale_with_image=bool(rng.integers(2)),
             **[{}, {"max_depth": 20.0}, {"max_depth": 1e6, "min_gaussian_length": 112.0}][rng.integers(3)],
         ),
-        disagreement=str(rng.choice(["w2", "overlap"])),
         overlap_weighted=bool(rng.integers(2)),
         unmeasured=str(rng.choice(["paper", "relative", "nan"])), prior_mean=0.25,
         regression=str(rng.choice(["exact", "neighbourhood"])),

@@ -18,7 +18,7 @@ BACKENDS = ("torch", "numba")
 
 
 VARIANTS = {
-    "overlap": {"disagreement": "overlap", "overlap_weighted": True, "initial_capacity": 2},
+    "weighted": {"overlap_weighted": True, "initial_capacity": 2},
     "neighbourhood": {"regression": "neighbourhood", "variances_in_h": True},
     "anchored": {"anchors": AnchorConfig()},
 }

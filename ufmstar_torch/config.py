@@ -245,8 +245,6 @@ class UfMStarConfig(Checked):
         overlap_weighted: weight a fusion by the overlap of its Gaussians
         view_baseline: baseline over distance at which a comparison with an earlier view counts for 63 %: two views from
             one position of the camera show nothing; null = every comparison counts fully, as in the paper
-        disagreement: between views: squared 2-Wasserstein distance (w2), or squared depth difference where both
-            Gaussians are seen (overlap)
         prior_weight: weight of the prior in the regression
         prior_mean: disagreement where no Gaussian is near
         unmeasured: M where no two views were compared: a share of the depth squared (relative), as the paper (0 of what
@@ -281,9 +279,6 @@ class UfMStarConfig(Checked):
     overlap_weighted: bool = False
     # Two views from one position are one view (``steps.fuse``).
     view_baseline: float | None = number(0.07, "b_0", "1", 0.0, open_low=True, optional=True)
-    # m averages the paper's squared 2-Wasserstein distance, or the squared depth difference where both Gaussians are
-    # seen (``disagree``).
-    disagreement: str = choice("w2", "overlap")
 
     # Regression (section "Uncertainty Regression")
     prior_weight: float = number(1.0, "pi_0", "px/m^3", 0.0, open_low=True)

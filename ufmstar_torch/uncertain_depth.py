@@ -40,17 +40,14 @@ from ufmstar_torch.frames.prediction import (
     in_unit_range,
     modules_of,
     shared_preprocess,
-    weights_mark,
 )
-from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.posterior.recalibrate import Recalibration
 from ufmstar_torch.runtime.stateful import OneCaller, one_caller
 from ufmstar_torch.runtime.warm_up import along_wall, require_size, warm_up
 from ufmstar_torch.ufmstar import UfMStar
 
-# Keys of a stream's state, or prefixes of keys: of UfM*, of the anchors' source, the number of processed images, and a
-# checksum of the networks' weights.
-_UFM, _LANDMARKS, _INDEX, _MARK = "ufm.", "landmarks.", "image_index", "weights_mark"
+# Keys of a stream's state, or prefixes of keys: of UfM*, of the anchors' source, and the number of processed images.
+_UFM, _LANDMARKS, _INDEX = "ufm.", "landmarks.", "image_index"
 
 
 @dataclass(frozen=True)
@@ -458,11 +455,10 @@ class UncertainDepth(NetworksInTurn):
         state = {f"{_UFM}{name}": value.clone() for name, value in self.ufm.state_dict().items()}
         if self.landmarks is not None:
             state |= {f"{_LANDMARKS}{name}": value for name, value in self.landmarks.state().items()}
-        return state | {_INDEX: torch.tensor(self._next), _MARK: torch.tensor(weights_mark(self.networks))}
+        return state | {_INDEX: torch.tensor(self._next)}
 
     def load_stream_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue from a :meth:`stream_state`, bit for bit. If the networks' weights differ from those at saving, a
-        warning is logged. All or nothing: if it raises, the module is unchanged.
+        """Continue from a :meth:`stream_state`, bit for bit. All or nothing: if it raises, the module is unchanged.
 
         Raises:
             ValueError: the state is incomplete, of other sources of anchors, or invalid.
@@ -481,20 +477,19 @@ class UncertainDepth(NetworksInTurn):
             prefix = next(prefix for prefix in parts if str(key).startswith(prefix))
             parts[prefix][str(key).removeprefix(prefix)] = value
         counts, ufm, landmarks = parts[""], parts[_UFM], parts[_LANDMARKS]
-        for expected, present in ((self.ufm.state_dict().keys(), ufm.keys()), ({_INDEX, _MARK}, counts.keys())):
+        for expected, present in ((self.ufm.state_dict().keys(), ufm.keys()), ({_INDEX}, counts.keys())):
             if wrong := sorted(expected ^ present):
                 raise ValueError(f"the state must hold {', '.join(sorted(expected))}; missing or unknown: {wrong}")
-        for name, value in counts.items():
-            _require_count(value, name)
+        index = counts[_INDEX]
+        if not isinstance(index, Tensor) or index.dtype != torch.int64 or index.dim() or bool(index < 0):
+            raise ValueError(f"{_INDEX} must be a whole number of at least 0, got {index}")
         self.ufm.accepted(ufm)
         if self.landmarks is not None:
             self.landmarks.load_state(landmarks)
         elif landmarks:
             raise ValueError(f"state holds landmarks, for which the module has no source: {', '.join(landmarks)}")
         self.ufm.load_state_dict(ufm)
-        if int(counts[_MARK]) != weights_mark(self.networks):
-            LOGGER.warning("the state was saved with other networks: it holds their disagreement; reset() begins anew")
-        self._next = int(counts[_INDEX])
+        self._next = int(index)
 
 
 def _copied(values: dict[str, Tensor], device: torch.device | None) -> tuple[dict[str, Any], torch.cuda.Event | None]:
@@ -524,9 +519,3 @@ def _require_passes(members: Sequence[nn.Module], mode: object, samples: object)
         raise ValueError("mode 'full' needs several networks, or samples for a stochastic one")
     if len({id(member) for member in members}) < len(members):
         raise ValueError("networks must differ, got one of them twice: for passes of a stochastic one set samples")
-
-
-def _require_count(value: object, name: str) -> None:
-    """Raise a ValueError unless ``value`` is a whole number of at least 0."""
-    if not isinstance(value, Tensor) or value.dtype != torch.int64 or value.dim() or bool(value < 0):
-        raise ValueError(f"{name} must be a whole number of at least 0, got {value}")
