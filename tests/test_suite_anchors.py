@@ -74,7 +74,7 @@ def assert_agrees(result, expected, used):
         {"anchors": "corners", "anchor_count": 0, "seed": 0},
         {"anchors": "truth", "seed": 3},
         {"anchors": "corners", "track_noise": 2.0, "rotation_noise": 1.0, "seed": 1},
-        {"disagreement": "overlap", "anchors": "corners", "anchors.half_life": 10.0},
+        {"regression": "neighbourhood", "anchors": "corners", "anchors.half_life": 10.0},
     ],
 )
 def test_a_setting_survives_its_flat_form_and_json(values):

@@ -77,7 +77,6 @@ def warm_up(
     depth = torch.full((streams, height, width), distance, device=device)
     pose = torch.eye(4)
     K = camera_of(size)
-    features = depth.new_zeros(streams, config.features, height, width) if config.features else None
     aleatoric = depth if config.variances_in_h else None
     corner = depth[:, 0, :1]
     anchors = None
@@ -88,8 +87,8 @@ def warm_up(
         stages = _Stages(progress, _TOTAL + len(sources))
         module.observer = stages
         for _ in range(2):  # the fusion needs a mixture, from the second frame on
-            module(depth, pose, K, aleatoric, features=features, **({} if anchors is None else {"anchors": anchors}))
-        module.mean_uncertainty(depth, pose, K, aleatoric, features=features, pixels=1)
+            module(depth, pose, K, aleatoric, **({} if anchors is None else {"anchors": anchors}))
+        module.mean_uncertainty(depth, pose, K, aleatoric, pixels=1)
         finish()
         for kind in sources:
             along_wall(kind())
