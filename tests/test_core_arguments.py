@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -98,14 +97,6 @@ REFUSED = {
     "points in the plane": (lambda: seen().query(torch.zeros(1, 5, 2)), ValueError, r"points must be \[1, N, 3\]"),
     "points of another frame": (lambda: seen().query(torch.zeros(1, 5, 3), "camera"), ValueError, "frame must be"),
     "points of no mixture": (lambda: UfMStar().query(torch.zeros(1, 5, 3)), ValueError, "query needs a mixture"),
-    **{
-        f"a mixture of other {name}": (
-            lambda n=name, v=value: replace(seen().mixture, **{n: v}), ValueError, f"{name} must have shape"
-        )
-        for name, value in (
-            ("weight", torch.ones(4)), ("mean", torch.ones(1, 4, 2)), ("features", torch.ones(1, 4))
-        )
-    },
     "an image of one channel": (lambda: model(IMAGE[:, :1]), ValueError, r"image must be \[B, 3, H, W\]"),
     "a tensor with channels last": (lambda: model(torch.tensor(PICTURE)[None]), ValueError, "image .*permute"),
     "an array with channels first": (lambda: model(IMAGE.numpy()), ValueError, r"image as a NumPy array .*\[H, W, 3\]"),

@@ -27,6 +27,7 @@ from ufmstar_torch.frames.arguments import (
     as_pose,
     require_flag,
     require_kind,
+    require_size,
     require_whole,
 )
 from ufmstar_torch.frames.image_check import warn_of_range
@@ -43,7 +44,7 @@ from ufmstar_torch.frames.prediction import (
 )
 from ufmstar_torch.posterior.recalibrate import Recalibration
 from ufmstar_torch.runtime.stateful import OneCaller, one_caller
-from ufmstar_torch.runtime.warm_up import along_wall, require_size, warm_up
+from ufmstar_torch.runtime.warm_up import along_wall, warm_up
 from ufmstar_torch.ufmstar import UfMStar
 
 # Keys of a stream's state, or prefixes of keys: of UfM*, of the anchors' source, and the number of processed images.
@@ -415,7 +416,7 @@ class UncertainDepth(NetworksInTurn):
         Raises:
             ValueError: as :meth:`UfMStar.warm_up`.
         """
-        require_size(size, streams)
+        size, streams = require_size("size", size), require_whole("streams", streams, 1)
         searching = () if self.landmarks is None else self.landmarks.searching
         if self.networks:
             size = self.run_on_noise(size, streams)
