@@ -18,7 +18,7 @@ from ufmstar_torch.config import UfMStarConfig
 class Progress:
     """The progress of a command."""
 
-    stage: str  # "kernels" (compiled on a machine's first run), "rooms", "frames" or "pictures"
+    stage: str  # "kernels" (compiled on a machine's first run), "rooms", "frames", "pictures" or "figures"
     done: int  # number of finished steps of this stage, skipped frames included
     total: int  # number of steps of this stage
     components: int | None = None  # of the first row with components; None before the first frame
