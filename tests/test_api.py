@@ -77,9 +77,9 @@ def test_signatures():
 
 
 def test_few_settings():
-    """The core has at most 48 settings, those of all sections together."""
+    """The core has at most 46 settings, those of all sections together."""
     sections = {"anchors": AnchorConfig(), "confidence": ConfidenceConfig(), "posterior": PosteriorConfig()}
-    assert len(flat(UfMStarConfig(**sections, merge=MergeConfig()).to_dict())) <= 48
+    assert len(flat(UfMStarConfig(**sections, merge=MergeConfig()).to_dict())) <= 46
 
 
 def test_the_papers_defaults():

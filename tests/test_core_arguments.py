@@ -321,7 +321,7 @@ def test_the_mask_of_an_array_is_valid(name):
 
 
 def test_numbers_of_numpy_are_numbers():
-    config = UfMStarConfig(max_components=np.int64(100), eta=np.float32(0.5), add_aleatoric=np.bool_(True))
+    config = UfMStarConfig(max_components=np.int64(100), eta=np.float32(0.5), variances_in_h=np.bool_(False))
     assert config == UfMStarConfig(max_components=100, eta=0.5)
     assert type(config.max_components) is int
     assert seen().query(np.zeros((1, 5, 3))).disagreement.shape == (1, 5)

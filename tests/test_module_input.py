@@ -42,7 +42,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: settings({"backend": "cuda"}), "backend"),
     (lambda: settings({"max_components": 0}), "max_components"),
     (lambda: settings({"variance_floor": NAN}), "variance_floor"),
-    (lambda: settings({"add_aleatoric": 1}), "add_aleatoric"),
+    (lambda: settings({"variances_in_h": 1}), "variances_in_h"),
     (lambda: settings({"initial_capacity": 1.5}), "initial_capacity"),
     (lambda: settings({"initial_capacity": True}), "initial_capacity"),
     (lambda: settings({"eta_oclusion": 0.7}), "eta_oclusion"),

@@ -253,8 +253,6 @@ class UfMStarConfig(Checked):
         regression: exact sum over the Gaussians in view, or the paper's neighbourhood
         ema_alpha: weight of the new disagreement map in the running average
         variance_floor: smallest variance of a pixel
-        add_aleatoric: add the network's aleatoric variance to the result
-        add_epistemic: add the network's epistemic variance to the result
         variances_in_h: average the network's variances, aleatoric and epistemic, over views in the Gaussians (the
             paper's H), and add these averages instead of the pixel's own
         initial_capacity: slots for Gaussians at the start; the number grows as needed
@@ -288,8 +286,6 @@ class UfMStarConfig(Checked):
     regression: str = choice("exact", "neighbourhood")
     ema_alpha: float = number(0.5, "alpha", "1", 0.0, 1.0, open_low=True)
     variance_floor: float = number(0.0, "v_min", "m^2", 0.0)
-    add_aleatoric: bool = True
-    add_epistemic: bool = True
 
     # State
     variances_in_h: bool = False
@@ -321,11 +317,8 @@ class UfMStarConfig(Checked):
         for name in ("posterior", "confidence"):
             if getattr(self, name) is not None and self.anchors is None:
                 raise ValueError(f"UfMStarConfig.{name} needs anchors: set anchors=AnchorConfig() as well")
-        if self.variances_in_h and (self.anchors is not None or not (self.add_aleatoric or self.add_epistemic)):
-            raise ValueError(
-                "UfMStarConfig.variances_in_h goes with add_aleatoric=True or add_epistemic=True and without anchors "
-                "(posterior=False; --plain), got another setting"
-            )
+        if self.variances_in_h and self.anchors is not None:
+            raise ValueError("UfMStarConfig.variances_in_h goes without anchors (posterior=False; --plain)")
         require_bytes("UfMStarConfig.initial_capacity", self.initial_capacity * (_SLOT + 4 * self.entries))
 
     @classmethod

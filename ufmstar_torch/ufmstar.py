@@ -260,7 +260,7 @@ class UfMStar(StatefulModule):
             frame = replace(frame, confidence=as_confidence(confidence, frame))
         if anchors is None:
             return frame
-        variances = [v for v in variance.network_variances(frame, self.config) if v is not None]
+        variances = [v for v in (frame.aleatoric, frame.epistemic) if v is not None]
         checked = check_anchors(anchors, frame, variances, self._kernels(depth.device.type)[1].check_anchors)
         self._doubts.judge(anchors, checked, frame.size)
         return replace(frame, anchors=checked)
