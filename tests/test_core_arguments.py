@@ -12,7 +12,7 @@ from modules import CONFIG, H, K, W, frame, same
 from PIL import Image
 from torch import nn
 
-from ufmstar_torch import AnchorConfig, ConfidenceConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch import AnchorConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch import uncertain_depth as pipeline
 from ufmstar_torch.frames.prediction import combine
 from ufmstar_torch.gaussians.camera import crop_intrinsics, resize_intrinsics
@@ -160,7 +160,7 @@ REFUSED = {
         lambda: ufm(DEPTH, POSE, K, confidence=DEPTH), ValueError, "confidence must be None where"
     ),
     "a confidence in whole numbers": (
-        lambda: UfMStar(CONFIG.replace(anchors=AnchorConfig(), confidence=ConfidenceConfig()))(
+        lambda: UfMStar(CONFIG.replace(anchors=AnchorConfig(), confidence=True))(
             DEPTH, POSE, K, confidence=DEPTH.int()
         ),
         TypeError, "confidence must have a floating-point",

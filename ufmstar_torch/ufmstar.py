@@ -238,7 +238,7 @@ class UfMStar(StatefulModule):
     def uses_confidence(self) -> bool:
         """True if V depends on the network's confidence."""
         mapped = isinstance(self.recalibration, Recalibration) and self.recalibration.covariate == CONFIDENCE
-        return self.config.confidence is not None or mapped
+        return self.config.confidence or mapped
 
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
         self._empty.with_tensors(state).require(self.config, self._empty)
@@ -250,7 +250,7 @@ class UfMStar(StatefulModule):
         used = {"anchors": self.config.anchors is not None, "confidence": self.uses_confidence}
         for name, value in (("anchors", anchors), ("confidence", confidence)):
             if value is not None and not used[name]:
-                raise ValueError(f"{name} must be None where UfMStarConfig.{name} is None, which switches it off")
+                raise ValueError(f"{name} must be None where UfMStarConfig.{name} is off")
         frame = check_frame(
             depth, T, K, *maps, **view, variances_in_h=self.config.variances_in_h,
             rotation_tolerance=self.config.rotation_tolerance, max_depth=self.config.segment.depth_limit,

@@ -96,13 +96,13 @@ def corrected(
     """
     M, factor, quantiles = out.maps["disagreement"], None, None
     maps, counts = dict[str, Tensor](), dict[str, Tensor]()
-    if config.confidence is not None and frame.confidence is not None:
+    if config.confidence and frame.confidence is not None:
         V = None
         if pixels is None:
             network = network_maps(frame, out.maps["features"], config, pixels)
             V = total_variance(out.variance, network, frame, config, mapped, pixels)
         before = state.by_stream["confidence"]
-        after, factor, counts["confidence"] = learn_confidence(before, frame, V, config.confidence)
+        after, factor, counts["confidence"] = learn_confidence(before, frame, V)
         factor, state = at_pixels(factor, pixels), state.with_tensors({"confidence": after})
     if config.posterior is not None and pixels is None:
         network = network_maps(frame, out.maps["features"], config, pixels)
