@@ -6,7 +6,6 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
@@ -42,7 +41,7 @@ from ufmstar_torch.frames.prediction import (
 from ufmstar_torch.posterior.recalibrate import Recalibration
 from ufmstar_torch.runtime.kinds import require
 from ufmstar_torch.runtime.stateful import OneCaller, one_caller
-from ufmstar_torch.runtime.warm_up import along_wall, warm_up
+from ufmstar_torch.runtime.warm_up import warm_up
 from ufmstar_torch.ufmstar import UfMStar
 
 # Keys of a stream's state, or prefixes of keys: of UfM*, of the anchors' source, and the number of processed images.
@@ -419,7 +418,7 @@ class UncertainDepth(NetworksInTurn):
         if self.networks:
             size = self.run_on_noise(size, streams)
         ufm = UfMStar(self.ufm.config, dtype=self.ufm.mean.dtype, device=self.ufm.mean.device)
-        warm_up(ufm, size, streams, progress, [partial(along_wall, kind()) for kind in searching])
+        warm_up(ufm, size, streams, progress, searching)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Move the networks; UfM* stays on ``multiview_device`` unless that is None."""

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 
@@ -31,12 +30,12 @@ def warm_up_command(
     """Compile UfM* and the sources of ``anchors`` that are named in it ("corners", "dense"), or load them from disk."""
     from ufmstar_torch.anchors.dense import DenseEvidence
     from ufmstar_torch.anchors.tracker import LandmarkTracker
-    from ufmstar_torch.runtime.warm_up import along_wall, warm_up
+    from ufmstar_torch.runtime.warm_up import warm_up
     from ufmstar_torch.ufmstar import UfMStar
 
     searching = {CORNERS: LandmarkTracker, DENSE: DenseEvidence}
-    also = [partial(along_wall, kind()) for name, kind in searching.items() if name in anchors]
-    warm_up(UfMStar(config), (32, 32), 1, lambda done, total: show(Progress("kernels", done, total)), also)
+    sources = [kind for name, kind in searching.items() if name in anchors]
+    warm_up(UfMStar(config), (32, 32), 1, lambda done, total: show(Progress("kernels", done, total)), sources)
 
 
 @contextmanager
