@@ -85,10 +85,6 @@ REFUSED = {
     "epistemic in whole numbers": (lambda: ufm(DEPTH, POSE, K, None, DEPTH.int()), TypeError, "epistemic must have"),
     "valid as a weight": (lambda: ufm(DEPTH, POSE, K, valid=DEPTH), TypeError, "valid must be a torch.bool"),
     "valid of another size": (lambda: ufm(DEPTH, POSE, K, valid=DEPTH[:, 1:] > 0), ValueError, "valid must have"),
-    "features that are off": (lambda: ufm(DEPTH, POSE, K, features=DEPTH[:, None]), ValueError, "features must have"),
-    "features that are missing": (
-        lambda: UfMStar(CONFIG.replace(features=1))(DEPTH, POSE, K), ValueError, "features must be given"
-    ),
     "anchors that are off": (lambda: ufm(DEPTH, POSE, K, anchors=1), ValueError, "anchors must be None where"),
     "an unknown argument": (lambda: ufm(DEPTH, POSE, K, ancors=1), TypeError, "unexpected keyword argument 'ancors'"),
     "a config that is a dict": (lambda: UfMStar({}), TypeError, "config must be a UfMStarConfig"),
@@ -236,7 +232,7 @@ def network_of_zeros():
 PUBLIC = {
     "UfMStar": (UfMStar, {"config": None, "recalibration": None, "dtype": torch.float32, "device": None}),
     "forward": (
-        lambda **k: seen()(**k), GOOD | dict.fromkeys(("aleatoric", "epistemic", "valid", "features")),
+        lambda **k: seen()(**k), GOOD | dict.fromkeys(("aleatoric", "epistemic", "valid")),
     ),
     "mean_uncertainty": (lambda **k: seen().mean_uncertainty(**k), GOOD | SAMPLE),
     "query": (lambda **k: seen().query(**k), {"points": torch.zeros(1, 1, 3), "frame": "world"}),
@@ -248,7 +244,7 @@ PUBLIC = {
          "anchors": None, "recalibration": None, "check_poses": 0, "multiview_device": None},
     ),
     "UncertainDepth.forward": (
-        lambda **k: network_of_zeros()(**k), IMAGE_GOOD | dict.fromkeys(("valid", "features", "anchors")),
+        lambda **k: network_of_zeros()(**k), IMAGE_GOOD | dict.fromkeys(("valid", "anchors")),
     ),
     "update": (
         lambda **k: network_of_zeros().update(**k),
@@ -331,17 +327,15 @@ def test_a_network_whose_train_starts_a_training_is_refused(place):
     UncertainDepth(Freezes())
 
 
-@pytest.mark.parametrize("name", ["depth", "aleatoric", "epistemic", "valid", "features"])
+@pytest.mark.parametrize("name", ["depth", "aleatoric", "epistemic", "valid"])
 def test_the_mask_of_an_array_is_valid(name):
     """A masked entry is the same as False in ``valid``."""
     masked = np.zeros((1, H, W), bool)
     masked[:, :, W // 2 :] = True
-    config = UfMStarConfig(features=1)
     maps = {name: np.full((1, H, W), value) for name, value in (("depth", 2.0), ("aleatoric", 0.1), ("epistemic", 0.1))}
-    maps |= {"valid": np.ones((1, H, W), bool), "features": np.ones((1, 1, H, W))}
-    expected = UfMStar(config)(pose=POSE, intrinsics=K, **{**maps, "valid": ~masked})
-    mask = masked[:, None] if name == "features" else masked
-    out = UfMStar(config)(pose=POSE, intrinsics=K, **{**maps, name: np.ma.masked_array(maps[name], mask)})
+    maps["valid"] = np.ones((1, H, W), bool)
+    expected = UfMStar()(pose=POSE, intrinsics=K, **{**maps, "valid": ~masked})
+    out = UfMStar()(pose=POSE, intrinsics=K, **{**maps, name: np.ma.masked_array(maps[name], masked)})
     assert torch.equal(out.valid, expected.valid)
     torch.testing.assert_close(out.variance[out.valid], expected.variance[out.valid], rtol=0, atol=0)
     with pytest.raises(TypeError, match="image must not be masked"):

@@ -43,7 +43,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: settings({"max_components": 0}), "max_components"),
     (lambda: settings({"variance_floor": NAN}), "variance_floor"),
     (lambda: settings({"add_aleatoric": 1}), "add_aleatoric"),
-    (lambda: settings({"features": 1.5}), "features"),
+    (lambda: settings({"initial_capacity": 1.5}), "initial_capacity"),
     (lambda: settings({"initial_capacity": True}), "initial_capacity"),
     (lambda: settings({"eta_oclusion": 0.7}), "eta_oclusion"),
     (lambda: settings({"segment": {"min_pixel": 7}}), "min_pixel"),

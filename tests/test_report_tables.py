@@ -47,23 +47,15 @@ ALONE, UFM, _, UFM_STAR = ENSEMBLE
 SECOND = "records/scannet/x/Ensemble.json"
 
 
-def test_a_mixture_has_columns_where_a_row_states_one():
+def test_a_mixture_and_intervals_have_columns_where_a_row_states_them():
     plain = {(row, ("d", "s")): {"rmse": 0.5} for row in (ALONE, UFM_STAR)}
-    stated = plain | {(UFM_STAR, ("d", "s")): {"rmse": 0.5, "mixture_nll": 0.25, "mixture_coverage": 0.99}}
-    without, extended = extra_table(in_memory(plain)), extra_table(in_memory(stated))
-    new = [heading for _, heading in extended.cells.columns if ("", heading) not in without.cells.columns]
-    assert new == ["mixture: NLL ↓", "mixture: within 3 σ [%]"]
-    assert list(extended.cells.iloc[1][-2:]) == ["0.25", "99.0"]
-
-
-def test_coverage_has_columns_where_a_row_has_intervals():
-    plain = {(row, ("d", "s")): {"rmse": 0.5} for row in (ALONE, UFM_STAR)}
-    coverage = {"coverage_50": 0.52, "coverage_90": 0.905, "coverage_99": 0.99}
-    extended = extra_table(in_memory(plain | {(UFM_STAR, ("d", "s")): {"rmse": 0.5, **coverage}}))
+    stated = {"mixture_nll": 0.25, "mixture_coverage": 0.99, "coverage_50": 0.52, "coverage_90": 0.905}
+    extended = extra_table(in_memory(plain | {(UFM_STAR, ("d", "s")): {"rmse": 0.5, **stated}}))
     before = extra_table(in_memory(plain)).cells.columns
     new = [heading for _, heading in extended.cells.columns if ("", heading) not in before]
-    assert new == ["in the 50 % interval [%]", "in the 90 % interval [%]", "in the 99 % interval [%]"]
-    assert list(extended.cells.iloc[1][-3:]) == ["52.0", "90.5", "99.0"]
+    shares = ["mixture: within 3 σ [%]", "in the 50 % interval [%]", "in the 90 % interval [%]"]
+    assert new == ["mixture: NLL ↓", *shares]
+    assert list(extended.cells.iloc[1][-4:]) == ["0.25", "99.0", "52.0", "90.5"]
 
 
 class TestMainTable:

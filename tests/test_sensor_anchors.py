@@ -327,7 +327,7 @@ def test_holes_that_move_have_the_depths_of_earlier_frames_without_images(tour):
         for i, entry in enumerate(tour.entries)
     )
     (row, _), squares, counts = sensor_job(replace(tour, entries=entries), tour).row(), np.zeros(2), []
-    with patch.object(row.anchors.tracks, "of", return_value=None):
+    with patch.object(row.anchors, "tracked", return_value=None):
         for result in frame_results(replace(tour, entries=entries), range(len(entries)), [row]):
             found, truth = result.rows[UFM], tour[result.index].depth[::2, ::2]
             hole = np.zeros(truth.shape, np.bool_)

@@ -80,7 +80,6 @@ def test_sizes_of_networks_and_settings():
         lambda: NetworkSpec(size=(32 * 10**5, 32 * 10**5)),
         lambda: parse_size("1000000x1000000"),
         lambda: UfMStarConfig(initial_capacity=10**9),
-        lambda: UfMStarConfig(features=10**9),
     ):
         with pytest.raises(ValueError, match=LIMIT):
             refused()

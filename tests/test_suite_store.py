@@ -18,8 +18,8 @@ from tiny_suite import NAMES, go, job_on, write_rooms
 from ufmstar_torch.eval.engine.record import pack, unpack
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
-from ufmstar_torch.eval.run.folder import FolderError, hold
-from ufmstar_torch.eval.suite.folder import evaluation_folder
+from ufmstar_torch.eval.run.folder import FolderError, hold, output_folder
+from ufmstar_torch.eval.suite.folder import EVALUATION
 from ufmstar_torch.eval.suite.work_items import WorkItem, find_work, read_names
 
 # ---- work list ----
@@ -85,8 +85,8 @@ ABOUT = {
 }  # fmt: skip
 
 
-def enter(*arguments, **how):
-    with evaluation_folder(*arguments, **how):
+def enter(out, about, **how):
+    with output_folder(out, EVALUATION, about, **how):
         pass
 
 

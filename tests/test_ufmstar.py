@@ -18,9 +18,9 @@ BACKENDS = ("torch", "numba")
 
 
 VARIANTS = {
-    "overlap": {"disagreement": "overlap", "overlap_weighted": True, "initial_capacity": 2},
-    "neighbourhood": {"regression": "neighbourhood", "features": 1},
-    "anchored": {"anchors": AnchorConfig(), "features": 1},
+    "weighted": {"overlap_weighted": True, "initial_capacity": 2},
+    "neighbourhood": {"regression": "neighbourhood", "variances_in_h": True},
+    "anchored": {"anchors": AnchorConfig()},
 }
 
 

@@ -247,8 +247,6 @@ class UfMStarConfig(Checked):
         overlap_weighted: weight a fusion by the overlap of its Gaussians
         view_baseline: baseline over distance at which a comparison with an earlier view counts for 63 %: two views from
             one position of the camera show nothing; null = every comparison counts fully, as in the paper
-        disagreement: between views: squared 2-Wasserstein distance (w2), or squared depth difference where both
-            Gaussians are seen (overlap)
         prior_weight: weight of the prior in the regression
         prior_mean: disagreement where no Gaussian is near
         unmeasured: M where no two views were compared: a share of the depth squared (relative), as the paper (0 of what
@@ -261,7 +259,6 @@ class UfMStarConfig(Checked):
         add_epistemic: add the network's epistemic variance to the result
         variances_in_h: average the network's variances, aleatoric and epistemic, over views in the Gaussians (the
             paper's H), and add these averages instead of the pixel's own
-        features: additional regressed quantities per Gaussian
         initial_capacity: slots for Gaussians at the start; the number grows as needed
         max_components: largest number of Gaussians, beyond which the farthest are dropped, then the oldest; null = no
             limit
@@ -284,9 +281,6 @@ class UfMStarConfig(Checked):
     overlap_weighted: bool = False
     # Two views from one position are one view (``steps.fuse``).
     view_baseline: float | None = number(0.07, "b_0", "1", 0.0, open_low=True, optional=True)
-    # m averages the paper's squared 2-Wasserstein distance, or the squared depth difference where both Gaussians are
-    # seen (``disagree``).
-    disagreement: str = choice("w2", "overlap")
 
     # Regression (section "Uncertainty Regression")
     prior_weight: float = number(1.0, "pi_0", "px/m^3", 0.0, open_low=True)
@@ -301,7 +295,6 @@ class UfMStarConfig(Checked):
 
     # State
     variances_in_h: bool = False
-    features: int = number(0, "dim H - 1", "1", 0)
     initial_capacity: int = number(256, "K_0", "components", 1)
     max_components: int | None = number(None, "K_max", "components", 1)
 
@@ -363,8 +356,8 @@ class UfMStarConfig(Checked):
 
     @property
     def entries(self) -> int:
-        """Number of entries of H after m: ``features``, and with ``variances_in_h`` also A, E and 1."""
-        return self.features + 3 * self.variances_in_h
+        """Number of entries of H after m: with ``variances_in_h`` A, E and 1."""
+        return 3 * self.variances_in_h
 
     def merges_on(self, device_type: str) -> bool:
         """True if components are merged on a ``torch.device.type``."""

@@ -12,7 +12,7 @@ OUT/records/DATASET/SEQUENCE/failed.json
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from typing import Any
 from ufmstar_torch.eval.engine.files import remove_temporaries, write_json_atomic
 from ufmstar_torch.eval.engine.record import FORMAT, Record, ResultsError
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
+from ufmstar_torch.eval.run.folder import FolderError, FolderKind
 from ufmstar_torch.eval.suite.work_items import WorkItem
 from ufmstar_torch.files.limits import read_json
 
@@ -28,13 +28,6 @@ FAILED, CACHE, STOP = "failed.json", "cache", "eval.stop"
 # Files of a report; --overwrite removes them.
 _REPORT = ("efficiency.json", "results.csv", "report.html", "tables/*.tex", "figures/*.png", "figures/*.svg")
 _OF_SEQUENCE = ("*.json", "*.pt", "examples/*.npz")
-
-
-def evaluation_folder(out: Path, about: Mapping[str, Any], *, overwrite: bool = False) -> AbstractContextManager[None]:
-    """Create the folder, or continue the evaluation in it, and lock it; see ``output_folder``. Rows, sequences and
-    networks of ``about`` (eval.json) are added to the earlier evaluation; suite, settings and the networks of the same
-    base must be equal. The cache of predictions is never removed."""
-    return output_folder(out, EVALUATION, about, overwrite=overwrite)
 
 
 @dataclass(frozen=True)
@@ -140,6 +133,8 @@ def _merged(earlier: Mapping[str, Any], current: Mapping[str, Any]) -> dict[str,
     }
 
 
+# Rows, sequences and networks are added to the earlier evaluation; suite, settings and the networks of the same base
+# must be equal. The cache of predictions is never removed.
 EVALUATION = FolderKind(
     program="ufmstar eval",
     noun="evaluation",

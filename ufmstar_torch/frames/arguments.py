@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias, cast
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -17,19 +17,7 @@ _RESOLUTION, _TOO_FAR = 0.01, 1e10  # [m] coarsest accepted pose coordinates, an
 Array: TypeAlias = Tensor | NDArray[Any]
 # An image may also be Pillow's, and intrinsics four numbers.
 ImageLike: TypeAlias = Any
-CameraLike: TypeAlias = "Tensor | NDArray[Any] | Sequence[float] | PinholeCamera"
-
-
-class PinholeCamera(Protocol):
-    """kornia's camera, accepted as the pose, the intrinsics or both."""
-
-    @property
-    def extrinsics(self) -> Tensor:
-        """[B, 4, 4] world-to-camera [m]."""
-
-    @property
-    def intrinsics(self) -> Tensor:
-        """[B, 4, 4] [px], first pixel's centre at (0, 0)."""
+CameraLike: TypeAlias = "Tensor | NDArray[Any] | Sequence[float]"
 
 
 def as_tensor(name: str, value: object) -> Tensor:
@@ -152,18 +140,12 @@ def as_pose(pose: CameraLike) -> Tensor:
     that :func:`ufmstar_torch.frames.frame.pose_fault` rejects them.
 
     Args:
-        pose: [B, 4, 4], [4, 4], or [..., 3, 4] without the last row; or a :class:`PinholeCamera`, whose world-to-camera
-            matrix is inverted.
+        pose: [B, 4, 4], [4, 4], or [..., 3, 4] without the last row.
 
     Raises:
         TypeError: another type.
         ValueError: another shape.
     """
-    if (camera := _camera(pose)) is not None:
-        T_cam_world = require_float("pose.extrinsics", camera.extrinsics)
-        if T_cam_world.dim() != 3 or T_cam_world.shape[1:] != (4, 4):
-            raise ValueError(f"pose.extrinsics must be [B, 4, 4] world-to-camera, got {tuple(T_cam_world.shape)}")
-        return torch.linalg.inv_ex(T_cam_world.double()).inverse  # of a singular matrix: infinite, so not rigid
     T = _numbers("pose", pose)
     if T.dtype != torch.float64 and T.shape[-1:] == (4,):
         coarse = T.abs() > _RESOLUTION / torch.finfo(T.dtype).eps
@@ -182,17 +164,13 @@ def as_intrinsics(intrinsics: CameraLike) -> Tensor:
     """Convert intrinsics to [B, 3, 3] or [3, 3] [px].
 
     Args:
-        intrinsics: [B, 3, 3], [3, 3], [..., 4, 4] with the fourth row and column of an identity, the four numbers fx,
-            fy, cx, cy [px], or a :class:`PinholeCamera`.
+        intrinsics: [B, 3, 3], [3, 3], [..., 4, 4] with the fourth row and column of an identity, or fx, fy, cx, cy.
 
     Raises:
         TypeError: another type.
         ValueError: another shape, or another fourth row or column.
     """
-    camera = _camera(intrinsics)
-    K = _numbers("intrinsics", intrinsics if camera is None else camera.intrinsics)
-    if camera is not None and K.shape[-2:] == (4, 4):
-        K = K[..., :3, :3]  # kornia ignores the fourth row and column, too
+    K = _numbers("intrinsics", intrinsics)
     if K.shape == (4,):
         (fx, fy, cx, cy), zero, one = K, K.new_zeros(()), K.new_ones(())
         return torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one]).view(3, 3)
@@ -208,16 +186,6 @@ def as_intrinsics(intrinsics: CameraLike) -> Tensor:
 def _of_intrinsics(values: Tensor) -> bool:
     """True if the shape fits intrinsics but no pose."""
     return values.shape == (4,) or values.shape[-2:] == (3, 3)
-
-
-def _camera(value: object) -> PinholeCamera | None:
-    """``value`` if it is kornia's camera, else None; does not import kornia."""
-    if isinstance(value, Tensor | np.ndarray):
-        return None
-    is_kornia = any(
-        cls.__name__ == "PinholeCamera" and cls.__module__.startswith("kornia.") for cls in type(value).__mro__
-    )
-    return cast("PinholeCamera", value) if is_kornia else None
 
 
 def _numbers(name: str, value: object) -> Tensor:
