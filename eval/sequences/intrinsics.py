@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from ufmstar_torch.eval.sequences.frame import Size
 from ufmstar_torch.eval.sequences.paths import on_disk
 
 # A file's path, a matrix [3, 3] (or ScanNet's [4, 4]), or the numbers fx, fy, cx, cy [px].
-IntrinsicsLike = str | Path | np.ndarray | Sequence[float]
+IntrinsicsLike = str | Path | np.ndarray | Sequence[Any]
 
 # Names of files with the camera of the images, and of the depth maps.
 FILES = (
