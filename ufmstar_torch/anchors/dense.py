@@ -201,14 +201,9 @@ class DenseEvidence(SavedState):
         self._memory.forget()
 
     def _measured(
-        self,
-        small: NDArray[np.uint8],
-        half: NDArray[np.uint8],
-        scale: NDArray,
-        T: NDArray,
-        K: NDArray,
+        self, small: NDArray[np.uint8], half: NDArray[np.uint8], scale: NDArray, T: NDArray, K: NDArray,
         corners: Landmarks,
-    ) -> Landmarks:
+    ) -> Landmarks:  # fmt: skip
         """Measure the depths in a reduced image, and add corners where there are none. ``half`` is the image at half
         the size."""
         cell, K = _cell(small.shape[1]), self._errors.camera(K)
@@ -240,14 +235,9 @@ class DenseEvidence(SavedState):
         return Landmarks(position, depth, variance, searched, none, *judged, motion=motion, moving=withheld)
 
     def _in_cells(
-        self,
-        small: NDArray[np.uint8],
-        T: NDArray,
-        K: NDArray,
-        cell: int,
-        compared: tuple[Views, Views] | None,
+        self, small: NDArray[np.uint8], T: NDArray, K: NDArray, cell: int, compared: tuple[Views, Views] | None,
         trusted: bool,
-    ) -> tuple[Depths, int, bool, list[MotionTest], int]:
+    ) -> tuple[Depths, int, bool, list[MotionTest], int]:  # fmt: skip
         """Measure visible landmarks again where the camera has moved, and new pixels in the cells without a landmark.
 
         Also updates the running estimates.
@@ -277,13 +267,9 @@ class DenseEvidence(SavedState):
         return depths, count + searched, trusted, tests, disagree + refuted
 
     def _coarse(
-        self,
-        small: NDArray[np.uint8],
-        half: NDArray[np.uint8],
-        occupied: NDArray[np.float64],
-        views: Views,
+        self, small: NDArray[np.uint8], half: NDArray[np.uint8], occupied: NDArray[np.float64], views: Views,
         cell: int,
-    ) -> Depths:
+    ) -> Depths:  # fmt: skip
         """Search the cells without a pixel of ``occupied`` [N, 2] with windows of twice the width, in images of half
         the size.
 

@@ -40,13 +40,9 @@ class Keyframes(SavedState):
         self._added = 0
 
     def add(
-        self,
-        image: NDArray[np.uint8],
-        half: NDArray[np.uint8],
-        T_world_cam: NDArray[np.float64],
-        depth: float,
+        self, image: NDArray[np.uint8], half: NDArray[np.uint8], T_world_cam: NDArray[np.float64], depth: float,
         number: int,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Store a frame if the camera has moved or turned since the last keyframe.
 
         Args:
@@ -73,12 +69,8 @@ class Keyframes(SavedState):
         self._pose[slot] = T_world_cam[view]
 
     def compared(
-        self,
-        T_world_cam: NDArray[np.float64],
-        K: NDArray[np.float64],
-        depth: float,
-        baselines: NDArray[np.float64],
-    ) -> tuple[Views, Views, float]:
+        self, T_world_cam: NDArray[np.float64], K: NDArray[np.float64], depth: float, baselines: NDArray[np.float64],
+    ) -> tuple[Views, Views, float]:  # fmt: skip
         """Choose the keyframes to compare with a view, at most one for each baseline, the shortest first; noise 0.
 
         Args:

@@ -79,15 +79,9 @@ class PoseErrors(SavedState):
         return np.array([[K[0, 0] * (1 + focal), 0, K[0, 2] + u], [0, K[1, 1] * (1 + focal), K[1, 2] + v], [0, 0, 1]])
 
     def corrected(
-        self,
-        pixel: NDArray[np.float64],
-        accepted: NDArray[np.bool_],
-        measured: Measured,
-        views: Views,
-        K: NDArray[np.float64],
-        depth: float,
-        trusted: bool = True,
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        self, pixel: NDArray[np.float64], accepted: NDArray[np.bool_], measured: Measured, views: Views,
+        K: NDArray[np.float64], depth: float, trusted: bool = True,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
         """Correct depths for errors of the poses and the camera, and update the estimates of these errors.
 
         Args:
