@@ -3,7 +3,7 @@
 An error (w, s) of a keyframe's relative pose shifts all pixels of its image consistently, and so do errors of the focal
 length, the centre or the distortion. A shift across the epipolar lines is measured directly. A shift along them is
 measured where keyframes of other baselines, or other pixels, contradict it. To first order, with the errors d and the
-Jacobians of ``anchors.kernels.poses``,
+Jacobians of ``anchors.kernels.pose_equations``,
 
     value_k = rho + c_k d + noise,      across_k = a_k d + noise,
 
