@@ -29,7 +29,6 @@ def check_values(
     intrinsics: Tensor,
     aleatoric: Tensor | None,
     epistemic: Tensor | None,
-    features: Tensor | None,
     mask: Tensor | None,
     *,
     rotation_tolerance: float,
@@ -42,16 +41,16 @@ def check_values(
     wanted = np.ones(z.shape, np.bool_) if mask is None else array(mask)
     use, safe, counts = wanted if mask is None else wanted.copy(), np.empty_like(z), np.empty((3, b), np.int64)
     pixels = use.reshape(shape)
-    for values, least in ((aleatoric, 0.0), (epistemic, 0.0), (features, -LARGEST)):
+    for values in (aleatoric, epistemic):
         if values is not None:
-            _restrict(pixels, array(values).reshape(b, -1, shape[1]), least, LARGEST)
+            _restrict(pixels, array(values).reshape(b, 1, shape[1]), 0.0, LARGEST)
     limits = DEPTH_RANGE[0], min(max_depth, DEPTH_RANGE[1]), max_depth
     wanted = wanted.reshape(shape)
     usable = _count(z.reshape(shape), pixels, wanted, mask is not None, safe.reshape(shape), cameras[3], limits, counts)
     T, K, deviation, fault, valid = map(torch.from_numpy, (*cameras, use))
     beyond, out_of_range, valid_pixels = torch.from_numpy(counts).unbind()
     return FrameInput(
-        torch.from_numpy(z if usable == z.size else safe), T, K, aleatoric, epistemic, features, valid, fault,
+        torch.from_numpy(z if usable == z.size else safe), T, K, aleatoric, epistemic, None, valid, fault,
         deviation, beyond, out_of_range, valid_pixels, fault,
     )  # fmt: skip
 

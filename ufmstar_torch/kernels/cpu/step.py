@@ -31,7 +31,6 @@ from ufmstar_torch.kernels.cpu.regress_cull import Seen, View
 from ufmstar_torch.kernels.cpu.rigid import FIELDS, padded
 from ufmstar_torch.kernels.cpu.segment import gaussians
 from ufmstar_torch.kernels.cpu.stream import COMPONENTS, COUNTS, DROPPED, NEW, SINGLE_VIEW, UNMEASURED, join, match
-from ufmstar_torch.steps.disagree import overlap_disagreement
 from ufmstar_torch.steps.fuse import Room, make_room
 from ufmstar_torch.steps.regress import distribute, memory_for
 from ufmstar_torch.steps.step import StepObserver, step_output, unobserved
@@ -134,9 +133,8 @@ def _join(
     features = slots[-1].shape[2] + columns + 1
     seen = [Seen(np.empty((FIELDS, padded(n))), np.empty(n), np.empty((n, features))) for n in totals]
     current, common = (*segments[:3], segments[-1]), (settings, counts)
-    distances = _distances(state, frame, first, segments, matched, config)
     each(join, [
-        (i, camera, first, members, updated, current, matched[i], distances[i], *common, seen[i])
+        (i, camera, first, members, updated, current, matched[i], *common, seen[i])
         for i in range(b)
     ])  # fmt: skip
     mixture, sums = dict(zip(_MIXTURE, map(torch.from_numpy, updated), strict=True)), dict(state.by_component)
@@ -193,19 +191,3 @@ def _learn(
     for one, values in zip(seen, array(learnt.beyond), strict=True):
         one.features[:, -COLUMNS - 1 : -1] = values[: len(one.disagreement)]
     return learnt, None
-
-
-def _distances(
-    state: UfMStarState, frame: FrameInput, first: NDArray[np.float64], segments: _Arrays, matched: Sequence[_Match],
-    config: UfMStarConfig,
-) -> list[NDArray[np.float64]]:  # fmt: skip
-    """The overlap disagreement [P] of the pairs of each stream, or [0] where the step uses W2^2."""
-    if config.disagreement != "overlap":
-        return [np.empty(0)] * len(matched)
-    motion = relative_pose(torch.from_numpy(first), frame.T_world_cam)
-    mixture = state.mixture.to(torch.float64).rigid(*motion)
-    mean, covariance = map(torch.from_numpy, segments[:2])
-    return [
-        overlap_disagreement(mean[b, c], covariance[b, c], mixture.mean[b, k], mixture.covariance[b, k]).numpy()
-        for b, (c, k) in enumerate(torch.from_numpy(pairs) for pairs, *_ in matched)
-    ]

@@ -69,7 +69,7 @@ def match(b, camera, before, after, mixture, segments, size, thresholds, counts)
 
 
 @kernel
-def join(b, camera, first, members, slots, segments, matched, distance, settings, counts, seen):
+def join(b, camera, first, members, slots, segments, matched, settings, counts, seen):
     """Step 4 for stream ``b``: fuse the pairs, append the new components, and transform the mixture into the camera
     frame for the regression.
 
@@ -81,7 +81,6 @@ def join(b, camera, first, members, slots, segments, matched, distance, settings
             mixture; changed.
         segments: mean, covariance, weight and features [B, C, ...] of C_i.
         matched: the result of :func:`match`.
-        distance: as :func:`fuse_pairs`.
         settings: as :func:`fuse_pairs`: whether weighted by overlap, epsilon, b_0 (0 = the paper) and near plane.
         counts: [8, B] rows of components and of those seen in one view are written.
         seen: written (:class:`Seen`); the last feature is that of ``regress.with_measured_share``, those between the
@@ -105,7 +104,7 @@ def join(b, camera, first, members, slots, segments, matched, distance, settings
     view[3] = members[b]
     fuse_pairs(
         mean, covariance, weight, disagreement, compared, views, references, features, moved, turned, weight_c,
-        features_c, pairs[0], pairs[1], overlap, distance, view, settings, empty(weight.size, np.float64), work,
+        features_c, pairs[0], pairs[1], overlap, view, settings, empty(weight.size, np.float64), work,
     )  # fmt: skip
     n = append(
         mean, covariance, weight, disagreement, compared, views, references, features, moved, turned, weight_c,
