@@ -271,7 +271,7 @@ def _of_depth(name: str, value: Tensor, plain: Tensor) -> Tensor:
     """A checked camera on its original device (the check of a pose on the CPU does not wait for an accelerator)."""
     if value.dim() == 3 and value.shape[0] not in (1, plain.shape[0]):
         raise ValueError(f"{name} must have depth's {plain.shape[0]} streams, got {value.shape[0]}")
-    if value.device.type == "meta" and plain.device.type != "meta":
+    if value.is_meta and not plain.is_meta:
         raise ValueError(f"{name} must hold values, got a tensor on device meta")
     return _constant(value)
 

@@ -176,7 +176,8 @@ class UfMStarState:
         """A copy with some tensors replaced, by name."""
         named = {**vars(self), **changed}
         for group in ("by_component", "by_stream"):
-            named[group] = {name: named.pop(name, value) for name, value in getattr(self, group).items()}
+            if own := named[group]:
+                named[group] = {name: named.pop(name, value) for name, value in own.items()}
         return UfMStarState(**named)
 
     def restarted(self, again: Tensor) -> UfMStarState:

@@ -23,6 +23,7 @@ sums adds to it; the bounds contain their own rounding. tests/test_regress.py ch
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -53,7 +54,6 @@ class Settings(NamedTuple):
         epsilon: of the culling for the image and for anchors.
         error: of the culling for maps, at least epsilon.
         least, least_product: log2 of the prior's parts of the denominator and of the numerator.
-        among: number of all components, of which a view has some.
     """
 
     prior_weight: float
@@ -62,7 +62,6 @@ class Settings(NamedTuple):
     error: float
     least: float
     least_product: float
-    among: int
 
 
 class Seen(NamedTuple):
@@ -82,6 +81,7 @@ class View(NamedTuple):
         fields: [n, 10] mean, whitening and log2 of the peak.
         packed: [10, n and more] the same by field, padded (``rigid.padded``), in the depth's dtype.
         terms: [n, TERMS] of the sum, in the depth's dtype.
+        among: number of all components of the mixture.
         settings: of the sum.
     """
 
@@ -89,40 +89,32 @@ class View(NamedTuple):
     fields: NDArray[np.float64]
     packed: NDArray[np.floating]
     terms: NDArray[np.floating]
+    among: int
     settings: Settings
 
 
-def in_view(
-    seen: Seen,
-    depth: NDArray[np.floating],
-    K: NDArray[np.float64],
-    prior: tuple[float, float],
-    epsilon: float,
-    error: float,
-) -> View:
-    """The components that can matter in an image.
-
-    Args:
-        seen: the mixture.
-        depth: [H, W], not positive where invalid.
-        K: [3, 3].
-        prior: its weight and mean.
-        epsilon, error: of :class:`Settings`.
-    """
-    n, dtype = len(seen.disagreement), depth.dtype
-    slot, fields, packed = np.empty(n, np.int64), np.empty((n, FIELDS)), np.empty((ROWS, padded(n)), dtype)
-    terms = np.empty((n, TERMS), dtype)
-    least = math.log2(prior[0]), math.log2(prior[0] * max(prior[1], _LEAST))
-    settings = Settings(*prior, epsilon, error, *least, n)
-    count = _in_view(*seen, K, depth, settings, slot, fields, packed, terms)
-    return View(slot[:count], fields[:count], packed, terms[:count], settings)
+@functools.lru_cache(maxsize=16)
+def settings_of(prior_weight: float, prior_mean: float, epsilon: float, error: float) -> Settings:
+    """The settings of the sum with a prior."""
+    least = math.log2(prior_weight), math.log2(prior_weight * max(prior_mean, _LEAST))
+    return Settings(prior_weight, prior_mean, epsilon, error, *least)
 
 
 @kernel
-def _in_view(components, m, features, K, depth, settings, index, fields, packed, constants):
-    """Write the first four of a :class:`View`; return the number of its components."""
+def in_view(components, m, features, depth, K, settings):
+    """The components that can matter in an image: the first four fields of a :class:`View`, with room for all
+    components, and the number of those.
+
+    Args:
+        components, m, features: of the mixture (:class:`Seen`).
+        depth: [H, W], not positive where invalid.
+        K: [3, 3].
+        settings: of the sum.
+    """
     height, width = depth.shape
     n = m.size
+    index, fields = empty(n, np.int64), empty((n, FIELDS), np.float64)
+    packed, constants = empty((ROWS, components.shape[1]), depth.dtype), empty((n, TERMS), depth.dtype)
     whitened = empty((WHITENED, components.shape[1]), np.float64)
     every = empty(n, np.int64)
     whiten(components, n, whitened)
@@ -143,7 +135,7 @@ def _in_view(components, m, features, K, depth, settings, index, fields, packed,
     chosen = cull(packed, n, limit(settings.epsilon, n + n // 64 + 1), box, settings, work, index)
     _terms(components, whitened, index, chosen, m, features, fields, constants)
     _pack(components, whitened, m, index, chosen, packed)
-    return chosen
+    return index, fields, packed, constants, chosen
 
 
 @reordered_leaf

@@ -89,8 +89,8 @@ def gaussians(
             write_labels(spans[b], runs[b], slot, out[b])
         return out
 
-    mean, covariance, weight = (_padded([fit[i] for fit in fits]) for i in range(3))
-    none, means = np.zeros_like(weight), np.empty((*weight.shape, 0))
+    mean, covariance, weight = map(_padded, zip(*[fit[:3] for fit in fits], strict=True))
+    none, means = np.zeros(weight.shape), np.empty((*weight.shape, 0))
     if features is not None:
         means = _feature_means(features, labels(), weight.astype(z.dtype)).astype(np.float64)
     return (mean, covariance, weight, none, none, none, np.zeros((*weight.shape, 5)), means), labels
@@ -98,7 +98,7 @@ def gaussians(
 
 def _padded(values: Sequence[Maps]) -> Maps:
     """[B, K, ...] of values [k, ...] by stream, zeros behind them; K is at least 1."""
-    if len(values) == 1 and len(values[0]) > 0:
+    if len(values) == 1 and values[0].size > 0:
         return values[0][None]
     out = np.zeros((len(values), max(1, *map(len, values)), *values[0].shape[1:]))
     for padded, value in zip(out, values, strict=True):
