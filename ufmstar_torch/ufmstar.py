@@ -21,7 +21,7 @@ from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.gaussians.state import ALWAYS_FLOAT64, NAMES, UfMStarState
 from ufmstar_torch.kernels.select import FrameKernels, select_frame, select_step
 from ufmstar_torch.posterior.recalibrate import CONFIDENCE, Recalibration
-from ufmstar_torch.runtime.stateful import StatefulModule, full_precision, one_caller, outliving
+from ufmstar_torch.runtime.stateful import StatefulModule, one_caller, undisturbed
 from ufmstar_torch.runtime.warm_up import warm_up
 from ufmstar_torch.steps import variance
 from ufmstar_torch.steps.regress import Regression, query
@@ -200,8 +200,7 @@ class UfMStar(StatefulModule):
         Raises:
             ValueError: wrong shape or frame, or there was no frame yet.
         """
-        with torch.no_grad():
-            return query(self.state, as_tensor("points", points), frame, self.config)
+        return query(self.state, as_tensor("points", points), frame, self.config)
 
     @property
     def mixture(self) -> GaussianMixture:
@@ -226,7 +225,7 @@ class UfMStar(StatefulModule):
         """
         if require_flag("keep_evidence", keep_evidence) and not self._empty.by_stream:
             raise ValueError("keep_evidence needs UfMStarConfig(anchors=AnchorConfig()), got one without anchors")
-        with outliving(), torch.no_grad():  # buffers must outlive the caller's inference mode
+        with undisturbed(self.mean.device):
             old, b = self.state, self.mean.shape[0]
             if streams is None:
                 self._warnings.reset()
@@ -249,10 +248,10 @@ class UfMStar(StatefulModule):
         self, depth: Tensor, T: CameraLike, K: CameraLike, *maps: Array | None, anchors: Anchors | None,
         confidence: Array | None, **view: Any,
     ) -> FrameInput:  # fmt: skip
-        used = {"anchors": self.config.anchors is not None, "confidence": self.uses_confidence}
-        for name, value in (("anchors", anchors), ("confidence", confidence)):
-            if value is not None and not used[name]:
-                raise ValueError(f"{name} must be None where UfMStarConfig.{name} is None, which switches it off")
+        unused = ["anchors"] if anchors is not None and self.config.anchors is None else []
+        if unused or (confidence is not None and not self.uses_confidence):
+            [name] = unused or ["confidence"]
+            raise ValueError(f"{name} must be None where UfMStarConfig.{name} is None, which switches it off")
         frame = check_frame(
             depth, T, K, *maps, **view, feature_count=self.config.features, variances_in_h=self.config.variances_in_h,
             rotation_tolerance=self.config.rotation_tolerance, max_depth=self.config.segment.depth_limit,
@@ -273,8 +272,7 @@ class UfMStar(StatefulModule):
     ) -> UncertaintyOutput:  # fmt: skip
         """Run the step and the corrections by anchors, and store the new state. The maps are [B, n] at ``pixels``,
         indices into the flattened image; without these, ``network`` has the caller's maps, whose shape they get."""
-        # Outside the caller's inference mode, since the state must outlive it.
-        with outliving(), torch.set_grad_enabled(False), full_precision(frame.depth.device):
+        with undisturbed(frame.depth.device):
             state = self._stored().for_frame(frame, self.config)
             if self.config.on_bad_frame == "raise":
                 raise_faults(frame)
@@ -292,7 +290,7 @@ class UfMStar(StatefulModule):
         if network is not None:
             maps = self._shaped(maps, network, frame.confidence)
         depth, V, valid = maps.pop("depth"), maps.pop("variance"), maps.pop("valid")
-        out = replace(out, depth=depth, variance=V, valid=valid, maps=maps)
+        out = UncertaintyOutput(depth, V, valid, maps, out.statistics, out.quantiles, out.current_cam)
         self._store(state.tensors())  # last, so that an earlier error changes nothing
         self._warnings.after_frame(frame, out.statistics, state.frames, self.config)
         return out

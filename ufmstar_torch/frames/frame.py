@@ -242,12 +242,10 @@ def raise_faults(frame: FrameInput) -> None:
         ValueError: a stream is faulty, or the frame has no values.
     """
     fault = frame.fault if frame.host_fault is None else frame.host_fault
-    if fault.device.type == "meta":
+    if fault.is_meta:
         raise ValueError("depth lies on device meta, without values: set on_bad_frame='skip'")
-    faults = fault.tolist()
-    bad = [f"stream {b}: {FRAME_FAULTS[code]}" for b, code in enumerate(faults) if code]
-    if bad:
-        raise ValueError("; ".join(bad))
+    if any(faults := fault.tolist()):
+        raise ValueError("; ".join(f"stream {b}: {FRAME_FAULTS[code]}" for b, code in enumerate(faults) if code))
 
 
 def _features(features: Array | None, count: int, plain: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, pairwise
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,7 @@ _ROWS = 8
 EVERY = 64
 # Counts of a frame that are read for these checks, and their type.
 _READ = ("segments", "valid_pixels", "beyond", "out_of_range", "components", "fault", "single_view")
+_READ_FROM = itemgetter(*_READ)
 _Counts = dict[str, list[int]]
 LOGGER = logging.getLogger("ufmstar_torch")
 _ONE_VIDEO = (
@@ -119,7 +121,7 @@ class _Track:
             if self.alternating == _ALTERNATING:
                 text = "the poses go back and forth between two places: every camera is a stream of its own (a batch)"
                 yield "alternating", text
-            largest = float(depth.max())
+            largest = float(np.maximum.reduce(depth, None))
             self.saturated = self.saturated + 1 if largest == self.farthest > 0 else 0
             self.farthest = largest
             if self.saturated == _FRAMES:
@@ -221,7 +223,7 @@ class StreamWarnings:
         self._calls += 1
         if device == "meta" or (device != "cpu" and (self._calls % EVERY or torch.cuda.is_current_stream_capturing())):
             return
-        counts = {name: statistics.counts[name].tolist() for name in _READ}
+        counts = dict(zip(_READ, map(Tensor.tolist, _READ_FROM(statistics.counts)), strict=True))
         used = statistics.counts.get("anchors_used")
         seen = frames.tolist()
         findings = (
@@ -233,8 +235,8 @@ class StreamWarnings:
         log_once(self._logged, chain.from_iterable(findings))
 
     def _tracked(self, frame: FrameInput, counts: _Counts, used: list[int] | None) -> Iterator[tuple[int, str, str]]:
-        rows = frame.depth[:, ::_ROWS].numpy(force=True)
-        totals, pixels, faults = rows.sum((1, 2)).tolist(), counts["valid_pixels"], counts["fault"]
+        rows = frame.depth.numpy(force=True)[:, ::_ROWS]
+        totals, pixels, faults = np.add.reduce(rows, (1, 2)).tolist(), counts["valid_pixels"], counts["fault"]
         poses, cameras = frame.T_world_cam.tolist(), frame.intrinsics.tolist()
         members = [0.0] * len(poses) if frame.member is None else frame.member.tolist()
         height, width = frame.size
@@ -286,23 +288,24 @@ def _left_out(
         segments, valid, beyond, outside, components, fault, _, seen = each
         positive = valid + beyond + outside
         unstated = 0 if config.segment.max_depth is not None else beyond
-        parted = f"of {positive} pixels {beyond} lie beyond segment.max_depth = {config.segment.depth_limit} m and "
-        parted += f"{outside} outside the accepted ranges. "
-        shows = frame.informative is None or bool(frame.informative[b])
-        if positive and not segments and not fault and shows:
-            text = f"a frame has no segment, so nothing is compared between views: {parted}"
+        if positive and not segments and not fault and (frame.informative is None or bool(frame.informative[b])):
+            text = "a frame has no segment, so nothing is compared between views: " + _parted(*each[1:4], config)
             yield b, "segments", text + "Is the depth in metres, smooth, and the intrinsics the depth map's?"
         elif max(outside, unstated) > _OUTSIDE * positive:
-            text = (
-                f"pixels are left out: {parted}Are A and E variances [m^2], not logarithms, which may be negative, and "
-            )
-            yield b, "range", text + "does the network state its largest depth (segment.max_depth)?"
+            text = _parted(*each[1:4], config) + "Are A and E variances [m^2], not logarithms, which may be negative, "
+            text += "and does the network state its largest depth (segment.max_depth)?"
+            yield b, "range", "pixels are left out: " + text
         elif seen >= _FRAMES and 0 < valid < _SPARSE * frame.size[0] * frame.size[1]:
             share = valid / (frame.size[0] * frame.size[1])
             yield b, "sparse", f"only {share:.1%} of the pixels are used: is valid inverted? True = use"
         elif not positive and not components and seen >= _FRAMES:
             text = f"none of {seen} frames has a pixel with a positive and finite depth where valid is True"
             yield b, "empty", text + ": nothing is compared between views"
+
+
+def _parted(valid: int, beyond: int, outside: int, config: UfMStarConfig) -> str:
+    limit, every = f"segment.max_depth = {config.segment.depth_limit} m", valid + beyond + outside
+    return f"of {every} pixels {beyond} lie beyond {limit} and {outside} outside the accepted ranges. "
 
 
 def _spreads(frame: FrameInput) -> Iterator[tuple[int, str, str]]:

@@ -178,7 +178,9 @@ class UfMStarState:
         for group in ("by_component", "by_stream"):
             if own := named[group]:
                 named[group] = {name: named.pop(name, value) for name, value in own.items()}
-        return UfMStarState(**named)
+        state = UfMStarState.__new__(UfMStarState)  # the constructor takes ten times as long
+        vars(state).update(named)
+        return state
 
     def restarted(self, again: Tensor) -> UfMStarState:
         """A copy with the streams of the mask ``again`` [B] set to the state before their first frame."""

@@ -35,7 +35,7 @@ def array(value: Tensor) -> NDArray[Any]:
 
 
 def arrays(*tensors: Tensor) -> list[NDArray[Any]]:
-    """Contiguous arrays that share the memory of tensors on the CPU where they can; no tensor has a graph or is half."""
+    """As :func:`array`, of tensors on the CPU without a graph, none of which is half."""
     return list(map(np.ascontiguousarray, map(Tensor.numpy, tensors)))
 
 

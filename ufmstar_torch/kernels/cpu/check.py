@@ -46,8 +46,7 @@ def check_values(
     limits = DEPTH_RANGE[0], min(max_depth, DEPTH_RANGE[1]), max_depth
     cameras = _matrices(array(pose), array(intrinsics))
     checked = _check(*cameras, float(size[0]), float(size[1]), rotation_tolerance, z, wanted, allowed, limits)
-    T, K, deviation, fault, valid, safe, counts = map(torch.from_numpy, checked)
-    counts = counts.unbind()
+    T, K, deviation, fault, valid, safe, *counts = map(torch.from_numpy, (*checked[:-1], *checked[-1]))
     return FrameInput(safe, T, K, aleatoric, epistemic, features, valid, fault, deviation, *counts, fault)
 
 

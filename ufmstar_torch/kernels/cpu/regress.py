@@ -80,9 +80,8 @@ def regress_maps(
     shown, features = (out, out_f) if pixels is None else (out[:, None], out_f[:, :, None])
     z, previous = depth, depth if smoothed is None else smoothed
     if pixels is not None:
-        at = np.arange(len(out))[:, None], pixels // depth.shape[2], pixels % depth.shape[2]
-        z = depth[at][:, None]
-        previous = z if smoothed is None else smoothed[at][:, None]
+        z = at_pixels(depth, pixels)[:, None]
+        previous = z if smoothed is None else at_pixels(smoothed, pixels)[:, None]
     memory = np.empty(previous.shape, previous.dtype)
     relative = config.unmeasured_relative**2 if config.unmeasured == "relative" else 0
     settings = depth.dtype.type(relative), config.unmeasured == "nan", 1.0 if smoothed is None else config.ema_alpha
@@ -91,8 +90,17 @@ def regress_maps(
         return out, out_f, None, counts
     if pixels is not None:
         mixed, memory = memory[:, 0], smoothed.copy()
-        memory[at] = mixed
+        memory.reshape(-1)[_flat(memory, pixels)] = mixed
     return out, out_f, memory, counts
+
+
+def at_pixels(values: Reals, pixels: NDArray[np.int64]) -> Reals:
+    """The values of a map [B, H, W] at pixels [B, n], indices into the flattened image."""
+    return values.reshape(-1).take(_flat(values, pixels))
+
+
+def _flat(values: Reals, pixels: NDArray[np.int64]) -> NDArray[np.int64]:
+    return pixels if len(values) == 1 else pixels + values[0].size * np.arange(len(values))[:, None]
 
 
 def regression(

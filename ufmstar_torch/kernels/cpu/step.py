@@ -27,7 +27,7 @@ from ufmstar_torch.gaussians.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.gaussians.state import UfMStarState
 from ufmstar_torch.kernels.cpu.calls import array, arrays, each
-from ufmstar_torch.kernels.cpu.regress import regress_maps, views_of
+from ufmstar_torch.kernels.cpu.regress import at_pixels, regress_maps, views_of
 from ufmstar_torch.kernels.cpu.regress_cull import Seen, View
 from ufmstar_torch.kernels.cpu.rigid import FIELDS, padded
 from ufmstar_torch.kernels.cpu.segment import gaussians
@@ -81,13 +81,13 @@ def step(
     stage("append")
 
     smoothed = array(memory_for(state.smoothed, frame.size)) if smooth and config.ema_alpha < 1 else None
+    at = None if pixels is None else array(pixels)
     shown, regressed, memory, counts[UNMEASURED] = regress_maps(
-        seen, depth, K, config, None if pixels is None else array(pixels), views=views, shift=shift,
-        informative=informative, smoothed=smoothed,
-    )  # fmt: skip
+        seen, depth, K, config, at, views=views, shift=shift, informative=informative, smoothed=smoothed
+    )
     stage("regress")
 
-    parts = regressed.swapaxes(1, -1) if pixels is not None else regressed.transpose(0, 2, 3, 1)
+    parts = regressed.swapaxes(1, -1) if at is not None else regressed.transpose(0, 2, 3, 1)
     last = parts.shape[-1] - 1
     of_maps = shown, parts[..., last], parts[..., : last - columns]
     maps = dict(zip(("disagreement", "measured", "features"), map(torch.from_numpy, of_maps), strict=True))
@@ -99,9 +99,13 @@ def step(
         residual = torch.from_numpy(parts[..., last - columns : last])
         residual = residual if shift is not None else learnt.residual(residual)
         changed |= learnt.tensors()
-    counted = dict(zip(COUNTS, torch.from_numpy(counts).unbind(), strict=True))
+    counted = dict(zip(COUNTS, map(torch.from_numpy, counts), strict=True))
     current_cam = GaussianMixture.of(dict(zip(_MIXTURE, map(torch.from_numpy, segments), strict=True)))
-    out = step_output(frame, maps, residual, pixels, current_cam, counted, learnt)
+    maps |= {"depth": frame.depth, "valid": frame.valid}
+    if at is not None:
+        z = at_pixels(depth, at)
+        maps |= {"depth": torch.from_numpy(z), "valid": torch.from_numpy(z > 0)}
+    out = step_output(frame, maps, residual, current_cam, counted, learnt)
     stage("average")
     return state.with_tensors(changed), out
 
