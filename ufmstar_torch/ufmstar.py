@@ -290,7 +290,7 @@ class UfMStar(StatefulModule):
         if network is not None:
             maps = self._shaped(maps, network, frame.confidence)
         depth, V, valid = maps.pop("depth"), maps.pop("variance"), maps.pop("valid")
-        out = UncertaintyOutput(depth, V, valid, maps, out.statistics, out.quantiles, out.current_cam)
+        out = UncertaintyOutput(depth, V, valid, maps, out.statistics, out.quantiles)
         self._store(state.tensors())  # last, so that an earlier error changes nothing
         self._warnings.after_frame(frame, out.statistics, state.frames, self.config)
         return out

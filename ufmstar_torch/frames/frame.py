@@ -156,7 +156,7 @@ CheckKernel = Callable[..., FrameInput]  # as ``check_values``
 
 
 def check_frame(
-    depth: Array,
+    depth: Tensor,
     pose: CameraLike,
     intrinsics: CameraLike,
     aleatoric: Array | None,
@@ -188,8 +188,7 @@ def check_frame(
         ValueError: an argument has the wrong shape or lies on another device than ``depth``, or ``variances_in_h``
             without ``aleatoric``.
     """
-    depth = require_float("depth", as_tensor("depth", depth))
-    shape = tuple(depth.shape)
+    shape = tuple(require_float("depth", depth).shape)
     if not (len(shape) == 3 or (len(shape) == 4 and shape[1] == 1)) or 0 in shape:
         one = "; a single map is depth[None]" if len(shape) == 2 else ""
         raise ValueError(f"depth must be [B, H, W] or [B, 1, H, W] with no empty dimension, got {shape}{one}")

@@ -3,7 +3,6 @@ and uncertainty"): B independent streams of K slots, padded and masked."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,13 +40,6 @@ class GaussianMixture:
     views: Tensor
     reference: Tensor
     features: Tensor
-
-    @classmethod
-    def of(cls, tensors: Mapping[str, Tensor]) -> GaussianMixture:
-        """The mixture of fields by name whose shapes are known to be right, without a check."""
-        mixture = cls.__new__(cls)
-        vars(mixture).update(tensors)
-        return mixture
 
     @classmethod
     @check_kinds

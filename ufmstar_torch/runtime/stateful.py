@@ -119,7 +119,8 @@ class StatefulModule(nn.Module):
 
     def _store(self, state: Mapping[str, Tensor]) -> None:
         """Replace all buffers."""
-        self._buffers.update({name: state[name] for name in self.STATE})
+        for name in self.STATE:
+            self._buffers[name] = state[name]
 
     def _chosen(self, streams: Sequence[int] | Tensor, count: int) -> Tensor:
         """Convert stream indices or a mask to a bool mask [count] on the state's device. Raises IndexError: an index is

@@ -161,7 +161,7 @@ def step(
         "frames": state.frames + fine, "skipped": state.skipped + ~fine, "smoothed": smoothed,
     })  # fmt: skip
     maps |= {"depth": regress.at_pixels(frame.depth, pixels), "valid": regress.at_pixels(frame.valid, pixels)}
-    out = step_output(frame, maps, residual, current_cam, counts, learnt)
+    out = step_output(frame, maps, residual, counts, learnt)
     stage("average")
     return updated, out
 
@@ -170,7 +170,6 @@ def step_output(
     frame: FrameInput,
     maps: dict[str, Tensor],
     residual: Tensor | None,
-    current_cam: GaussianMixture,
     counts: Mapping[str, Tensor],
     learnt: anchors.Learnt | None = None,
 ) -> UncertaintyOutput:
@@ -180,7 +179,6 @@ def step_output(
         frame: of B streams.
         maps: "depth", "valid", "disagreement", "measured" and "features" of every pixel, or [B, n] at some; changed.
         residual: [..., 2] the relative error r and its excess e that anchors let expect; None without anchors.
-        current_cam: C_i.
         counts: of the step, by name.
         learnt: from the anchors; None without.
     """
@@ -195,7 +193,7 @@ def step_output(
     }  # fmt: skip
     of_anchors = {} if learnt is None else anchors.counts(frame.anchors, learnt.used)
     statistics = FrameStatistics({**counts, **checked, **of_anchors})
-    return UncertaintyOutput(depth, variance, valid, maps, statistics, current_cam=current_cam)
+    return UncertaintyOutput(depth, variance, valid, maps, statistics)
 
 
 def unobserved(name: str) -> None:

@@ -55,6 +55,8 @@ def network_maps(
     With ``config.variances_in_h`` the last three features are the mixture's A, E and weight share s; each of A and E is
     then its mean over the mixture plus (1 - s) times the pixel's own.
     """
+    if frame.aleatoric is None and frame.epistemic is None:
+        return {}
     pairs = zip(("aleatoric", "epistemic"), network_variances(frame, config), strict=True)
     maps = {name: at_pixels(value, pixels) for name, value in pairs if value is not None}
     if config.variances_in_h:

@@ -40,6 +40,7 @@ from ufmstar_torch.steps.step import StepObserver, step_output, unobserved
 _MIXTURE = tuple(field.name for field in fields(GaussianMixture))
 _STREAM = ("T_world_first", "started", "frames", "skipped")
 _EPSILON = {dtype: torch.finfo(dtype).eps for dtype in (torch.float32, torch.float64)}
+_SQUARED_W2 = np.empty(0)  # in place of distances: the step computes W2^2
 _of_mixture, _of_stream = attrgetter(*_MIXTURE), attrgetter(*_STREAM)
 _Arrays = Sequence[NDArray[Any]]
 _Match = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_], int]  # the result of ``match``
@@ -100,12 +101,11 @@ def step(
         residual = residual if shift is not None else learnt.residual(residual)
         changed |= learnt.tensors()
     counted = dict(zip(COUNTS, map(torch.from_numpy, counts), strict=True))
-    current_cam = GaussianMixture.of(dict(zip(_MIXTURE, map(torch.from_numpy, segments), strict=True)))
     maps |= {"depth": frame.depth, "valid": frame.valid}
     if at is not None:
         z = at_pixels(depth, at)
         maps |= {"depth": torch.from_numpy(z), "valid": torch.from_numpy(z > 0)}
-    out = step_output(frame, maps, residual, current_cam, counted, learnt)
+    out = step_output(frame, maps, residual, counted, learnt)
     stage("average")
     return state.with_tensors(changed), out
 
@@ -136,7 +136,9 @@ def _join(
     members = np.zeros(b) if frame.member is None else array(frame.member)
     rest = settings, slots[-1].shape[2] + columns + 1, counts
     fixed, current = (camera, first, members, updated), (*segments[:3], segments[-1])
-    distances = _distances(state, frame, first, segments, matched, config)
+    distances: Sequence[NDArray[np.float64]] = [_SQUARED_W2] * b
+    if config.disagreement == "overlap":
+        distances = _distances(state, frame, first, segments, matched)
     joined = each(join, [(i, *fixed, current, matched[i], distances[i], *rest) for i in range(b)])
     seen = [Seen(*one) for one in joined]
     mixture, sums = dict(zip(_MIXTURE, map(torch.from_numpy, updated), strict=True)), state.by_component
@@ -194,12 +196,9 @@ def _learn(
 
 
 def _distances(
-    state: UfMStarState, frame: FrameInput, first: NDArray[np.float64], segments: _Arrays, matched: Sequence[_Match],
-    config: UfMStarConfig,
-) -> list[NDArray[np.float64]]:  # fmt: skip
-    """The overlap disagreement [P] of the pairs of each stream, or [0] where the step uses W2^2."""
-    if config.disagreement != "overlap":
-        return [np.empty(0)] * len(matched)
+    state: UfMStarState, frame: FrameInput, first: NDArray[np.float64], segments: _Arrays, matched: Sequence[_Match]
+) -> list[NDArray[np.float64]]:
+    """The overlap disagreement [P] of the pairs of each stream."""
     motion = relative_pose(torch.from_numpy(first), frame.T_world_cam)
     mixture = state.mixture.to(torch.float64).rigid(*motion)
     mean, covariance = map(torch.from_numpy, segments[:2])

@@ -148,7 +148,7 @@ def device_step(
     })  # fmt: skip
     maps = {"disagreement": result.disagreement, "measured": result.measured, "features": result.features}
     maps |= {"depth": frame.depth, "valid": frame.valid}
-    out = step_output(frame, maps, None, current, of_step)
+    out = step_output(frame, maps, None, of_step)
     return updated, out
 
 
