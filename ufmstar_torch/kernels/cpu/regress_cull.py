@@ -30,9 +30,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, reordered_leaf
-from ufmstar_torch.kernels.cpu.regress_vectors import TERMS, bounds
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
+from ufmstar_torch.kernels.cpu.regress_vectors import TERMS, bounds, largest
 from ufmstar_torch.kernels.cpu.rigid import COVARIANCE, WEIGHT, padded
+from ufmstar_torch.kernels.cpu.vectors import LANES
 
 HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
 FIELDS = 10  # of a component: mean (3), whitening (6), log2 of the peak
@@ -124,27 +125,20 @@ def in_view(components, m, features, depth, K, settings):
             whitened[i, k] *= _SCALE
         whitened[PEAK, k] = (math.log(whitened[PEAK, k]) - HALF_LOG_TWO_PI_CUBED) * _LOG2_E
     _pack(components, whitened, m, every, n, packed)
-    z = 0.0
-    for v in range(height):
-        z = max(z, np.float64(_largest(depth[v])))
+    work, whole = empty(_BOX + packed.shape[1], depth.dtype), depth.size // LANES * LANES
+    work[0] = 0
+    largest(depth, whole, work)
+    z = np.float64(work[0])
+    for i in range(whole, depth.size):
+        z = max(z, np.float64(depth[i // width, i % width]))
     left, top = (0 - K[0, 2]) / K[0, 0] * z, (0 - K[1, 2]) / K[1, 1] * z
     right, bottom = (width - 1 - K[0, 2]) / K[0, 0] * z, (height - 1 - K[1, 2]) / K[1, 1] * z
     box = min(left, 0.0), min(top, 0.0), 0.0, max(right, 0.0), max(bottom, 0.0), z
-    work = empty(_BOX + packed.shape[1], depth.dtype)
     # Blocks divide their threshold by n. A larger divisor makes this one lower in spite of rounding of the boxes.
     chosen = cull(packed, n, limit(settings.epsilon, n + n // 64 + 1), box, settings, work, index)
     _terms(components, whitened, index, chosen, m, features, fields, constants)
     _pack(components, whitened, m, index, chosen, packed)
     return index, fields, packed, constants, chosen
-
-
-@reordered_leaf
-def _largest(values):
-    """The largest of the values, at least 0."""
-    most = values.dtype.type(0)
-    for i in range(values.size):
-        most = max(most, values[i])
-    return most
 
 
 @leaf
