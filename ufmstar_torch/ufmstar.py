@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import NoneType
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -168,7 +168,7 @@ class UfMStar(StatefulModule):
             depth, pose, intrinsics, aleatoric, epistemic, valid, features, member=member, informative=informative,
             anchors=anchors, confidence=confidence,
         )  # fmt: skip
-        kernels = self._kernels(depth.device.type)[1].sample
+        kernels = self._kernels(depth)[1].sample
         index, used = kernels.pixels(frame.valid, *sample_size(frame.size, pixels, fraction, seed))
         out = self._observe(frame, index, average=require_flag("average", average))
         return mean_uncertainty(out, used, kernels.summary)
@@ -225,7 +225,7 @@ class UfMStar(StatefulModule):
         """
         if require_flag("keep_evidence", keep_evidence) and not self._empty.by_stream:
             raise ValueError("keep_evidence needs UfMStarConfig(anchors=AnchorConfig()), got one without anchors")
-        with undisturbed(self.mean.device):
+        with undisturbed(self.mean):
             old, b = self.state, self.mean.shape[0]
             if streams is None:
                 self._warnings.reset()
@@ -255,14 +255,14 @@ class UfMStar(StatefulModule):
         frame = check_frame(
             depth, T, K, *maps, **view, feature_count=self.config.features, variances_in_h=self.config.variances_in_h,
             rotation_tolerance=self.config.rotation_tolerance, max_depth=self.config.segment.depth_limit,
-            kernel=self._kernels(depth.device.type)[1].check,
+            kernel=self._kernels(depth)[1].check,
         )  # fmt: skip
         if confidence is not None:
             frame = replace(frame, confidence=as_confidence(confidence, frame))
         if anchors is None:
             return frame
         variances = [v for v in variance.network_variances(frame, self.config) if v is not None]
-        checked = check_anchors(anchors, frame, variances, self._kernels(depth.device.type)[1].check_anchors)
+        checked = check_anchors(anchors, frame, variances, self._kernels(depth)[1].check_anchors)
         self._doubts.judge(anchors, checked, frame.size)
         return replace(frame, anchors=checked)
 
@@ -272,13 +272,13 @@ class UfMStar(StatefulModule):
     ) -> UncertaintyOutput:  # fmt: skip
         """Run the step and the corrections by anchors, and store the new state. The maps are [B, n] at ``pixels``,
         indices into the flattened image; without these, ``network`` has the caller's maps, whose shape they get."""
-        with undisturbed(frame.depth.device):
+        with undisturbed(frame.depth):
             state = self._stored().for_frame(frame, self.config)
             if self.config.on_bad_frame == "raise":
                 raise_faults(frame)
             if self.observer is not None:
                 self.observer.stage("check")
-            step, kernels = self._kernels(frame.depth.device.type)
+            step, kernels = self._kernels(frame.depth)
             state, out = step(state, frame, self.config, pixels=pixels, smooth=average, observer=self.observer)
             merging = kernels.merge
             state, out, factor = variance.corrected(state, frame, out, self.config, self.recalibration, pixels, merging)
@@ -313,11 +313,11 @@ class UfMStar(StatefulModule):
         return maps
 
     def _stored(self) -> UfMStarState:
-        return self._empty.with_tensors(cast("dict[str, Tensor]", self._buffers))  # avoids ``__getattr__``
+        return self._empty.with_tensors(self._buffers)  # type: ignore[arg-type]  # avoids ``__getattr__``
 
-    def _kernels(self, device_type: str) -> tuple[Step, FrameKernels]:
-        """The step and the check for a device. The step is cached, since a GPU's counts components."""
-        key = (self.config.backend, device_type)
+    def _kernels(self, like: Tensor) -> tuple[Step, FrameKernels]:
+        """The step and the check for a tensor's device. The step is cached, since a GPU's counts components."""
+        key = (self.config.backend, "cpu" if like.is_cpu else like.device.type)
         if self._cached_step is None or self._cached_step[0] != key:
             self._cached_step = key, select_step(*key), select_frame(*key)
         return self._cached_step[1:]

@@ -92,7 +92,7 @@ class UfM:
         if self.clouds and len(frame.depth) != len(self.clouds):
             raise ValueError(f"depth must be of {len(self.clouds)} streams as before, got {tuple(depth.shape)}")
         raise_faults(frame)
-        with undisturbed(frame.depth.device):
+        with undisturbed(frame.depth):
             first = self.T_world_first if self.clouds else frame.T_world_cam
             clouds = self.clouds or [Cloud.empty(self._dtype, frame.depth.device)] * len(frame.depth)
             stated = [value.detach() for value in (frame.aleatoric, frame.epistemic) if value is not None]

@@ -91,13 +91,13 @@ class UfMStarState:
         Raises:
             ValueError: the frame has another number of streams, or lies on another device.
         """
-        streams, device, before = frame.depth.shape[0], frame.depth.device, self.mean.shape[0]
+        depth, streams, before = frame.depth, frame.depth.shape[0], self.mean.shape[0]
         if before == 0:
-            return UfMStarState.initial(streams, config, self.mean.dtype, device)
+            return UfMStarState.initial(streams, config, self.mean.dtype, depth.device)
         if before != streams:
             raise ValueError(f"depth has {streams} streams but the state holds {before}: call reset() first")
-        if self.mean.device != device:
-            raise ValueError(f"depth lies on {device} but the state on {self.mean.device}: move one with .to()")
+        if not (self.mean.is_cpu and depth.is_cpu) and self.mean.device != depth.device:
+            raise ValueError(f"depth lies on {depth.device} but the state on {self.mean.device}: move one with .to()")
         return self
 
     @property

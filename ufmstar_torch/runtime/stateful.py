@@ -246,10 +246,10 @@ def plain(config: Checked) -> dict[str, Any]:
     return _config_of(_bytes_of(config))
 
 
-def undisturbed(device: torch.device) -> AbstractContextManager[object]:
+def undisturbed(like: Tensor) -> AbstractContextManager[object]:
     """Disable gradients, the caller's inference mode, since tensors of the state must outlive it, and autocast, which
-    would compute products in half precision."""
-    kind, inferring = device.type, torch.is_inference_mode_enabled()
+    would compute products in half precision, for work on a tensor's device."""
+    kind, inferring = "cpu" if like.is_cpu else like.device.type, torch.is_inference_mode_enabled()
     may_cast = kind == "cpu" or (kind != "meta" and torch.amp.is_autocast_available(kind))
     casting = may_cast and torch.is_autocast_enabled(kind)
     if not (inferring or casting):

@@ -288,7 +288,7 @@ def query(state: UfMStarState, points: Tensor, frame: str, config: UfMStarConfig
         raise ValueError("query needs a mixture: call the module on a frame first")
     if points.dim() != 3 or points.shape[0] != streams or points.shape[2] != 3:
         raise ValueError(f"points must be [{streams}, N, 3], got {tuple(points.shape)}")
-    with undisturbed(points.device):
+    with undisturbed(points):
         local = points.detach()
         if frame == "world":
             T = invert_rigid(state.T_world_first)

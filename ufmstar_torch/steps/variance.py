@@ -103,7 +103,8 @@ def corrected(
         at the pixels (``anchors.confidence``), None = 1.
     """
     M, factor, quantiles = out.maps["disagreement"], None, None
-    maps, counts = dict[str, Tensor](), dict[str, Tensor]()
+    maps: dict[str, Tensor] = {}
+    counts: dict[str, Tensor] = {}
     if config.confidence is not None and frame.confidence is not None:
         V = None
         if pixels is None:

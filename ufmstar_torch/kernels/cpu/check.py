@@ -47,7 +47,10 @@ def check_values(
     cameras = _matrices(array(pose), array(intrinsics))
     checked = _check(*cameras, float(size[0]), float(size[1]), rotation_tolerance, z, wanted, allowed, limits)
     T, K, deviation, fault, valid, safe, *counts = map(torch.from_numpy, (*checked[:-1], *checked[-1]))
-    return FrameInput(safe, T, K, aleatoric, epistemic, features, valid, fault, deviation, *counts, fault)
+    beyond, out_of_range, usable = counts
+    return FrameInput(
+        safe, T, K, aleatoric, epistemic, features, valid, fault, deviation, beyond, out_of_range, usable, fault
+    )
 
 
 def camera_faults(pose: Matrices, K: Matrices, size: tuple[float, ...], tolerance: float) -> list[int]:

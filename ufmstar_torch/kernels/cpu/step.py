@@ -81,7 +81,7 @@ def step(
         views = views_of(seen, depth, K, config)
     stage("append")
 
-    smoothed = array(memory_for(state.smoothed, frame.size)) if smooth and config.ema_alpha < 1 else None
+    smoothed = arrays(memory_for(state.smoothed, frame.size))[0] if smooth and config.ema_alpha < 1 else None
     at = None if pixels is None else array(pixels)
     shown, regressed, memory, counts[UNMEASURED] = regress_maps(
         seen, depth, K, config, at, views=views, shift=shift, informative=informative, smoothed=smoothed
@@ -141,7 +141,7 @@ def _join(
         distances = _distances(state, frame, first, segments, matched)
     joined = each(join, [(i, *fixed, current, matched[i], distances[i], *rest) for i in range(b)])
     seen = [Seen(*one) for one in joined]
-    mixture, sums = dict(zip(_MIXTURE, map(torch.from_numpy, updated), strict=True)), state.by_component
+    mixture, sums = dict(zip(_MIXTURE, map(torch.from_numpy, updated), strict=True)), dict(state.by_component)
     limit = config.max_components
     if limit is None or capacity <= limit:
         return mixture | sums, seen
