@@ -79,8 +79,8 @@ def prepare(source: str, network: DepthNetwork | bool, frames: int | None = None
         depth, K = made(frame, network) if isinstance(network, bool) else predicted(frame, network)
         truth = truth_at(frame, K[0].numpy(), (depth.shape[1], depth.shape[2]))
         assert truth is not None
-        pose, options = torch.from_numpy(frame.T_world_cam)[None], {"feature_count": 0, "rotation_tolerance": 0.01}
-        checked = check_frame(depth, pose, K, None, None, None, None, **options)
+        pose, options = torch.from_numpy(frame.T_world_cam)[None], {"rotation_tolerance": 0.01}
+        checked = check_frame(depth, pose, K, None, None, None, **options)
         marks = {
             kind: s.update(frame.image, frame.T_world_cam, frame.intrinsics).anchors(frame.intrinsics, K)
             for kind, s in sources.items()

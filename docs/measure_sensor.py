@@ -118,7 +118,7 @@ def measure(path: str, weights: str, sensor: str | None, images: bool, frames: i
     )  # fmt: skip
     (row, _), judged = job.row(), RemovedHalf(whole)
     assert row.anchors is not None
-    without_images = patch.object(row.anchors.tracks, "of", return_value=None)
+    without_images = patch.object(row.anchors, "tracked", return_value=None)
     with nullcontext() if images else without_images:
         for result in frame_results(job.sequence, job.indices, [row]):
             judged.add(result)

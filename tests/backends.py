@@ -144,11 +144,10 @@ def _fused(previous, current, pairs, view, config, *, rounds=None):
     epsilon = torch.finfo(previous.covariance.dtype).eps
     for b in range(previous.streams):
         c, k = pairs.match[b].nonzero(as_tuple=True)
-        distance = torch.empty(0).double() if pairs.distance is None else pairs.distance[b, c, k]
         new = (v[b].numpy() for v in (current.mean, current.covariance, current.weight, current.features))
         compiled(fuse_cpu.fuse_pairs)(
             *(value[b].numpy() for value in out.tensors().values()), *new,
-            c.numpy(), k.numpy(), pairs.overlap[b, c, k].numpy(), distance.numpy(), view[b].numpy(),
+            c.numpy(), k.numpy(), pairs.overlap[b, c, k].numpy(), view[b].numpy(),
             (config.overlap_weighted, epsilon, config.view_baseline or 0.0, config.near_plane),
             np.empty(out.capacity), np.empty(fuse_cpu.WORK),
         )  # fmt: skip

@@ -34,34 +34,6 @@ def geodesic(mean_k, cov_k, mean_c, cov_c, lam):
     return (1 - lam) * mean_k + lam * mean_c, T @ cov_k @ T.T
 
 
-def overlap_squared(mean_a, cov_a, mean_b, cov_b):
-    """d^2 of ``disagreement="overlap"``: squared depth difference, averaged over the overlap of both in the image."""
-
-    def profile(mean, cov):
-        x, y, z = mean
-        J = np.array([[1 / z, 0, -x / z**2], [0, 1 / z, -y / z**2], [0, 0, 1]])
-        S = J @ cov @ J.T
-        b = np.linalg.solve(S[:2, :2], S[:2, 2])
-        return np.array([x / z, y / z]), z, S[:2, :2], b, np.sqrt(max(S[2, 2] - S[2, :2] @ b, 0.0))
-
-    def at(u, u_0, z_0, b):
-        """Depth and slope of the plane through (u_0, z_0) with slope b, where the ray u meets it."""
-        inverse_depth = min(max((1 - b @ (u - u_0) / z_0) / z_0, 0.5 / z_0), 2 / z_0)
-        return 1 / inverse_depth, b / z_0**2 / inverse_depth**2
-
-    (u_a, z_a, S_a, b_a, tau_a), (u_b, z_b, S_b, b_b, tau_b) = profile(mean_a, cov_a), profile(mean_b, cov_b)
-    shared = np.linalg.inv(np.linalg.inv(S_a) + np.linalg.inv(S_b))
-    centre = shared @ (np.linalg.inv(S_a) @ u_a + np.linalg.inv(S_b) @ u_b)
-    (depth_a, slope_a), (depth_b, slope_b) = at(centre, u_a, z_a, b_a), at(centre, u_b, z_b, b_b)
-    values, axes = np.linalg.eigh(shared)
-    total = 0.0
-    for i, wi in ((-1, 1 / 6), (0, 2 / 3), (1, 1 / 6)):  # Gauss-Hermite: exact for the square of a linear function
-        for j, wj in ((-1, 1 / 6), (0, 2 / 3), (1, 1 / 6)):
-            step = axes @ (np.sqrt(3 * np.maximum(values, 0)) * np.array([i, j]))
-            total += wi * wj * (depth_a + slope_a @ step - depth_b - slope_b @ step) ** 2
-    return total + (tau_a - tau_b) ** 2
-
-
 def bhattacharyya(mean_a, cov_a, mean_b, cov_b):
     S = (cov_a + cov_b) / 2
     d = mean_a - mean_b
@@ -178,7 +150,7 @@ def view_weight(component, view, baseline, near):
 
 
 def fuse(mixture, current, matches, overlaps, view, *, baseline=0.07, near=0.05, overlap_weighted=False,
-         remembered=None, distances=None):  # fmt: skip
+         remembered=None):  # fmt: skip
     """M_i from M_(i-1) and C_i, both in the first camera's frame; returns a new list. view: centre of the camera there,
     and index of the network."""
     fused = [dict(k) for k in mixture]
@@ -197,8 +169,6 @@ def fuse(mixture, current, matches, overlaps, view, *, baseline=0.07, near=0.05,
             pi_c = new["weight"] * (overlaps[c, k] if overlap_weighted else 1.0)
             lam = pi_c / (g["weight"] + pi_c)
             distance = w2_squared(g["mean"], g["cov"], new["mean"], new["cov"])
-            if distances is not None:
-                distance = distances[c, k]
             g["mean"], g["cov"] = geodesic(g["mean"], g["cov"], new["mean"], new["cov"], lam)
             g["m"] = (g["compared"] * g["m"] + counts[k] * pi_c * distance) / (g["compared"] + counts[k] * pi_c)
             g["compared"] += counts[k] * pi_c
@@ -258,12 +228,11 @@ class Oracle:
     of a covariance: near = pixel_variance = 0."""
 
     def __init__(self, spgf, *, eta=0.5, eta_occl=0.7, near=0.05, prior_weight=1.0, prior_mean=0.0,
-                 alpha=0.5, overlap_weighted=False, neighbourhood=None, disagreement="w2",
+                 alpha=0.5, overlap_weighted=False, neighbourhood=None,
                  unmeasured="paper", unmeasured_relative=0.1, baseline=0.07,
                  pixel_variance=PIXEL_VARIANCE):  # fmt: skip
         self.baseline, self.pixel_variance = baseline, pixel_variance
         self.unmeasured, self.unmeasured_relative = unmeasured, unmeasured_relative
-        self.disagreement = disagreement
         self.spgf, self.eta, self.eta_occl, self.near = spgf, eta, eta_occl, near
         self.prior_mean = prior_mean
         self.prior = {"prior_weight": prior_weight, "neighbourhood": neighbourhood}
@@ -292,14 +261,6 @@ class Oracle:
         limits = self.eta, self.eta_occl, self.near, self.pixel_variance
         self.matches, overlaps = correspond(previous_cam, current, K, depth.shape, *limits)
         current_first = [transform(g, *to_first) for g in current]
-        distances = None
-        if self.disagreement == "overlap":
-            pairs = [(c, k) for c, ks in enumerate(self.matches) for k in ks]
-            earlier, now = previous_cam, current
-            distances = {
-                (c, k): overlap_squared(earlier[k]["mean"], earlier[k]["cov"], now[c]["mean"], now[c]["cov"])
-                for c, k in pairs
-            }
         self.mixture = fuse(
             self.mixture,
             current_first,
@@ -310,7 +271,6 @@ class Oracle:
             near=self.near,
             overlap_weighted=self.overlap_weighted,
             remembered=[g["mean"][2] > self.near for g in current],
-            distances=distances,
         )
         mixture_cam = self.mixture_cam = [transform(g, *to_cam) for g in self.mixture]
         self.seen = mixture_cam, depth, valid, K

@@ -140,7 +140,7 @@ def test_what_is_checked_of_strange_anchors():
     maps = 1 + 4 * torch.rand(3, 2, *size, generator=generator)
     maps[0, 0, 10:20, 10:20] = 0
     cameras = torch.eye(4).expand(2, 4, 4), torch.tensor([[60.0, 0, 30], [0, 60, 20], [0, 0, 1]])
-    frame = check_frame(maps[0], *cameras, None, None, None, None, feature_count=0, rotation_tolerance=1e-3)
+    frame = check_frame(maps[0], *cameras, None, None, None, rotation_tolerance=1e-3)
     for variance_maps, mask in (((), None), ((maps[1],), chance < 0.7), ((maps[1], maps[2]), None)):
         found, far = check_anchors(Anchors(pixel, depth, variance, mask), frame, variance_maps), [0, 0]
         for b, i in np.ndindex(2, n):
@@ -195,9 +195,7 @@ def test_the_compiled_lesson_is_the_references_own(n, dtype, tolerance):
         walked(torch.tensor(depth).expand(2, -1, -1), torch.tensor(T), torch.tensor(K))
     mixture = walked.mixture.to(torch.float64)
     seen = torch.tensor(depth, dtype=dtype).expand(2, -1, -1)
-    frame = check_frame(
-        seen, torch.eye(4), torch.tensor(K), None, None, None, None, feature_count=0, rotation_tolerance=1e-3
-    )
+    frame = check_frame(seen, torch.eye(4), torch.tensor(K), None, None, None, rotation_tolerance=1e-3)
     start = Evidence(torch.zeros(2, mixture.capacity, 3, dtype=dtype), torch.zeros(2, 3, dtype=dtype))
     a = b = Learnt(start, *[torch.empty(0)] * 3)
     for _ in range(3):

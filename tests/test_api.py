@@ -9,7 +9,6 @@ import pytest
 import ufmstar_torch
 from ufmstar_torch import (
     AnchorConfig,
-    ConfidenceConfig,
     MergeConfig,
     PosteriorConfig,
     UfMStar,
@@ -24,7 +23,6 @@ PUBLIC = {
     "LiveDepth",
     "LiveResult",
     "AnchorConfig",
-    "ConfidenceConfig",
     "MergeConfig",
     "PosteriorConfig",
     "Recalibration",
@@ -51,7 +49,7 @@ def test_public_names():
 
 
 def test_signatures():
-    observation = ["depth", "pose", "intrinsics", "aleatoric", "epistemic", "valid", "features"]
+    observation = ["depth", "pose", "intrinsics", "aleatoric", "epistemic", "valid"]
     assert names(UfMStar.__init__) == ["config", "recalibration", "dtype", "device"]
     view, sampled = ["member", "informative"], ["pixels", "fraction", "seed", "average"]
     assert names(UfMStar.forward) == [*observation, *view, "anchors", "confidence"]
@@ -71,15 +69,15 @@ def test_signatures():
         "multiview_device",
     ]
     assert names(UncertainDepth.__init__) == made_of
-    images = ["image", "pose", "intrinsics", "valid", "features", "anchors"]
+    images = ["image", "pose", "intrinsics", "valid", "anchors"]
     assert names(UncertainDepth.forward) == images
     assert names(UncertainDepth.mean_uncertainty) == [*images, "pixels", "fraction", "seed", "average"]
 
 
 def test_few_settings():
-    """The core has at most 50 settings, those of all sections together."""
-    sections = {"anchors": AnchorConfig(), "confidence": ConfidenceConfig(), "posterior": PosteriorConfig()}
-    assert len(flat(UfMStarConfig(**sections, merge=MergeConfig()).to_dict())) <= 50
+    """The core has at most 45 settings, those of all sections together."""
+    sections = {"anchors": AnchorConfig(), "posterior": PosteriorConfig()}
+    assert len(flat(UfMStarConfig(**sections, merge=MergeConfig()).to_dict())) <= 45
 
 
 def test_the_papers_defaults():

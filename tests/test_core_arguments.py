@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -13,10 +12,13 @@ from modules import CONFIG, H, K, W, frame, same
 from PIL import Image
 from torch import nn
 
-from ufmstar_torch import AnchorConfig, ConfidenceConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch import AnchorConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch import uncertain_depth as pipeline
+from ufmstar_torch.anchors import Anchors, LandmarkMap
+from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.frames.prediction import combine
 from ufmstar_torch.gaussians.camera import crop_intrinsics, resize_intrinsics
+from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.models import Preprocess, load_network, save_checkpoint, wrap_network
 from ufmstar_torch.posterior.recalibrate import Recalibration
 
@@ -82,10 +84,6 @@ REFUSED = {
     "epistemic in whole numbers": (lambda: ufm(DEPTH, POSE, K, None, DEPTH.int()), TypeError, "epistemic must have"),
     "valid as a weight": (lambda: ufm(DEPTH, POSE, K, valid=DEPTH), TypeError, "valid must be a torch.bool"),
     "valid of another size": (lambda: ufm(DEPTH, POSE, K, valid=DEPTH[:, 1:] > 0), ValueError, "valid must have"),
-    "features that are off": (lambda: ufm(DEPTH, POSE, K, features=DEPTH[:, None]), ValueError, "features must have"),
-    "features that are missing": (
-        lambda: UfMStar(CONFIG.replace(features=1))(DEPTH, POSE, K), ValueError, "features must be given"
-    ),
     "anchors that are off": (lambda: ufm(DEPTH, POSE, K, anchors=1), ValueError, "anchors must be None where"),
     "an unknown argument": (lambda: ufm(DEPTH, POSE, K, ancors=1), TypeError, "unexpected keyword argument 'ancors'"),
     "a config that is a dict": (lambda: UfMStar({}), TypeError, "config must be a UfMStarConfig"),
@@ -102,14 +100,6 @@ REFUSED = {
     "points in the plane": (lambda: seen().query(torch.zeros(1, 5, 2)), ValueError, r"points must be \[1, N, 3\]"),
     "points of another frame": (lambda: seen().query(torch.zeros(1, 5, 3), "camera"), ValueError, "frame must be"),
     "points of no mixture": (lambda: UfMStar().query(torch.zeros(1, 5, 3)), ValueError, "query needs a mixture"),
-    **{
-        f"a mixture of other {name}": (
-            lambda n=name, v=value: replace(seen().mixture, **{n: v}), ValueError, f"{name} must have shape"
-        )
-        for name, value in (
-            ("weight", torch.ones(4)), ("mean", torch.ones(1, 4, 2)), ("features", torch.ones(1, 4))
-        )
-    },
     "an image of one channel": (lambda: model(IMAGE[:, :1]), ValueError, r"image must be \[B, 3, H, W\]"),
     "a tensor with channels last": (lambda: model(torch.tensor(PICTURE)[None]), ValueError, "image .*permute"),
     "an array with channels first": (lambda: model(IMAGE.numpy()), ValueError, r"image as a NumPy array .*\[H, W, 3\]"),
@@ -173,7 +163,7 @@ REFUSED = {
         lambda: ufm(DEPTH, POSE, K, confidence=DEPTH), ValueError, "confidence must be None where"
     ),
     "a confidence in whole numbers": (
-        lambda: UfMStar(CONFIG.replace(anchors=AnchorConfig(), confidence=ConfidenceConfig()))(
+        lambda: UfMStar(CONFIG.replace(anchors=AnchorConfig(), confidence=True))(
             DEPTH, POSE, K, confidence=DEPTH.int()
         ),
         TypeError, "confidence must have a floating-point",
@@ -195,6 +185,16 @@ REFUSED = {
     "a pose of half precision": (
         lambda: ufm(DEPTH, far(torch.float16, 20.0), K), ValueError, "its dtype is exact to 1 cm .*expected float64"
     ),
+    "an image size in text": (lambda: SPGFConfig().scaled_to("480", 640), TypeError, "height must be a whole number"),
+    "a rotation of an array": (
+        lambda: GaussianMixture.empty(1, 2, dtype=torch.float32, device="cpu").rigid(np.eye(3), torch.zeros(1, 3)),
+        TypeError, r"R must be a dense torch\.Tensor, got nd",
+    ),
+    "a camera of numbers": (
+        lambda: Anchors(torch.zeros(1, 2, 2), torch.ones(1, 2), torch.ones(1, 2)).moved([1.0], K),
+        TypeError, r"K_from must be a dense torch\.Tensor, got list of float",
+    ),
+    "a map of text": (lambda: LandmarkMap("abc", None), TypeError, "points_world and sigma must be arrays of numbers"),
     "a map without knots": (lambda: Recalibration((), ()), ValueError, "Recalibration needs knots"),
 }  # fmt: skip
 
@@ -223,7 +223,7 @@ def network_of_zeros():
 PUBLIC = {
     "UfMStar": (UfMStar, {"config": None, "recalibration": None, "dtype": torch.float32, "device": None}),
     "forward": (
-        lambda **k: seen()(**k), GOOD | dict.fromkeys(("aleatoric", "epistemic", "valid", "features")),
+        lambda **k: seen()(**k), GOOD | dict.fromkeys(("aleatoric", "epistemic", "valid")),
     ),
     "mean_uncertainty": (lambda **k: seen().mean_uncertainty(**k), GOOD | SAMPLE),
     "query": (lambda **k: seen().query(**k), {"points": torch.zeros(1, 1, 3), "frame": "world"}),
@@ -235,7 +235,7 @@ PUBLIC = {
          "anchors": None, "recalibration": None, "check_poses": 0, "multiview_device": None},
     ),
     "UncertainDepth.forward": (
-        lambda **k: network_of_zeros()(**k), IMAGE_GOOD | dict.fromkeys(("valid", "features", "anchors")),
+        lambda **k: network_of_zeros()(**k), IMAGE_GOOD | dict.fromkeys(("valid", "anchors")),
     ),
     "update": (
         lambda **k: network_of_zeros().update(**k),
@@ -318,17 +318,15 @@ def test_a_network_whose_train_starts_a_training_is_refused(place):
     UncertainDepth(Freezes())
 
 
-@pytest.mark.parametrize("name", ["depth", "aleatoric", "epistemic", "valid", "features"])
+@pytest.mark.parametrize("name", ["depth", "aleatoric", "epistemic", "valid"])
 def test_the_mask_of_an_array_is_valid(name):
     """A masked entry is the same as False in ``valid``."""
     masked = np.zeros((1, H, W), bool)
     masked[:, :, W // 2 :] = True
-    config = UfMStarConfig(features=1)
     maps = {name: np.full((1, H, W), value) for name, value in (("depth", 2.0), ("aleatoric", 0.1), ("epistemic", 0.1))}
-    maps |= {"valid": np.ones((1, H, W), bool), "features": np.ones((1, 1, H, W))}
-    expected = UfMStar(config)(pose=POSE, intrinsics=K, **{**maps, "valid": ~masked})
-    mask = masked[:, None] if name == "features" else masked
-    out = UfMStar(config)(pose=POSE, intrinsics=K, **{**maps, name: np.ma.masked_array(maps[name], mask)})
+    maps["valid"] = np.ones((1, H, W), bool)
+    expected = UfMStar()(pose=POSE, intrinsics=K, **{**maps, "valid": ~masked})
+    out = UfMStar()(pose=POSE, intrinsics=K, **{**maps, name: np.ma.masked_array(maps[name], masked)})
     assert torch.equal(out.valid, expected.valid)
     torch.testing.assert_close(out.variance[out.valid], expected.variance[out.valid], rtol=0, atol=0)
     with pytest.raises(TypeError, match="image must not be masked"):
@@ -336,7 +334,7 @@ def test_the_mask_of_an_array_is_valid(name):
 
 
 def test_numbers_of_numpy_are_numbers():
-    config = UfMStarConfig(max_components=np.int64(100), eta=np.float32(0.5), add_aleatoric=np.bool_(True))
+    config = UfMStarConfig(max_components=np.int64(100), eta=np.float32(0.5), variances_in_h=np.bool_(False))
     assert config == UfMStarConfig(max_components=100, eta=0.5)
     assert type(config.max_components) is int
     assert seen().query(np.zeros((1, 5, 3))).disagreement.shape == (1, 5)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -23,13 +21,10 @@ pytestmark = pytest.mark.numerics
 @pytest.mark.parametrize(("weighted", "baseline"), [(False, 0.07), (True, 0.5), (False, None)])
 @given(seed=st.integers(0, 10**6))
 def test_agrees_with_the_oracle(backend, weighted, baseline, seed):
-    """Several c that match one k are fused in increasing c. ``weighted``: by overlap, with distances instead of
-    W2^2."""
+    """Several c that match one k are fused in increasing c. ``weighted``: by overlap."""
     previous, current = mixture(2, 6, seed, features=2), mixture(2, 5, seed + 50, empty=1, features=2)
     pairs = random_pairs(2, previous, current, seed)
-    if weighted:
-        pairs = replace(pairs, distance=1 + pairs.overlap)
-    config = UfMStarConfig(overlap_weighted=weighted, features=2, view_baseline=baseline)
+    config = UfMStarConfig(overlap_weighted=weighted, view_baseline=baseline)
     view = views(2, seed)
     fused = backend.kernels.fuse(previous.padded(12), current, pairs.padded(12), view, config)
     fused, dropped = append(fused, current, current.valid & ~pairs.match.any(2), view, config)
@@ -37,10 +32,9 @@ def test_agrees_with_the_oracle(backend, weighted, baseline, seed):
     for b in range(2):
         matches = [pairs.match[b, c].nonzero().flatten().tolist() for c in range(int(current.components[b]))]
         overlaps = {(c, k): pairs.overlap[b, c, k].item() for c in range(5) for k in range(6)}
-        distances = {pair: 1 + overlap for pair, overlap in overlaps.items()} if weighted else None
         expected = oracle.fuse(
             as_lists(previous, b), as_lists(current, b), matches, overlaps, view[b].numpy(), baseline=baseline,
-            overlap_weighted=weighted, distances=distances,
+            overlap_weighted=weighted,
         )  # fmt: skip
         ours = as_lists(fused, b)
         assert len(ours) == len(expected)

@@ -93,7 +93,6 @@ def one_stream(rng, i, config, dtype):
     made = {
         "depth": depth_map(rng), "pose": pose(rng, i), "intrinsics": camera(rng),
         "aleatoric": spread(rng, (H, W)), "epistemic": 10 ** rng.uniform(-6, 0, (H, W)),
-        "features": spread(rng, (config.features, H, W)),
     }  # fmt: skip
     exact = ("pose", "intrinsics")
     with np.errstate(over="ignore"):
@@ -122,14 +121,12 @@ def configuration(rng):
             scale_with_image=bool(rng.integers(2)),
             **[{}, {"max_depth": 20.0}, {"max_depth": 1e6, "min_gaussian_length": 112.0}][rng.integers(3)],
         ),
-        disagreement=str(rng.choice(["w2", "overlap"])),
         overlap_weighted=bool(rng.integers(2)),
         unmeasured=str(rng.choice(["paper", "relative", "nan"])), prior_mean=0.25,
         regression=str(rng.choice(["exact", "neighbourhood"])),
         variance_floor=float(rng.choice([0.0, 1e-4])),
         ema_alpha=float(rng.choice([0.5, 1.0])),
         anchors=AnchorConfig() if rng.integers(2) else None,
-        features=int(rng.integers(2)),
         max_components=[None, 1, 30][rng.integers(3)],
         initial_capacity=int(rng.choice([1, 64])),
         merge=MergeConfig(every=3) if rng.integers(2) else None,
@@ -166,8 +163,6 @@ def assert_sound(out, arguments, config, session):
     for name in ("aleatoric", "epistemic"):
         value = arguments.get(name, torch.zeros_like(depth)).to(depth.dtype)
         use &= (value >= 0) & (value <= 1e12)
-    if config.features:
-        use &= (arguments["features"].to(depth.dtype).abs() <= 1e12).all(1)
     counts = out.statistics
     assert torch.equal(out.valid, use), session
     positive = (mask & (depth > 0) & depth.isfinite()).sum((1, 2))
@@ -189,7 +184,7 @@ def run_session(session):
     for i in range(LENGTH):
         hostile, watched, other = (one_stream(rng, i, config, dtype) for _ in range(3))
         names = [n for n in ("aleatoric", "epistemic", "valid", "anchors") if rng.integers(2)]
-        names = [n for n in names if n != "anchors" or config.anchors is not None] + ["features"] * config.features
+        names = [n for n in names if n != "anchors" or config.anchors is not None]
         arguments, spoilt = batch([hostile, watched], names), rng.integers(6) == 0
         before = {name: value.clone() for name, value in ufm.state_dict().items()}
         try:

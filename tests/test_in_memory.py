@@ -1,4 +1,4 @@
-"""In-memory objects as input: kornia's cameras, models and pipelines of ``transformers``."""
+"""In-memory objects as input: models and pipelines of ``transformers``."""
 
 from __future__ import annotations
 
@@ -6,41 +6,15 @@ import pytest
 import torch
 import transformers
 from depth_anything_files import write_depth_anything, write_other
-from modules import CONFIG, H, K, W, frame, same
+from modules import CONFIG
 from PIL import Image
 from torch import nn
 
-from ufmstar_torch import UfMStar, UncertainDepth
+from ufmstar_torch import UncertainDepth
 from ufmstar_torch.models import Preprocess, from_hugging_face, wrap_network
 
-DEPTH, POSE, _ = frame(3)
-K4 = torch.eye(4, dtype=torch.float64)
-K4[:3, :3] = K
 IMAGES = torch.randint(0, 256, (2, 3, 48, 64), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
 CAMERA = torch.tensor([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]])
-
-
-def kornia_camera(extrinsics, intrinsics=K4):
-    camera = pytest.importorskip("kornia.geometry.camera").PinholeCamera
-    size = (torch.tensor([float(n)]).expand(len(extrinsics)) for n in (H, W))
-    return camera(intrinsics.expand_as(extrinsics).to(extrinsics), extrinsics, *size)
-
-
-def test_kornias_camera_is_pose_and_intrinsics():
-    """The camera's matrix is world-to-camera. One camera can be passed as pose and intrinsics, also to
-    ``UncertainDepth``."""
-    camera = kornia_camera(torch.linalg.inv(POSE.double()))
-    expected = UfMStar(CONFIG)(DEPTH, POSE, K)
-    torch.testing.assert_close(UfMStar(CONFIG)(DEPTH, camera, camera).variance, expected.variance, equal_nan=True)
-    network = wrap_network(lambda x: 1 + x.mean(1))
-    model, twin = (UncertainDepth(network, CONFIG, preprocess=network.preprocess) for _ in range(2))
-    image = torch.rand(1, 3, H, W, generator=torch.Generator().manual_seed(0))
-    assert same(model(image, camera, camera).intrinsics, twin(image, POSE, K).intrinsics)
-    for T, message in ((2 * torch.eye(4)[None], "not orthonormal|last row"), (torch.zeros(1, 4, 4), "NaN or infinity")):
-        with pytest.raises(ValueError, match=f"stream 0: pose .*({message})"):
-            UfMStar(CONFIG)(DEPTH, kornia_camera(T), K)
-    with pytest.raises(ValueError, match=r"pose.extrinsics must be \[B, 4, 4\] world-to-camera"):
-        UfMStar(CONFIG)(DEPTH, kornia_camera(torch.eye(4).expand(1, 2, 4, 4)), K)
 
 
 @pytest.mark.parametrize("architecture", ["depth_anything", "depth_pro", "dpt", "glpn", "zoedepth"])

@@ -128,7 +128,7 @@ def test_sigterm_as_an_exception_saves_the_state(tmp_path):
         import live_model as t
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         from ufmstar_torch import LiveDepth, UncertainDepth
-        model = UncertainDepth(t.Network())
+        model = UncertainDepth(t.Network(), posterior=False)
         ready, state = lambda _: print("ready", flush=True), {str(tmp_path / "state.pt")!r}
         with LiveDepth(model, ready, t.K, state=state) as live:
             live.push_pose(0, t.at(0)); live.push_image(0, t.PICTURE)

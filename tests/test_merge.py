@@ -27,7 +27,7 @@ def merging(share: float, **settings: float) -> MergeConfig:
     return type("Merging", (MergeConfig,), {"share": share})(**settings)
 
 
-CONFIG = UfMStarConfig(merge=merging(0.2, loss=1.0), features=2, anchors=AnchorConfig())
+CONFIG = UfMStarConfig(merge=merging(0.2, loss=1.0), anchors=AnchorConfig())
 ALL = torch.tensor([True, True])
 
 
@@ -142,7 +142,7 @@ def test_the_map_stays_within_the_stated_bound_where_components_are_dissolved(se
     """At a dissolved component's points, a feature in [0, 1] changes by little more than the component's share. Joining
     is off."""
     before, _ = crowd(seed)
-    config = UfMStarConfig(merge=merging(0.05, loss=1e-9), features=2)
+    config = UfMStarConfig(merge=merging(0.05, loss=1e-9))
     after, _ = merge(before, before.mean.new_zeros(*before.weight.shape, 0), ALL, config)
     for b in range(2):
         gone = [k for k in range(12) if not (after.mean[b] == before.mean[b, k]).all(1).any()]

@@ -14,7 +14,7 @@ from pages import blocks
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from ufmstar_torch.eval.metrics import NLL, Coverage, ECEDelta, ECEQuantile, SequenceMetrics, base
+from ufmstar_torch.eval.metrics import NLL, Coverage, ECEDelta, ECEQuantile, base
 from ufmstar_torch.eval.metrics.intervals import GatedPixels, IntervalCoverage
 from ufmstar_torch.eval.metrics.mixture import Mixture
 
@@ -81,16 +81,6 @@ def test_an_update_needs_no_value(kind):
     """Tensors of the device "meta" have none, so that an update that reads one fails."""
     metric = added(kind().to("meta"), tuple(x.to("meta") for x in frames()))
     assert all(getattr(metric, name).device.type == "meta" for name, *_ in metric.STATES)
-
-
-def test_a_sequence_s_metrics_on_a_device(as_on_a_device, monkeypatch):
-    depth, variance, truth, valid, inlier, outlier, level = frames()
-    device, host = SequenceMetrics(), SequenceMetrics()
-    as_on_a_device()
-    device.update(depth, variance, truth, valid, (inlier, outlier), level)
-    monkeypatch.undo()
-    host.update(depth, variance, truth, valid, (inlier, outlier), level)
-    assert device.compute() == pytest.approx(host.compute(), rel=1e-9, abs=1e-9, nan_ok=True)
 
 
 def test_coverage_and_width_of_normal_errors():

@@ -14,7 +14,7 @@ import scenes
 from ufmstar_torch import DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.sequences.frame import Frame
-from ufmstar_torch.frames.prediction import NetworksInTurn, combine, weights_mark
+from ufmstar_torch.frames.prediction import NetworksInTurn, combine
 from ufmstar_torch.models import Preprocess
 
 H, W = 30, 40
@@ -196,83 +196,17 @@ def test_a_state_that_is_refused_leaves_the_last_image_known():
     assert not torch.equal(loaded, undisturbed)
 
 
-def test_a_state_holds_no_weights_and_names_other_networks(caplog):
+def test_a_state_holds_no_weights():
     first = UncertainDepth([Scaled(1.0), Scaled(1.1)], CONFIG, posterior=False)
     for i in range(3):
         first(image(i), POSES[i], K)
     state = first.stream_state()
-    assert not [name for name in state if name.startswith("networks.")]
-    same_networks = UncertainDepth([Scaled(1.0), Scaled(1.1)], CONFIG, posterior=False)
-    same_networks.load_stream_state(state)
-    assert not caplog.messages
     others = UncertainDepth([Scaled(1.0), Scaled(1.2)], CONFIG, posterior=False)
     others.load_stream_state(state)
-    assert [network.factor.item() for network in others.networks] == [1.0, pytest.approx(1.2)]
     assert int(others.ufm.frames) == 3
-    assert caplog.messages == [
-        "the state was saved with other networks: it holds their disagreement; reset() begins anew"
-    ]
-    for name in ("image_index", "weights_mark"):
-        with pytest.raises(ValueError, match=f"{name} must be a whole number of at least 0"):
-            others.load_stream_state({**state, name: torch.tensor(-1)})
+    with pytest.raises(ValueError, match="image_index must be a whole number of at least 0"):
+        others.load_stream_state({**state, "image_index": torch.tensor(-1)})
     assert [network.factor.item() for network in others.networks] == [1.0, pytest.approx(1.2)]
-
-
-@pytest.mark.parametrize("where", [0, -1])
-def test_networks_that_run_a_file_differ_with_its_content(tmp_path, where):
-    (tmp_path / "a").write_bytes(bytes(200_000))
-    changed = bytearray(200_000)
-    changed[where] = 1
-    (tmp_path / "b").write_bytes(changed)
-    marks = []
-    for name in "aab":
-        network = nn.Identity()
-        network.path = str(tmp_path / name)
-        marks.append(weights_mark(network))
-    assert marks[0] == marks[1] != marks[2]
-
-
-class Foreign(nn.Module):
-    """A network whose state also holds values that are no dense tensors, as quantised layers and offloaded ones."""
-
-    def __init__(self, first: float) -> None:
-        super().__init__()
-        self.register_buffer("first", torch.tensor([first, 0.0]))
-        self.register_buffer("eighth", torch.ones(3).to(torch.float8_e4m3fn))
-        self.register_buffer("offloaded", torch.ones(3, device="meta"))
-        self.register_buffer("sparse", torch.eye(3).to_sparse())
-        self.register_buffer("quantised", torch.quantize_per_tensor(torch.ones(3), 0.1, 0, torch.qint8))
-
-    def get_extra_state(self):
-        return {"scale": 1}
-
-    def set_extra_state(self, state):
-        assert state == {"scale": 1}
-
-    def forward(self, image):
-        return DepthPrediction(image[:, 0])
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
-def test_networks_with_states_of_any_kind_are_saved(caplog):
-    model = UncertainDepth(Foreign(1.0), CONFIG, posterior=False)
-    model(image(0), POSES[0], K)
-    state = model.stream_state()
-    UncertainDepth(Foreign(1.0), CONFIG, posterior=False).load_stream_state(state)
-    assert not caplog.messages
-    UncertainDepth(Foreign(2.0), CONFIG, posterior=False).load_stream_state(state)
-    assert caplog.messages
-
-
-def test_weights_of_a_large_layer_are_marked_by_its_first_and_last_entries():
-    """Above 2^24, float32 cannot hold every index."""
-    layer = nn.Module()
-    layer.register_buffer("weight", torch.zeros(2**24 + 8, dtype=torch.bool))
-    marks = [weights_mark(layer)]
-    for at in (0, -1):
-        layer.weight[at] = True
-        marks.append(weights_mark(layer))
-    assert len(set(marks)) == 3
 
 
 class Meeting:

@@ -24,9 +24,7 @@ def test_anchors_are_checked_as_by_the_reference(masked, off):
     rng = np.random.default_rng(int(off))
     depth = torch.from_numpy(rng.uniform(1, 3, (2, 48, 64)))
     depth[:, :5] = torch.nan
-    frame = check_frame(
-        depth, torch.eye(4), K, None, None, None, None, feature_count=0, rotation_tolerance=0.01, max_depth=10.0
-    )
+    frame = check_frame(depth, torch.eye(4), K, None, None, None, rotation_tolerance=0.01, max_depth=10.0)
     pixel, values = torch.from_numpy(rng.uniform(-3, 66, (2, 300, 2))), torch.from_numpy(rng.uniform(0.5, 4, (2, 300)))
     values[0] *= off  # with 1,000, most anchors of a stream are off by more than a factor of 100
     variance = torch.from_numpy(rng.uniform(0, 3, (2, 300)))

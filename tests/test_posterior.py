@@ -46,8 +46,8 @@ LEVEL = np.eye(4)
 
 
 def checked(depth, pixel, g, variance, pose=LEVEL):
-    frame = check_frame(torch.from_numpy(depth)[None], torch.from_numpy(pose)[None], K[None], None, None, None, None,
-                        feature_count=0, rotation_tolerance=0.01)  # fmt: skip
+    frame = check_frame(torch.from_numpy(depth)[None], torch.from_numpy(pose)[None], K[None], None, None, None,
+                        rotation_tolerance=0.01)  # fmt: skip
     anchors = Anchors(*(torch.from_numpy(x)[None] for x in (pixel, g, variance)))
     return frame, check_anchors(anchors, frame)
 
@@ -105,8 +105,8 @@ def streams_of(seeds, dtype, size=(36, 48)):
     scenes = [scene(seed, size) for seed in seeds]
     depth, claimed = (torch.from_numpy(np.stack([s[i] for s in scenes])).to(dtype) for i in (0, 2))
     b = len(seeds)
-    frame = check_frame(depth, torch.eye(4).repeat(b, 1, 1), K.repeat(b, 1, 1), None, None, None, None,
-                        feature_count=0, rotation_tolerance=0.01)  # fmt: skip
+    frame = check_frame(depth, torch.eye(4).repeat(b, 1, 1), K.repeat(b, 1, 1), None, None, None,
+                        rotation_tolerance=0.01)  # fmt: skip
     valid = torch.ones(b, 60, dtype=torch.bool)
     valid[0, 50:] = valid[-1] = False
     stacked = (torch.from_numpy(np.stack([s[i] for s in scenes])).to(dtype) for i in (3, 4, 5))

@@ -265,7 +265,7 @@ def test_numbers_of_anchors_are_lines_of_the_rows_that_state_one(anchored):
 
 
 def test_words_and_switches_are_no_values():
-    rows = [row(), *(row(disagreement="overlap", prior_weight=v) for v in (1.0, 2.0, 3.0))]
+    rows = [row(), *(row(unmeasured="nan", prior_weight=v) for v in (1.0, 2.0, 3.0))]
     rows += [row(**{"segment.prune": rule}) for rule in ("either", "none")] + [row(overlap_weighted=True)]
     assert sweeps(results_of(rows)) == [("depth_only", "prior_weight")]
     assert math.isnan(default_value("segment.prune"))

@@ -146,7 +146,10 @@ def test_a_figure_that_fails_does_not_lose_the_page(
 
     monkeypatch.setattr("ufmstar_torch.eval.report.figures_error.draw_entropy", broken)
     assert cli.main(["report", str(out)]) == 0
-    assert "figure not drawn: entropy ensemble: no <b>such</b> glyph\n" in capsys.readouterr().out
+    printed = capsys.readouterr()
+    assert "figure not drawn: entropy ensemble: no <b>such</b> glyph\n" in printed.out
+    assert printed.err.startswith("figures: 0 of ")
+    assert "figures: done, " in printed.err
     page = Page((out / "report.html").read_text(encoding="utf-8"))
     undrawn = next(t for t in page.tables if t and t[0] == ["figure", "reason"])
     assert undrawn[1] == ["entropy ensemble", "no <b>such</b> glyph"]

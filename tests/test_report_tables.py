@@ -6,6 +6,7 @@ import csv
 import json
 import re
 
+import numpy as np
 import pytest
 import torch
 from evaluations import (
@@ -47,23 +48,15 @@ ALONE, UFM, _, UFM_STAR = ENSEMBLE
 SECOND = "records/scannet/x/Ensemble.json"
 
 
-def test_a_mixture_has_columns_where_a_row_states_one():
+def test_a_mixture_and_intervals_have_columns_where_a_row_states_them():
     plain = {(row, ("d", "s")): {"rmse": 0.5} for row in (ALONE, UFM_STAR)}
-    stated = plain | {(UFM_STAR, ("d", "s")): {"rmse": 0.5, "mixture_nll": 0.25, "mixture_coverage": 0.99}}
-    without, extended = extra_table(in_memory(plain)), extra_table(in_memory(stated))
-    new = [heading for _, heading in extended.cells.columns if ("", heading) not in without.cells.columns]
-    assert new == ["mixture: NLL ↓", "mixture: within 3 σ [%]"]
-    assert list(extended.cells.iloc[1][-2:]) == ["0.25", "99.0"]
-
-
-def test_coverage_has_columns_where_a_row_has_intervals():
-    plain = {(row, ("d", "s")): {"rmse": 0.5} for row in (ALONE, UFM_STAR)}
-    coverage = {"coverage_50": 0.52, "coverage_90": 0.905, "coverage_99": 0.99}
-    extended = extra_table(in_memory(plain | {(UFM_STAR, ("d", "s")): {"rmse": 0.5, **coverage}}))
+    stated = {"mixture_nll": 0.25, "mixture_coverage": 0.99, "coverage_50": 0.52, "coverage_90": 0.905}
+    extended = extra_table(in_memory(plain | {(UFM_STAR, ("d", "s")): {"rmse": 0.5, **stated}}))
     before = extra_table(in_memory(plain)).cells.columns
     new = [heading for _, heading in extended.cells.columns if ("", heading) not in before]
-    assert new == ["in the 50 % interval [%]", "in the 90 % interval [%]", "in the 99 % interval [%]"]
-    assert list(extended.cells.iloc[1][-3:]) == ["52.0", "90.5", "99.0"]
+    shares = ["mixture: within 3 σ [%]", "in the 50 % interval [%]", "in the 90 % interval [%]"]
+    assert new == ["mixture: NLL ↓", *shares]
+    assert list(extended.cells.iloc[1][-4:]) == ["0.25", "99.0", "52.0", "90.5"]
 
 
 class TestMainTable:
@@ -208,7 +201,7 @@ class TestLoading:
             ("eval.json", {"format": 99}, r"eval\.json is not the description"),
             ("eval.json", {"rows": [{"method": "Oracle"}]}, "no method is called 'Oracle'"),
             (SECOND, {"sequence": "x", "network": "Other"}, "mixed networks.*FastDepth in .*Other in "),
-            (SECOND, {"format": 2}, r"Ensemble\.json is not a record of format 1"),
+            (SECOND, {"format": 1}, r"Ensemble\.json is not a record of format 2"),
             (SECOND, {"method": "Oracle"}, r"Ensemble\.json: no method is called 'Oracle'"),
             (SECOND, {"setting": {"skip": -1}}, r"Ensemble\.json: Setting\.skip must lie"),
         ],
@@ -228,18 +221,18 @@ class TestLoading:
 
     def test_sums_that_are_gone_or_broken(self, tmp_path):
         write_evaluation(tmp_path, ENSEMBLE[:2], SCENES[:2])
-        sums = tmp_path / "records" / "scannet" / SCENES[1][1] / "Ensemble.pt"
+        sums = tmp_path / "records" / "scannet" / SCENES[1][1] / "Ensemble.npz"
         content = sums.read_bytes()
         sums.unlink()
         result = load_results(tmp_path)
         assert set(result.merged) == {("scannet", UFM)}
         assert len(result.notes) == 1
-        assert "Ensemble.pt is not there" in result.notes[0]
+        assert "Ensemble.npz is not there" in result.notes[0]
         sums.write_bytes(content[:100])
-        with pytest.raises(ResultsError, match=r"Ensemble\.pt does not hold the sums"):
+        with pytest.raises(ResultsError, match=r"Ensemble\.npz does not hold the sums"):
             load_results(tmp_path)
-        torch.save({"metrics": {"metrics.NLL.total": torch.zeros(7)}}, sums)
-        with pytest.raises(ResultsError, match=r"Ensemble\.pt holds sums of other metrics"):
+        np.savez(sums, **{"metrics/metrics.NLL.total": np.zeros(7)})
+        with pytest.raises(ResultsError, match=r"Ensemble\.npz holds sums of other metrics"):
             load_results(tmp_path)
         assert load_results(tmp_path, with_sums=False).merged == {}
 

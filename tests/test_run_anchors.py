@@ -181,7 +181,7 @@ def test_only_a_run_with_anchors_is_repeated_with_anchors(tour, finished, tmp_pa
 
 
 def test_the_flag(tmp_path, capfd):
-    words = ["run", TOUR, "--depth", "self", "--plain", "--anchors", "corners", "--set", "disagreement=overlap"]
+    words = ["run", TOUR, "--depth", "self", "--plain", "--anchors", "corners", "--set", "ema_alpha=1"]
     words += ["--no-video", "--no-sheet"]
     assert cli.main([*words, "--frames", ":5", "--out", str(tmp_path / "a")]) == 0
     printed = capfd.readouterr().out
@@ -189,7 +189,7 @@ def test_the_flag(tmp_path, capfd):
     assert (summary["settings"]["anchors"], summary["settings"]["plain"], summary["result"]) == ("corners", True, "ufm")
     assert "posterior" not in summary
     assert summary["settings"]["set"]["anchors"] == AnchorConfig().to_dict()
-    assert summary["settings"]["set"]["disagreement"] == "overlap"
+    assert summary["settings"]["set"]["ema_alpha"] == 1.0
     assert "UfM*, anchored  " in printed
     used, result = (summary["anchors"][key] for key in ("used_per_frame", "found_per_frame"))
     assert f"anchors: {used:.1f} used a frame, of {result:.1f} triangulated" in printed

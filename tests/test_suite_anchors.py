@@ -12,8 +12,9 @@ from tiny_suite import Biased, base_network, evaluate, row, unbatched, write_net
 
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.anchors import Anchors
+from ufmstar_torch.anchors.sources import landmark_source
 from ufmstar_torch.anchors.tracker import LandmarkTracker
-from ufmstar_torch.eval.engine.anchors import TRUTH_SIGMA, AnchorSource, Tracks
+from ufmstar_torch.eval.engine.anchors import TRUTH_SIGMA, AnchorSource
 from ufmstar_torch.eval.engine.estimators import ufm_star_config
 from ufmstar_torch.eval.methods.perturb import perturbed
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, default_of, setting_from
@@ -74,7 +75,7 @@ def assert_agrees(result, expected, used):
         {"anchors": "corners", "anchor_count": 0, "seed": 0},
         {"anchors": "truth", "seed": 3},
         {"anchors": "corners", "track_noise": 2.0, "rotation_noise": 1.0, "seed": 1},
-        {"disagreement": "overlap", "anchors": "corners", "anchors.half_life": 10.0},
+        {"regression": "neighbourhood", "anchors": "corners", "anchors.half_life": 10.0},
     ],
 )
 def test_a_setting_survives_its_flat_form_and_json(values):
@@ -141,8 +142,8 @@ def test_truth_is_exact_at_random_pixels_and_more_hold_the_fewer(tour):
     truth = truth_at(frame, p.intrinsics[0].numpy(), p.size)
 
     def drawn(count, seed=0):
-        source = AnchorSource(Setting(anchors="truth", anchor_count=count, seed=seed), None)
-        _, anchors, ms = source.of(frame, frame.T_world_cam, p, truth)
+        setting = Setting(anchors="truth", anchor_count=count, seed=seed)
+        _, anchors, ms = AnchorSource(None).of(frame, frame.T_world_cam, p, truth, setting)
         assert ms is None
         return anchors
 
@@ -159,13 +160,13 @@ def test_truth_is_exact_at_random_pixels_and_more_hold_the_fewer(tour):
 
 def test_track_noise_has_the_size_that_the_tracker_states_for_it(tour):
     frames = list(tour)
-    tracks, clean, noisy, stated = [Tracks() for _ in range(2)], [], [], []
+    sources, clean, noisy, stated = [AnchorSource(landmark_source("corners")) for _ in range(2)], [], [], []
     for frame in frames:
         p = Biased().one(frame, 0)
         pair = []
-        for size, corners in zip((0.0, 0.5), tracks, strict=True):
-            source = AnchorSource(Setting(anchors="corners", track_noise=size), corners)
-            _, anchors, ms = source.of(frame, frame.T_world_cam, p, None)
+        for size, source in zip((0.0, 0.5), sources, strict=True):
+            setting = Setting(anchors="corners", track_noise=size)
+            _, anchors, ms = source.of(frame, frame.T_world_cam, p, None, setting)
             assert isinstance(anchors, Anchors)
             assert ms > 0
             pair.append(anchors)

@@ -193,7 +193,7 @@ def test_files_that_are_not_there(tmp_path):
 
 def test_a_in_h_agrees_with_the_oracle():
     config = UfMStarConfig(segment=SPGF, variances_in_h=True, backend="torch", unmeasured="paper")
-    estimator, sampled = Gaussians(config, CPU), UfMStar(config.replace(features=1, backend="auto"))
+    estimator, sampled = Gaussians(config, CPU), UfMStar(config.replace(backend="auto"))
     judge = oracle.Oracle(oracle_settings(SPGF))
     depths, poses, K = scenes.sequence(3, 30, 40, 0.05)
     for i, (depth, T) in enumerate(zip(depths[:2], poses[:2], strict=True)):
@@ -205,10 +205,10 @@ def test_a_in_h_agrees_with_the_oracle():
         np.testing.assert_allclose(answer.aleatoric[0].numpy(), A, rtol=1e-5)
         np.testing.assert_allclose(answer.variance[0].numpy(), M + A, rtol=1e-3, atol=1e-5)
         frame = maps.depth, torch.tensor(T), torch.tensor(K), maps.aleatoric_variance
-        mean = sampled.mean_uncertainty(*frame, features=torch.ones(1, 1, *depth.shape), fraction=1.0)
-        assert mean.aleatoric.mean.item() == pytest.approx(np.nanmean(A), rel=1e-4), "together with a feature, compiled"
+        mean = sampled.mean_uncertainty(*frame, fraction=1.0)
+        assert mean.aleatoric.mean.item() == pytest.approx(np.nanmean(A), rel=1e-4), "compiled"
         assert mean.aleatoric.maximum.item() == pytest.approx(np.nanmax(A), rel=1e-4)
-    assert sampled.query(torch.zeros(1, 2, 3)).features.shape == (1, 2, 1)
+    assert sampled.query(torch.zeros(1, 2, 3)).features.shape == (1, 2, 3)
     assert np.nanmax(np.abs(A - a)) > 0.01, "the mixture's average is not the pixel's value"
     with pytest.raises(ValueError, match="aleatoric or epistemic must be given"):
         estimator.update(replace(maps, aleatoric_variance=None), torch.tensor(T))
@@ -236,7 +236,7 @@ def test_e_in_h_follows_the_rule_of_a():
 def test_a_in_h_is_a_row_of_its_own():
     one = row("UfM*-Aleatoric", overrides={"variances_in_h": True})
     config = ufm_star_config(one)
-    assert (config.variances_in_h, config.features, config.entries) == (True, 0, 3)
+    assert (config.variances_in_h, config.entries) == (True, 3)
     assert one.label == "UfM*-Aleatoric (variances_in_h)"
 
 

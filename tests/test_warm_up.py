@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import gc
 import importlib
+import itertools
 import json
 import os
 import pkgutil
@@ -22,9 +23,11 @@ from numba.core.dispatcher import Dispatcher
 
 import ufmstar_torch
 from ufmstar_torch import DepthPrediction, UfMStar, UncertainDepth
+from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.kernels import compile_cpu
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, part
 from ufmstar_torch.kernels.cpu.vectors import vectors
+from ufmstar_torch.runtime import warm_up as module
 from ufmstar_torch.runtime.warm_up import warm_up
 
 COLD = """
@@ -144,6 +147,25 @@ def test_a_source_of_landmarks_needs_no_kernel_after_the_wall():
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("code", "step"), [(None, 1000), ("raise SystemExit(7)", 1000), ("import time; time.sleep(1000)", 0.5)]
+)
+def test_a_second_process_calls_the_kernels_of_the_search_and_may_fail(monkeypatch, code, step):
+    """Where it exits or hangs, this process compiles what is missing."""
+    started: list[subprocess.Popen] = []
+    monkeypatch.setattr(
+        subprocess, "Popen", lambda *a, _new=subprocess.Popen, **k: started.append(_new(*a, **k)) or started[-1]
+    )
+    monkeypatch.setattr(module, "_SECOND", code or module._SECOND)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
+    warm_up(UfMStar(), (16, 16), 1, sources=[LandmarkTracker])
+    assert not started, "kernels are in memory"
+    monkeypatch.setattr(module, "on_disk", lambda _: False)
+    monkeypatch.setattr(module.time, "monotonic", itertools.count(0, step).__next__)
+    warm_up(UfMStar(), (16, 16), 1, sources=[LandmarkTracker])
+    assert [process.returncode == 0 for process in started] == [code is None]
+
+
 def test_warm_up_leaves_networks_images_and_state_as_they_are():
     class Noisy(torch.nn.Module):
         sizes: ClassVar = []
@@ -194,6 +216,17 @@ def test_a_cold_start_compiles_all_and_a_warm_one_nothing(tmp_path):
     for result in (cold, warm):
         assert not result["late"]
         assert result["steps"] == [[done, 21] for done in range(22)]
+
+
+@pytest.mark.slow
+def test_a_cold_start_of_a_search_compiles_it_elsewhere(tmp_path):
+    code = COLD.replace("lambda done, total: steps.append((done, total))", "None, [LandmarkTracker]")
+    code = code.replace("import warm_up", "import LandmarkTracker, os, warm_up")
+    code = code.replace("steps = []", "steps = []\nos.sched_getaffinity = lambda _: {0, 1}")
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert not {"refine", "compare", "accept"} & set(json.loads(done.stdout)["names"])
+    assert list(tmp_path.rglob("bundle.refine*.nbc"))
 
 
 KERNEL = """

@@ -124,7 +124,6 @@ DAMAGED = {
         r"state\['images'\] must have shape",
     ),
     "depths of infinity": ("dense", "landmarks.0.landmark_sigma", at_end(torch.inf), "landmark_sigma.* must be finite"),
-    "a checksum in floats": ("plain", "weights_mark", torch.Tensor.double, "weights_mark must be a whole number"),
 }
 
 

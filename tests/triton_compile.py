@@ -84,14 +84,14 @@ def cases() -> dict[str, Callable[[], object]]:
     def device(streams: int = 2, **settings: Any) -> None:
         depth = torch.full((streams, *(SIZE if streams > 1 else (1, 1))), 2.0)
         kernels = select_kernels("triton", "cuda")
-        chosen = UfMStarConfig(features=1, merge=None, **settings)
+        chosen = UfMStarConfig(variances_in_h=True, merge=None, **settings)
         frame = check_frame(
-            depth, torch.eye(4), K[:streams], None, None, None, depth[:, None], feature_count=1, rotation_tolerance=0.01
+            depth, torch.eye(4), K[:streams], depth, None, None, variances_in_h=True, rotation_tolerance=0.01
         )
         state = UfMStarState.initial(streams, chosen, torch.float32, "cpu")
         step_device.DeviceStep(kernels)(state, frame, chosen)
 
-    values = depth, torch.eye(4).double().expand(2, 4, 4), K, depth, depth, depth[:, None], depth > 0
+    values = depth, torch.eye(4).double().expand(2, 4, 4), K, depth, depth, depth > 0
     limits = config.segment.scaled_to(*SIZE)
     return {
         "regress": lambda: regress.regress_image(m, depth, K, depth > 0, config),

@@ -55,8 +55,6 @@ def walk(config, frames, streams=slice(None)):
     for depth, pose, K, anchors in frames:
         parts = [anchors.pixel, anchors.depth, anchors.variance]
         options = {"anchors": Anchors(*(x[streams] for x in parts))} if config.anchors is not None else {}
-        if config.features:
-            options["features"] = (depth / 10).nan_to_num()[streams, None]
         aleatoric = (depth / 100).nan_to_num()[streams]
         outputs.append(ufm(depth[streams], pose[streams], K[streams], aleatoric, **options))
     return outputs, ufm

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from types import NoneType
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -13,7 +12,7 @@ from torch import Tensor
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.check import AnchorDoubts, check_anchors
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.frames.arguments import Array, CameraLike, as_device, as_tensor, require_flag, require_kind
+from ufmstar_torch.frames.arguments import Array, CameraLike, as_device, as_tensor
 from ufmstar_torch.frames.frame import FrameInput, as_confidence, check_frame, raise_faults
 from ufmstar_torch.frames.output import MeanUncertainty, UncertaintyOutput
 from ufmstar_torch.frames.warnings import StreamWarnings
@@ -21,6 +20,7 @@ from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.gaussians.state import ALWAYS_FLOAT64, NAMES, UfMStarState
 from ufmstar_torch.kernels.select import FrameKernels, select_frame, select_step
 from ufmstar_torch.posterior.recalibrate import CONFIDENCE, Recalibration
+from ufmstar_torch.runtime.kinds import require
 from ufmstar_torch.runtime.stateful import StatefulModule, one_caller, undisturbed
 from ufmstar_torch.runtime.warm_up import warm_up
 from ufmstar_torch.steps import variance
@@ -67,7 +67,7 @@ class UfMStar(StatefulModule):
         device: torch.device | str | None = None,
     ) -> None:
         super().__init__()
-        require_kind("config", config, (UfMStarConfig, NoneType), "a UfMStarConfig or None")
+        require("config", config, UfMStarConfig | None)
         if not isinstance(dtype, torch.dtype) or dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         self.config = config if config is not None else UfMStarConfig()
@@ -87,7 +87,6 @@ class UfMStar(StatefulModule):
         epistemic: Array | None = None,
         valid: Array | None = None,
         *,
-        features: Array | None = None,
         member: int | Tensor = 0,
         informative: Tensor | None = None,
         anchors: Anchors | None = None,
@@ -107,7 +106,6 @@ class UfMStar(StatefulModule):
             aleatoric: like ``depth``, the network's variance A [m^2]; pixels outside [0, 1e12] are not valid.
             epistemic: likewise E [m^2].
             valid: like ``depth``, bool, True = use.
-            features: [B, F, H, W] with F = ``config.features``, averaged per component and regressed; of at most 1e12.
             member: index of the network, or random sample, that predicted, an integer or [B]; see ``steps.fuse``.
             informative: [B] bool, False where the image shows nothing, so that the depth is neither fused nor measured.
             anchors: sparse depths of this frame, with ``config.anchors``; None = none.
@@ -123,7 +121,7 @@ class UfMStar(StatefulModule):
         a = None if aleatoric is None else as_tensor("aleatoric", aleatoric)
         e = None if epistemic is None else as_tensor("epistemic", epistemic)
         frame = self._checked(
-            depth, pose, intrinsics, a, e, valid, features, member=member, informative=informative, anchors=anchors,
+            depth, pose, intrinsics, a, e, valid, member=member, informative=informative, anchors=anchors,
             confidence=confidence,
         )  # fmt: skip
         return self._observe(frame, network={"network_depth": depth, "aleatoric": a, "epistemic": e})
@@ -140,7 +138,6 @@ class UfMStar(StatefulModule):
         epistemic: Array | None = None,
         valid: Array | None = None,
         *,
-        features: Array | None = None,
         member: int | Tensor = 0,
         informative: Tensor | None = None,
         pixels: int | None = None,
@@ -165,12 +162,12 @@ class UfMStar(StatefulModule):
         """
         depth = as_tensor("depth", depth)
         frame = self._checked(
-            depth, pose, intrinsics, aleatoric, epistemic, valid, features, member=member, informative=informative,
+            depth, pose, intrinsics, aleatoric, epistemic, valid, member=member, informative=informative,
             anchors=anchors, confidence=confidence,
         )  # fmt: skip
         kernels = self._kernels(depth)[1].sample
         index, used = kernels.pixels(frame.valid, *sample_size(frame.size, pixels, fraction, seed))
-        out = self._observe(frame, index, average=require_flag("average", average))
+        out = self._observe(frame, index, average=bool(require("average", average, bool)))
         return mean_uncertainty(out, used, kernels.summary)
 
     def warm_up(
@@ -194,8 +191,9 @@ class UfMStar(StatefulModule):
             frame: "world" (the poses' frame) or "first" (each stream's first camera).
 
         Returns:
-            disagreement [B, N] [m^2] and features [B, N, F]. Where M was not measured, the disagreement is NaN, or the
-            paper's value with ``config.unmeasured = "paper"``; "relative" gives NaN, since a point has no depth.
+            disagreement [B, N] [m^2], and with ``config.variances_in_h`` features [B, N, 3]: A, E and 1. Where M was
+            not measured, the disagreement is NaN, or the paper's value with ``config.unmeasured = "paper"``;
+            "relative" gives NaN, since a point has no depth.
 
         Raises:
             ValueError: wrong shape or frame, or there was no frame yet.
@@ -223,7 +221,7 @@ class UfMStar(StatefulModule):
             IndexError: an index is out of range.
             ValueError: a mask of the wrong length; ``keep_evidence`` without ``config.anchors``.
         """
-        if require_flag("keep_evidence", keep_evidence) and not self._empty.by_stream:
+        if require("keep_evidence", keep_evidence, bool) and not self._empty.by_stream:
             raise ValueError("keep_evidence needs UfMStarConfig(anchors=AnchorConfig()), got one without anchors")
         with undisturbed(self.mean):
             old, b = self.state, self.mean.shape[0]
@@ -239,7 +237,7 @@ class UfMStar(StatefulModule):
     def uses_confidence(self) -> bool:
         """True if V depends on the network's confidence."""
         mapped = isinstance(self.recalibration, Recalibration) and self.recalibration.covariate == CONFIDENCE
-        return self.config.confidence is not None or mapped
+        return self.config.confidence or mapped
 
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
         self._empty.with_tensors(state).require(self.config, self._empty)
@@ -248,12 +246,12 @@ class UfMStar(StatefulModule):
         self, depth: Tensor, T: CameraLike, K: CameraLike, *maps: Array | None, anchors: Anchors | None,
         confidence: Array | None, **view: Any,
     ) -> FrameInput:  # fmt: skip
-        unused = ["anchors"] if anchors is not None and self.config.anchors is None else []
-        if unused or (confidence is not None and not self.uses_confidence):
-            [name] = unused or ["confidence"]
-            raise ValueError(f"{name} must be None where UfMStarConfig.{name} is None, which switches it off")
+        used = {"anchors": self.config.anchors is not None, "confidence": self.uses_confidence}
+        for name, value in (("anchors", anchors), ("confidence", confidence)):
+            if value is not None and not used[name]:
+                raise ValueError(f"{name} must be None where UfMStarConfig.{name} is off")
         frame = check_frame(
-            depth, T, K, *maps, **view, feature_count=self.config.features, variances_in_h=self.config.variances_in_h,
+            depth, T, K, *maps, **view, variances_in_h=self.config.variances_in_h,
             rotation_tolerance=self.config.rotation_tolerance, max_depth=self.config.segment.depth_limit,
             kernel=self._kernels(depth)[1].check,
         )  # fmt: skip
@@ -261,7 +259,7 @@ class UfMStar(StatefulModule):
             frame = replace(frame, confidence=as_confidence(confidence, frame))
         if anchors is None:
             return frame
-        variances = [v for v in variance.network_variances(frame, self.config) if v is not None]
+        variances = [v for v in (frame.aleatoric, frame.epistemic) if v is not None]
         checked = check_anchors(anchors, frame, variances, self._kernels(depth)[1].check_anchors)
         self._doubts.judge(anchors, checked, frame.size)
         return replace(frame, anchors=checked)
@@ -283,10 +281,10 @@ class UfMStar(StatefulModule):
             merging = kernels.merge
             state, out, factor = variance.corrected(state, frame, out, self.config, self.recalibration, pixels, merging)
         # With gradients to A and E.
-        features = out.maps["features"]
-        added = variance.network_maps(frame, features, self.config, pixels)
+        added = variance.network_maps(frame, out.maps["features"], self.config, pixels)
         V = variance.total_variance(out.variance, added, frame, self.config, self.recalibration, pixels, factor)
         maps = {"depth": out.depth, "variance": V, "ufm_variance": V, "valid": out.valid, **added, **out.maps}
+        del maps["features"]
         if network is not None:
             maps = self._shaped(maps, network, frame.confidence)
         depth, V, valid = maps.pop("depth"), maps.pop("variance"), maps.pop("valid")
@@ -300,17 +298,13 @@ class UfMStar(StatefulModule):
     ) -> dict[str, Tensor]:
         """The maps [B, H, W] in the shape of the caller's depth, which may be [B, 1, H, W], with those of the network
         as the caller passed them."""
-        features, depth = maps.pop("features"), network["network_depth"]
+        depth = network["network_depth"]
         assert depth is not None
         if self.config.posterior is None:
             maps["depth"] = depth
         passed = {"network_depth": depth} if self.config.variances_in_h else network
         maps |= {name: value for name, value in {**passed, "confidence": confidence}.items() if value is not None}
-        if depth.dim() == 4:
-            maps = {name: value.reshape(depth.shape) for name, value in maps.items()}
-        if self.config.features:
-            maps["features"] = features[..., : self.config.features]
-        return maps
+        return {name: value.reshape(depth.shape) for name, value in maps.items()} if depth.dim() == 4 else maps
 
     def _stored(self) -> UfMStarState:
         return self._empty.with_tensors(self._buffers)  # type: ignore[arg-type]  # avoids ``__getattr__``

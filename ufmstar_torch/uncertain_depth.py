@@ -6,8 +6,6 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
-from types import NoneType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
@@ -25,9 +23,7 @@ from ufmstar_torch.frames.arguments import (
     as_image,
     as_intrinsics,
     as_pose,
-    as_tensor,
-    require_flag,
-    require_kind,
+    require_size,
     require_whole,
 )
 from ufmstar_torch.frames.image_check import warn_of_range
@@ -41,17 +37,15 @@ from ufmstar_torch.frames.prediction import (
     in_unit_range,
     modules_of,
     shared_preprocess,
-    weights_mark,
 )
-from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.posterior.recalibrate import Recalibration
+from ufmstar_torch.runtime.kinds import require
 from ufmstar_torch.runtime.stateful import OneCaller, one_caller
-from ufmstar_torch.runtime.warm_up import along_wall, require_size, warm_up
+from ufmstar_torch.runtime.warm_up import warm_up
 from ufmstar_torch.ufmstar import UfMStar
 
-# Keys of a stream's state, or prefixes of keys: of UfM*, of the anchors' source, the number of processed images, and a
-# checksum of the networks' weights.
-_UFM, _LANDMARKS, _INDEX, _MARK = "ufm.", "landmarks.", "image_index", "weights_mark"
+# Keys of a stream's state, or prefixes of keys: of UfM*, of the anchors' source, and the number of processed images.
+_UFM, _LANDMARKS, _INDEX = "ufm.", "landmarks.", "image_index"
 
 
 @dataclass(frozen=True)
@@ -61,7 +55,6 @@ class _Predicted:
     Attributes:
         image, pose, intrinsics: the image and its camera, as tensors.
         prediction, member: as in :class:`UncertaintyOutput`.
-        features: [B, F, H, W] for UfM*, or None.
         ready: recorded after the copies; None = no copy to wait for.
     """
 
@@ -70,7 +63,6 @@ class _Predicted:
     intrinsics: Tensor
     prediction: DepthPrediction
     member: int | None
-    features: Tensor | None
     ready: torch.cuda.Event | None
 
     def copied(self) -> _Predicted:
@@ -161,9 +153,9 @@ class UncertainDepth(NetworksInTurn):
         _require_passes(members, mode, samples)
         super().__init__(members or None, samples=samples, preprocess=preprocess)
         self._caller, self.mode = OneCaller(), mode
-        require_kind("config", config, (UfMStarConfig, NoneType), "a UfMStarConfig or None")
-        require_kind("recalibration", recalibration, (Recalibration, NoneType), "a Recalibration or None")
-        posterior = require_flag("posterior", posterior)
+        require("config", config, UfMStarConfig | None)
+        require("recalibration", recalibration, Recalibration | None)
+        posterior = bool(require("posterior", posterior, bool))
         config, source = with_evidence(config or UfMStarConfig(), networks, posterior, anchors)
         self.ufm = UfMStar(config.within(self.max_depth, self.states_confidence), recalibration=recalibration)
         self._evidence = ImageEvidence(
@@ -193,7 +185,6 @@ class UncertainDepth(NetworksInTurn):
         intrinsics: CameraLike,
         valid: Array | None = None,
         *,
-        features: Array | None = None,
         anchors: Anchors | None = None,
     ) -> UncertaintyOutput:
         """Predict depth and its variance for the next image of every stream.
@@ -204,14 +195,13 @@ class UncertainDepth(NetworksInTurn):
             pose: [B, 4, 4] or [4, 4] camera-to-world [m], or without the last row; a tensor or a NumPy array.
             intrinsics: [B, 3, 3] or [3, 3] of ``image`` [px], or fx, fy, cx, cy; likewise.
             valid: [B, h, w] bool at the depth map's size, True = use.
-            features: [B, F, h, w] likewise, F = ``config.features``.
             anchors: sparse depths of this frame, [B, N] padded and masked, at pixels of ``image`` before the
                 preprocessing. None = of the constructor's source.
 
         Raises:
             ValueError, TypeError: as :meth:`UfMStar.forward`; alternation and landmarks then do not advance.
         """
-        return self._fused(self._predicted(image, pose, intrinsics, features), valid, anchors)
+        return self._fused(self._predicted(image, pose, intrinsics), valid, anchors)
 
     if TYPE_CHECKING:
         __call__ = forward
@@ -221,19 +211,17 @@ class UncertainDepth(NetworksInTurn):
         image: ImageLike,
         pose: CameraLike,
         intrinsics: CameraLike,
-        features: Array | None = None,
         *,
         ahead: bool = False,
     ) -> _Predicted:
         """The prediction for the next image, or, with ``ahead``, for the one after that."""
-        return self._predict(image, pose, intrinsics, features, number=self._next + ahead)
+        return self._predict(image, pose, intrinsics, number=self._next + ahead)
 
     def _predict(
         self,
         image: ImageLike,
         pose: CameraLike,
         intrinsics: CameraLike,
-        features: Array | None = None,
         *,
         number: int,
     ) -> _Predicted:
@@ -252,17 +240,14 @@ class UncertainDepth(NetworksInTurn):
         index = 0 if member is None else number % SAMPLES if self.stochastic else member
         prediction = replace(prediction, member=index)
         tensors = {name: value for name, value in vars(prediction).items() if isinstance(value, Tensor)}
-        if features is not None:
-            tensors["features"] = as_tensor("features", features)
         there, ready = _copied(tensors, self.multiview_device)
-        H = there.pop("features", None)
-        return _Predicted(picture, T, K_image, replace(prediction, **there), member, H, ready)
+        return _Predicted(picture, T, K_image, replace(prediction, **there), member, ready)
 
     def _fused(
         self, predicted: _Predicted, valid: Array | None = None, anchors: Anchors | None = None
     ) -> UncertaintyOutput:
         with self._anchored(predicted, anchors) as (found, p):
-            out = self.update(p, predicted.pose, p.K, valid, features=predicted.features, anchors=found)
+            out = self.update(p, predicted.pose, p.K, valid, anchors=found)
         self._undo(out.statistics)
         return replace(out, member=predicted.member)
 
@@ -295,7 +280,6 @@ class UncertainDepth(NetworksInTurn):
         intrinsics: CameraLike,
         valid: Array | None = None,
         *,
-        features: Array | None = None,
         anchors: Anchors | None = None,
     ) -> UncertaintyOutput:
         """Process an existing prediction, for example a cached one, as :meth:`forward` does after its networks.
@@ -304,15 +288,15 @@ class UncertainDepth(NetworksInTurn):
             prediction: [B, h, w].
             pose: as in :meth:`forward`.
             intrinsics: as in :meth:`forward`, of the depth map [px].
-            valid, features: as in :meth:`forward`.
+            valid: as in :meth:`forward`.
             anchors: [B, N] at pixels of the depth map, with ``config.anchors``; None = no anchors, even with a source.
 
         Raises:
             ValueError, TypeError: as :meth:`UfMStar.forward`; the image is then not counted.
         """
-        require_kind("prediction", prediction, DepthPrediction, "a DepthPrediction")
+        require("prediction", prediction, DepthPrediction)
         maps = prediction.arguments(confidence=self.ufm.uses_confidence)
-        out = self.ufm(pose=pose, intrinsics=intrinsics, valid=valid, features=features, anchors=anchors, **maps)
+        out = self.ufm(pose=pose, intrinsics=intrinsics, valid=valid, anchors=anchors, **maps)
         self._next += 1
         if prediction.intrinsics is None:
             K = as_intrinsics(intrinsics)
@@ -338,7 +322,7 @@ class UncertainDepth(NetworksInTurn):
         if isinstance(frames, Tensor | np.ndarray):
             raise TypeError(f"frames must be an iterable of (image, pose, intrinsics), got {type(frames).__name__}")
         with ThreadPoolExecutor(1, thread_name_prefix="network") as pool:
-            for frame in require_kind("frames", frames, Iterable, "an iterable of (image, pose, intrinsics)"):
+            for frame in require("frames", frames, Iterable):
                 if not isinstance(frame, tuple | list) or len(frame) != 3:
                     raise TypeError(f"frames must yield (image, pose, intrinsics), got {type(frame).__name__}")
                 if waiting is None or not self._networks_on_cpu():
@@ -382,7 +366,6 @@ class UncertainDepth(NetworksInTurn):
         intrinsics: CameraLike,
         valid: Array | None = None,
         *,
-        features: Array | None = None,
         anchors: Anchors | None = None,
         pixels: int | None = None,
         fraction: float | None = None,
@@ -394,17 +377,17 @@ class UncertainDepth(NetworksInTurn):
         calls of :meth:`forward`.
 
         Args:
-            image, pose, intrinsics, valid, features, anchors: as in :meth:`forward`.
+            image, pose, intrinsics, valid, anchors: as in :meth:`forward`.
             pixels, fraction, seed, average: as in :meth:`UfMStar.mean_uncertainty`.
 
         Raises:
             ValueError, TypeError: as :meth:`UfMStar.mean_uncertainty`; alternation and landmarks then do not advance.
         """
-        predicted = self._predicted(image, pose, intrinsics, features)
+        predicted = self._predicted(image, pose, intrinsics)
         with self._anchored(predicted, anchors, search=not self._evidence.by_default) as (found, p):
             maps = p.arguments(confidence=self.ufm.uses_confidence)
             mean = self.ufm.mean_uncertainty(
-                pose=predicted.pose, intrinsics=p.K, valid=valid, features=predicted.features, anchors=found,
+                pose=predicted.pose, intrinsics=p.K, valid=valid, anchors=found,
                 pixels=pixels, fraction=fraction, seed=seed, average=average, **maps,
             )  # fmt: skip
         self._undo(mean.statistics)
@@ -430,12 +413,12 @@ class UncertainDepth(NetworksInTurn):
         Raises:
             ValueError: as :meth:`UfMStar.warm_up`.
         """
-        require_size(size, streams)
+        size, streams = require_size("size", size), require_whole("streams", streams, 1)
         searching = () if self.landmarks is None else self.landmarks.searching
         if self.networks:
             size = self.run_on_noise(size, streams)
         ufm = UfMStar(self.ufm.config, dtype=self.ufm.mean.dtype, device=self.ufm.mean.device)
-        warm_up(ufm, size, streams, progress, [partial(along_wall, kind()) for kind in searching])
+        warm_up(ufm, size, streams, progress, searching)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Move the networks; UfM* stays on ``multiview_device`` unless that is None."""
@@ -470,18 +453,17 @@ class UncertainDepth(NetworksInTurn):
         state = {f"{_UFM}{name}": value.clone() for name, value in self.ufm.state_dict().items()}
         if self.landmarks is not None:
             state |= {f"{_LANDMARKS}{name}": value for name, value in self.landmarks.state().items()}
-        return state | {_INDEX: torch.tensor(self._next), _MARK: torch.tensor(weights_mark(self.networks))}
+        return state | {_INDEX: torch.tensor(self._next)}
 
     def load_stream_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue from a :meth:`stream_state`, bit for bit. If the networks' weights differ from those at saving, a
-        warning is logged. All or nothing: if it raises, the module is unchanged.
+        """Continue from a :meth:`stream_state`, bit for bit. All or nothing: if it raises, the module is unchanged.
 
         Raises:
             ValueError: the state is incomplete, of other sources of anchors, or invalid.
         """
         before = self.stream_state()
         try:
-            self._load(require_kind("state", state, Mapping, "a mapping of names to tensors"))
+            self._load(require("state", state, Mapping))
         except BaseException:
             self._load(before)
             raise
@@ -493,20 +475,19 @@ class UncertainDepth(NetworksInTurn):
             prefix = next(prefix for prefix in parts if str(key).startswith(prefix))
             parts[prefix][str(key).removeprefix(prefix)] = value
         counts, ufm, landmarks = parts[""], parts[_UFM], parts[_LANDMARKS]
-        for expected, present in ((self.ufm.state_dict().keys(), ufm.keys()), ({_INDEX, _MARK}, counts.keys())):
+        for expected, present in ((self.ufm.state_dict().keys(), ufm.keys()), ({_INDEX}, counts.keys())):
             if wrong := sorted(expected ^ present):
                 raise ValueError(f"the state must hold {', '.join(sorted(expected))}; missing or unknown: {wrong}")
-        for name, value in counts.items():
-            _require_count(value, name)
+        index = counts[_INDEX]
+        if not isinstance(index, Tensor) or index.dtype != torch.int64 or index.dim() or bool(index < 0):
+            raise ValueError(f"{_INDEX} must be a whole number of at least 0, got {index}")
         self.ufm.accepted(ufm)
         if self.landmarks is not None:
             self.landmarks.load_state(landmarks)
         elif landmarks:
             raise ValueError(f"state holds landmarks, for which the module has no source: {', '.join(landmarks)}")
         self.ufm.load_state_dict(ufm)
-        if int(counts[_MARK]) != weights_mark(self.networks):
-            LOGGER.warning("the state was saved with other networks: it holds their disagreement; reset() begins anew")
-        self._next = int(counts[_INDEX])
+        self._next = int(index)
 
 
 def _copied(values: dict[str, Tensor], device: torch.device | None) -> tuple[dict[str, Any], torch.cuda.Event | None]:
@@ -536,9 +517,3 @@ def _require_passes(members: Sequence[nn.Module], mode: object, samples: object)
         raise ValueError("mode 'full' needs several networks, or samples for a stochastic one")
     if len({id(member) for member in members}) < len(members):
         raise ValueError("networks must differ, got one of them twice: for passes of a stochastic one set samples")
-
-
-def _require_count(value: object, name: str) -> None:
-    """Raise a ValueError unless ``value`` is a whole number of at least 0."""
-    if not isinstance(value, Tensor) or value.dtype != torch.int64 or value.dim() or bool(value < 0):
-        raise ValueError(f"{name} must be a whole number of at least 0, got {value}")

@@ -91,7 +91,7 @@ def measure(
         )
         how: dict[str, Any] = {"device": device, "multiview_device": multiview_device, "samples": plan.samples}
         parts_measured = (DEPTH, ONCE, EVERY, MULTIVIEW, SAMPLE)
-        how["metered"] = {part for part in parts_measured if _metered(units, part, meter)}
+        how["metered"] = {part for part in parts_measured if units.get(part, units[NETWORK]) not in meter.missing}
         how["clock"] = CLOCKS[plan.clock]
         parts = _timed(chosen, networks, sequence, range(len(sequence))[selected], plan, how)
         work = {part: (units.get(part[1], units[NETWORK]), calls) for part, calls in parts.calls.items()}
@@ -147,11 +147,6 @@ def _usable(frame: Frame) -> bool:
     except FrameError:
         return False
     return True
-
-
-def _metered(units: Mapping[str, str], part: str, meter: EnergyMeter) -> bool:
-    """True if the part runs on a unit with a meter."""
-    return units.get(part, units[NETWORK]) not in meter.missing
 
 
 def measure_job(job: EvalJob, plan: Plan | None = None) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
 from contextlib import closing
 from itertools import islice
 from typing import Any
@@ -14,7 +13,7 @@ from ufmstar_torch import UncertainDepth
 from ufmstar_torch.eval.bench.measure import Plan
 from ufmstar_torch.eval.bench.networks import DEPTH, TimedNetwork
 from ufmstar_torch.eval.bench.timing import paired_ratio, pinned_threads, spread
-from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
+from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.images import image_tensor
 
 
@@ -40,7 +39,8 @@ def time_overlap(
     whole, alone = list[float](), list[float]()
     with pinned_threads(plan.threads or 1):
         model = UncertainDepth(network.members, preprocess=network.preprocess, check_poses=0)
-        with closing(model.stream(_inputs(frames, device))) as results:
+        images = ((image_tensor(f).to(device), *map(torch.from_numpy, (f.T_world_cam, f.intrinsics))) for f in frames)
+        with closing(model.stream(images)) as results:
             for frame in frames[:-1]:
                 started = time.perf_counter()
                 next(results)
@@ -51,10 +51,3 @@ def time_overlap(
                 alone.append(1e3 * (time.perf_counter() - started))
     counted = slice(plan.warm_up, None)
     return {"latency": spread(whole[counted]), "ratio_to_network": paired_ratio(whole[counted], alone[counted])}
-
-
-def _inputs(frames: Sequence[Frame], device: torch.device) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
-    """Image, pose and intrinsics of each frame."""
-    for frame in frames:
-        pose, K = torch.from_numpy(frame.T_world_cam), torch.from_numpy(frame.intrinsics)
-        yield image_tensor(frame).to(device), pose, K

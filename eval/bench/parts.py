@@ -81,11 +81,6 @@ class MultiviewStep:
         return {"bytes_end": state_bytes, "count_end": memory["count"], "smoothing_bytes": memory["smoothing_bytes"]}
 
 
-def _bare(frame: Frame) -> Frame:
-    """The frame without its maps."""
-    return replace(frame, image=None, depth=None, moving=None)
-
-
 class TimedParts:
     """The parts that were run on the frames, and their times. On odd frames the parts run in the reverse order, so that
     no part always follows the same one.
@@ -168,7 +163,7 @@ def _inputs(
 ) -> dict[str, tuple[torch.Tensor | None, Frame, DepthPrediction]]:  # fmt: skip
     """Image (with anchors alone), frame without image, and prediction of a row's step, by the row's label.
     ``cameras``: K [1, 3, 3] of the maps, by the network."""
-    image, bare = image_tensor(frame).to(device), _bare(frame)
+    image, bare = image_tensor(frame).to(device), replace(frame, image=None, depth=None, moving=None)
     informative = shows_something(reduced(image))
     inputs = {}
     for row in rows:

@@ -238,7 +238,9 @@ def _report(job: EvalJob, outcome: EvalOutcome, options: EvalOptions) -> int:
         _measure(job, options.threads)
     if outcome.finished and not options.output.no_report:
         try:
-            print(written(job.out, write_report(job.out)))
+            with Bars() as bars:
+                report = write_report(job.out, progress=bars.show)
+            print(written(job.out, report))
         except (ImportError, ResultsError) as error:
             print(f"no report: {' '.join(str(error).split())}")
     for label, reason in outcome.failed.items():

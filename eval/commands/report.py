@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from ufmstar_torch.eval.commands.options import Flag, Positional, arg, reader
-from ufmstar_torch.eval.commands.terminal import usage_errors
+from ufmstar_torch.eval.commands.terminal import Bars, usage_errors
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,8 +36,8 @@ def main(options: ReportOptions) -> int:
     from ufmstar_torch.eval.report.text import summary, written
     from ufmstar_torch.eval.report.write import write_report
 
-    with usage_errors(ResultsError):
+    with usage_errors(ResultsError), Bars() as bars:
         print(summary(load_results(options.out, with_sums=False)))
-        report = write_report(options.out, figures=not options.no_figures)
+        report = write_report(options.out, figures=not options.no_figures, progress=bars.show)
     print(written(options.out, report))
     return 0

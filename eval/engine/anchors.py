@@ -40,19 +40,33 @@ SENSOR = "sensor"
 _TIME_OF_FLIGHT = ("stray", "arkitscenes", "transforms", "kitti360")
 
 
-class Tracks:
-    """Landmarks shared by rows with the same images and poses; each image is processed once. ``source`` is in its
-    initial state; None = a tracker of corners."""
+class AnchorSource:
+    """The anchors of rows with the same images and poses, from ``landmarks`` in their initial state; each image is
+    processed once. None = ground truth at random pixels. With a ``sensor``, a kind of ``SENSORS``, they are the
+    frame's depth, completed by that of earlier frames and the landmarks; that depth is then no ground truth.
 
-    def __init__(self, source: LandmarkSource | None = None) -> None:
-        self._streams = StreamLandmarks(landmark_source(CORNERS) if source is None else source)
+    Noise on tracked positions is applied to the anchors: it moves an anchor in the image, and gives its depth the
+    first-order error of that noise in every view (``track_noise`` times the tracker's standard deviation per
+    ``pixel_noise``). The variance stays the tracker's. Noise is independent between frames.
+    """
+
+    def __init__(self, landmarks: LandmarkSource | None, sensor: str | None = None) -> None:
+        self.sensor, self._memory = sensor, SensorMemory()
+        self._streams = None if landmarks is None else StreamLandmarks(landmarks)
         self._last: tuple[Frame, Landmarks, float] | None = None
 
-    def of(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> tuple[Landmarks, float] | None:
-        """Landmarks of the next frame at the noisy pose [4, 4] [m], and the time to compute them [ms]; None if the
-        source needs an image and the frame has none. Errors as ``StreamLandmarks.update``."""
+    @property
+    def bytes(self) -> int:
+        """Size of the state."""
+        streams = {} if self._streams is None else self._streams.state()
+        return self._memory.bytes + sum(value.nbytes for value in streams.values())
+
+    def tracked(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> tuple[Landmarks, float] | None:
+        """Landmarks of the next frame at the noisy pose [4, 4] [m], and the time to compute them [ms]; None if they
+        need an image and the frame has none. Errors as ``StreamLandmarks.update``."""
         if self._last is not None and self._last[0] is frame:
             return self._last[1:]
+        assert self._streams is not None
         if frame.image is None and self._streams.needs_image:
             return None
         image = None if frame.image is None else image_tensor(frame)
@@ -62,36 +76,13 @@ class Tracks:
         self._last = frame, self._streams.last[0], 1000 * (perf_counter() - started)
         return self._last[1:]
 
-    @property
-    def bytes(self) -> int:
-        """Size of the state."""
-        return sum(value.nbytes for value in self._streams.state().values())
-
-
-class AnchorSource:
-    """The anchors of a row, from ``tracks``; None = ground truth at random pixels. With a ``sensor``, a kind of
-    ``SENSORS``, they are the depth of the frame, completed by that of earlier frames and the tracks; that depth is then
-    no ground truth.
-
-    Noise on tracked positions is applied to the anchors: it moves an anchor in the image, and gives its depth the
-    first-order error of that noise in every view (``track_noise`` times the tracker's standard deviation per
-    ``pixel_noise``). The variance stays the tracker's. Noise is independent between frames.
-    """
-
-    def __init__(self, setting: Setting, tracks: Tracks | None, sensor: str | None = None) -> None:
-        self._setting, self.tracks, self.sensor, self._memory = setting, tracks, sensor, SensorMemory()
-
-    @property
-    def bytes(self) -> int:
-        """Size of the state."""
-        return self._memory.bytes + (0 if self.tracks is None else self.tracks.bytes)
-
     def of(
         self,
         frame: Frame,
         T_world_cam: NDArray[np.float64],
         prediction: DepthPrediction,
         truth: NDArray[np.float32] | None,
+        setting: Setting,
     ) -> tuple[Landmarks, Anchors | None, float | None]:
         """The anchors of the next frame.
 
@@ -100,6 +91,7 @@ class AnchorSource:
             T_world_cam: [4, 4] the row's pose, with noise [m].
             prediction: defines the camera of the anchors' pixels.
             truth: [h, w] ground truth at the prediction's pixels [m], 0 = none, or None.
+            setting: the row's, with the number of anchors and the noise on tracks.
 
         Returns:
             landmarks in the pixels of the image (for ground truth: of the depth map); the same as anchors [1, N] in the
@@ -109,21 +101,21 @@ class AnchorSource:
             FrameError: the sensor's depth map has no camera.
         """
         device, K = prediction.depth.device, prediction.K[0]
-        if self.tracks is None:
+        if self._streams is None:
             depth = np.zeros(prediction.size, np.float32) if truth is None else truth
-            drawn = self._sampled(depth, frame.index)
+            drawn = _sampled(depth, setting, frame.index)
             values = (torch.from_numpy(part)[None] for part in (drawn.pixel, drawn.depth, drawn.variance))
             return drawn, Anchors(*values).to(device), None
         if self.sensor is not None:
-            return self._completed(frame, T_world_cam, prediction, self.tracks)
-        tracked = self.tracks.of(frame, T_world_cam)
+            return self._completed(frame, T_world_cam, prediction)
+        tracked = self.tracked(frame, T_world_cam)
         if tracked is None:
             return _NO_IMAGE, None, None
-        landmarks = self._thinned(self._disturbed(tracked[0], frame.index), frame.index)
+        landmarks = _thinned(_disturbed(tracked[0], setting, frame.index), setting, frame.index)
         return landmarks, landmarks.anchors(frame.intrinsics, K).to(device), tracked[1]
 
     def _completed(
-        self, frame: Frame, T_world_cam: NDArray[np.float64], prediction: DepthPrediction, tracks: Tracks
+        self, frame: Frame, T_world_cam: NDArray[np.float64], prediction: DepthPrediction
     ) -> tuple[Landmarks, Anchors, float]:
         """As :meth:`of`, from the frame's depth where it has one, and from earlier frames' and the tracks elsewhere."""
         assert self.sensor is not None
@@ -135,38 +127,38 @@ class AnchorSource:
                 size = frame.image.shape[0], frame.image.shape[1]
                 depth = resample_nearest(frame.depth, K_depth, frame.intrinsics, size)
                 landmarks = self._memory.extended(landmarks, depth, T_world_cam, frame.intrinsics)
-        tracked = tracks.of(frame, T_world_cam)
+        tracked = self.tracked(frame, T_world_cam)
         if tracked is not None:
             landmarks = tracked[0] if depth is None else completed(landmarks, tracked[0], depth, self.sensor)
         anchors = landmarks.anchors(frame.intrinsics, prediction.K[0]).to(prediction.depth.device)
         return landmarks, anchors, 1000 * (perf_counter() - started)
 
-    def _sampled(self, truth: NDArray[np.float32], index: int) -> Landmarks:
-        v, u = np.nonzero(truth > 0)
-        depth, pixel = truth[v, u].astype(np.float64), np.stack([u, v], axis=-1).astype(np.float64)
-        landmarks = Landmarks(pixel, depth, np.square(TRUTH_SIGMA * depth), tracked=0, none="no ground truth")
-        return self._thinned(landmarks, index, TRUTH_COUNT)
 
-    def _disturbed(self, landmarks: Landmarks, index: int) -> Landmarks:
-        size = self._setting.track_noise
-        if not size:
-            return landmarks
-        noise = size * self._drawn(index, _NOISE).standard_normal((len(landmarks.depth), 3))
-        depth_per_pixel = np.sqrt(landmarks.variance) / TrackerConfig.pixel_noise
-        return replace(
-            landmarks, pixel=landmarks.pixel + noise[:, :2], depth=landmarks.depth + depth_per_pixel * noise[:, 2]
-        )
+def _sampled(truth: NDArray[np.float32], setting: Setting, index: int) -> Landmarks:
+    v, u = np.nonzero(truth > 0)
+    depth, pixel = truth[v, u].astype(np.float64), np.stack([u, v], axis=-1).astype(np.float64)
+    landmarks = Landmarks(pixel, depth, np.square(TRUTH_SIGMA * depth), tracked=0, none="no ground truth")
+    return _thinned(landmarks, setting, index, TRUTH_COUNT)
 
-    def _thinned(self, landmarks: Landmarks, index: int, most: int | None = None) -> Landmarks:
-        count = most if self._setting.anchor_count is None else self._setting.anchor_count
-        if count is None or len(landmarks.depth) <= count:
-            return landmarks
-        chosen = self._drawn(index, _CHOICE).permutation(len(landmarks.depth))[:count]
-        parts = {name: getattr(landmarks, name)[chosen] for name in ("pixel", "depth", "variance")}
-        return replace(landmarks, **parts)
 
-    def _drawn(self, index: int, purpose: int) -> np.random.Generator:
-        return np.random.default_rng([self._setting.seed, index, purpose])
+def _disturbed(landmarks: Landmarks, setting: Setting, index: int) -> Landmarks:
+    if not setting.track_noise:
+        return landmarks
+    noise = setting.track_noise * _drawn(setting, index, _NOISE).standard_normal((len(landmarks.depth), 3))
+    depth = landmarks.depth + np.sqrt(landmarks.variance) / TrackerConfig.pixel_noise * noise[:, 2]
+    return replace(landmarks, pixel=landmarks.pixel + noise[:, :2], depth=depth)
+
+
+def _thinned(landmarks: Landmarks, setting: Setting, index: int, most: int | None = None) -> Landmarks:
+    count = most if setting.anchor_count is None else setting.anchor_count
+    if count is None or len(landmarks.depth) <= count:
+        return landmarks
+    chosen = _drawn(setting, index, _CHOICE).permutation(len(landmarks.depth))[:count]
+    return replace(landmarks, **{name: getattr(landmarks, name)[chosen] for name in ("pixel", "depth", "variance")})
+
+
+def _drawn(setting: Setting, index: int, purpose: int) -> np.random.Generator:
+    return np.random.default_rng([setting.seed, index, purpose])
 
 
 def sensor_of(value: str | None, sequence: FrameSequence) -> str | None:
@@ -209,15 +201,13 @@ def landmark_digests(rows: Iterable[Row], folder: Path | None, scale: float = 1.
 def anchor_sources(rows: Iterable[Row], folder: Path | None = None, scale: float = 1.0) -> dict[Row, AnchorSource]:
     """The source of every row with anchors. Rows with the same images and poses share a tracker. Errors as
     :func:`landmarks_of`."""
-    tracks: dict[tuple[object, ...], Tracks] = {}
-    sources = {}
-    for row in rows:
+    sources: dict[Row, AnchorSource] = {}
+    shared: dict[tuple[object, ...], AnchorSource] = {}
+    for row in (row for row in rows if row.setting.anchors):
         setting = row.setting
-        if setting.anchors == TRUTH:
-            sources[row] = AnchorSource(setting, None)
-        elif setting.anchors:
-            key = (setting.anchors, setting.skip, setting.pose_noise)
-            if key not in tracks:
-                tracks[key] = Tracks(landmarks_of(setting.anchors, folder, scale))
-            sources[row] = AnchorSource(setting, tracks[key])
+        key = (setting.anchors, setting.skip, setting.pose_noise)
+        if key not in shared:
+            truth = setting.anchors == TRUTH
+            shared[key] = AnchorSource(None if truth else landmarks_of(setting.anchors, folder, scale))
+        sources[row] = shared[key]
     return sources

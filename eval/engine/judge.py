@@ -11,7 +11,6 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from statistics import median
-from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -30,9 +29,7 @@ UFM, ALONE, POSTERIOR = "ufm", "network_alone", "posterior"
 # Names under which a row stores its sums, in addition to those of METRICS.
 BY_ERROR, CONFIDENCE = "nll_by_error", "confidence"
 EACH = 512  # evenly spaced pixels of a frame for ``ufmstar recalibrate --covariate confidence``
-# The user's metrics by name (``sequences.plugins``).
-PluginMetrics = Mapping[str, Any]
-NO_PLUGINS: PluginMetrics = MappingProxyType({})
+PluginMetrics = Mapping[str, Any]  # the user's metrics by name (``sequences.plugins``)
 
 
 class SequenceError(Exception):
@@ -54,7 +51,7 @@ def add_to(
         metrics[name].update(*maps, torch.from_numpy(row.truth), mask, mixture, level)
 
 
-def judge_run(metrics: dict[str, SequenceMetrics], row: RowResult, plugins: PluginMetrics = NO_PLUGINS) -> None:
+def judge_run(metrics: dict[str, SequenceMetrics], row: RowResult, plugins: PluginMetrics) -> None:
     """Add a frame of a run to the metrics of its row, ``UFM``, of its network ``ALONE``, and of its ``POSTERIOR``, on
     the row's valid pixels, and as "ufm.moving", "ufm.still", ... on its ``RowResult.parts``, without curves of gates. A
     frame without ground truth is ignored."""
@@ -76,12 +73,7 @@ class RowJudge:
     of the rows on whose confident pixels the NLL by error is computed."""
 
     def __init__(
-        self,
-        row: Row,
-        runner: RowRunner,
-        reference_names: Mapping[str, str],
-        bins: str,
-        plugins: PluginMetrics = NO_PLUGINS,
+        self, row: Row, runner: RowRunner, reference_names: Mapping[str, str], bins: str, plugins: PluginMetrics
     ) -> None:
         self.row, self._runner, self._multiview = row, runner, row.method.fusion == method.UFM_STAR
         self._references, self._bins, self._plugins = reference_names, bins, plugins

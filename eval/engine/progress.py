@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 
@@ -18,7 +17,7 @@ from ufmstar_torch.config import UfMStarConfig
 class Progress:
     """The progress of a command."""
 
-    stage: str  # "kernels" (compiled on a machine's first run), "rooms", "frames" or "pictures"
+    stage: str  # "kernels" (compiled on a machine's first run), "rooms", "frames", "pictures" or "figures"
     done: int  # number of finished steps of this stage, skipped frames included
     total: int  # number of steps of this stage
     components: int | None = None  # of the first row with components; None before the first frame
@@ -31,12 +30,12 @@ def warm_up_command(
     """Compile UfM* and the sources of ``anchors`` that are named in it ("corners", "dense"), or load them from disk."""
     from ufmstar_torch.anchors.dense import DenseEvidence
     from ufmstar_torch.anchors.tracker import LandmarkTracker
-    from ufmstar_torch.runtime.warm_up import along_wall, warm_up
+    from ufmstar_torch.runtime.warm_up import warm_up
     from ufmstar_torch.ufmstar import UfMStar
 
     searching = {CORNERS: LandmarkTracker, DENSE: DenseEvidence}
-    also = [partial(along_wall, kind()) for name, kind in searching.items() if name in anchors]
-    warm_up(UfMStar(config), (32, 32), 1, lambda done, total: show(Progress("kernels", done, total)), also)
+    sources = [kind for name, kind in searching.items() if name in anchors]
+    warm_up(UfMStar(config), (32, 32), 1, lambda done, total: show(Progress("kernels", done, total)), sources)
 
 
 @contextmanager

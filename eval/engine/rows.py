@@ -158,7 +158,7 @@ class RowRunner:
         if self._drift is not None:
             T = perturbed(self._drift.of(T, frame.index), self.setting, frame.index)
         landmarks, anchors, tracking_ms = (
-            (None, None, None) if self.anchors is None else self.anchors.of(frame, T, prediction, truth)
+            (None, None, None) if self.anchors is None else self.anchors.of(frame, T, prediction, truth, self.setting)
         )
         member = self.source.turn(self.images) if self.source.networks and not self.every else None
         ms = {"network": prediction.ms, "anchors": tracking_ms}

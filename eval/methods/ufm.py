@@ -86,8 +86,8 @@ class UfM:
             ValueError: wrong shape, another number of streams than before, a pose that is not rigid, or bad intrinsics.
         """
         frame = check_frame(
-            depth, pose, intrinsics, aleatoric, epistemic, valid, None,
-            feature_count=0, rotation_tolerance=UfMStarConfig.rotation_tolerance,
+            depth, pose, intrinsics, aleatoric, epistemic, valid,
+            rotation_tolerance=UfMStarConfig.rotation_tolerance,
         )  # fmt: skip
         if self.clouds and len(frame.depth) != len(self.clouds):
             raise ValueError(f"depth must be of {len(self.clouds)} streams as before, got {tuple(depth.shape)}")

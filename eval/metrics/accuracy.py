@@ -25,7 +25,8 @@ class DepthAccuracy(SumMetric):
     )
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        d, _, g = chosen = pixels.depths
+        chosen = pixels.depths
+        d, g = chosen.map("depth"), chosen.map("target")
         most = 1 + TOLERANCE
         return {
             "hits": chosen.number(chosen.within),

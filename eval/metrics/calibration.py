@@ -44,7 +44,7 @@ class ECEDelta(SumMetric):
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
         chosen = pixels.judged
         delta, bins = self.settings["delta"], self.settings["bins"]
-        tolerance = delta * chosen.map(0).abs()
+        tolerance = delta * chosen.map("depth").abs()
         # Bin b is [b/B, (b+1)/B); a confidence of exactly 1, as of v = 0, belongs to the last.
         confidence = torch.erf(tolerance / (math.sqrt(2.0) * chosen.sigma)).nan_to_num(1.0)
         b = (confidence * bins).long().clamp_max(bins - 1)
@@ -96,8 +96,9 @@ class ECEQuantile(SumMetric):
         chosen = pixels.judged
         d, _, g = chosen
         z = ((g - d) / chosen.sigma).nan_to_num(-torch.inf, torch.inf, -torch.inf)
-        first = chosen.histogram(torch.searchsorted(self.quantiles, z), len(self.levels) + 1)
-        return {"at_or_below": first.cumsum(0)[:-1], "pixels": chosen.number()}
+        # For ten levels ``searchsorted`` takes twice as long.
+        at_or_below = torch.stack([chosen.number(z <= quantile) for quantile in self.quantiles])
+        return {"at_or_below": at_or_below, "pixels": chosen.number()}
 
     def compute(self) -> dict[str, Tensor]:
         observed = share(self.at_or_below, self.pixels)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, SumMetric, share
+from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, Selection, SumMetric, share
 from ufmstar_torch.runtime.kinds import check_kinds
 
 LEVELS = (0.5, 0.9, 0.99)
@@ -36,8 +36,8 @@ class IntervalCoverage(SumMetric):
     STATES = (("levels", COUNT, _PERCENT),)
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        chosen = pixels.select(pixels.with_truth & pixels.level.isfinite())
-        kind = (chosen.map(5) * _PERCENT - 1e-9).ceil().long() - 1
+        chosen = Selection(pixels, pixels.with_truth & pixels.level.isfinite())
+        kind = (chosen.map("level") * _PERCENT - 1e-9).ceil().long() - 1
         return {"levels": chosen.histogram(kind.clamp(0, _PERCENT - 1), _PERCENT)}
 
     def compute(self) -> dict[str, Tensor]:
@@ -73,7 +73,7 @@ class Coverage(SumMetric):
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
         chosen = pixels.judged
-        covered = chosen.number(chosen.squared <= self.half_width**2 * chosen.map(1))
+        covered = chosen.number(chosen.squared <= self.half_width**2 * chosen.map("variance"))
         width = chosen.total(2 * self.half_width * chosen.sigma)
         return {"covered": covered, "width": width, "pixels": chosen.number()}
 
@@ -100,8 +100,8 @@ class GatedPixels(SumMetric):
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
         chosen, gates = pixels.judged, len(_GATES) + 1
-        level = chosen.map(5)
-        gate = _class_of(chosen.sigma / chosen.map(0), self.gates)  # d = 0 is beyond every gate
+        level = chosen.map("level")
+        gate = _class_of(chosen.sigma / chosen.map("depth"), self.gates)  # d = 0 is beyond every gate
         joint = gate * (len(_ERRORS) + 1) + _class_of(chosen.relative, self.error_edges)
         sums = {
             "errors": chosen.histogram(joint, gates * (len(_ERRORS) + 1)).reshape(gates, -1),

@@ -14,7 +14,7 @@ from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, Selection, SumMe
 
 def gaussian_nll(pixels: Selection) -> Tensor:
     """(g - d)^2 / (2 v) + 0.5 ln(2 pi v), v > 0 [nats]."""
-    return (pixels.squared / pixels.map(1) + pixels.log_variance + math.log(2 * math.pi)) / 2
+    return (pixels.squared / pixels.map("variance") + pixels.map("log_variance") + math.log(2 * math.pi)) / 2
 
 
 class NLL(SumMetric):
@@ -50,9 +50,9 @@ class EntropyHistogram(SumMetric):
     STATES = (("counts", COUNT, 66), ("total", SUM), ("pixels", COUNT))
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        every = pixels.select(pixels.predicted)
-        positive = every.map(1) > 0
-        entropy = 0.5 * (math.log(2 * math.pi) + 1.0 + every.log_variance)
+        every = Selection(pixels, pixels.predicted)
+        positive = every.map("variance") > 0
+        entropy = 0.5 * (math.log(2 * math.pi) + 1.0 + every.map("log_variance"))
         counts = every.histogram((entropy * 4 + 33).clamp(0, 65).long(), 66)  # edges .25 apart
         return {"counts": counts, "total": every.total(entropy.where(positive, 0.0)), "pixels": every.number(positive)}
 

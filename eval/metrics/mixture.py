@@ -38,10 +38,10 @@ class Mixture(SumMetric):
     CONSTANTS = MappingProxyType({"levels": quantile_levels(_BINS)})
 
     def sums(self, pixels: Pixels) -> Mapping[str, Tensor]:
-        v1, p = pixels.judged.map(3), pixels.judged.map(4)
+        v1, p = (pixels.judged.map(name) for name in ("inlier", "outlier"))
         chosen = pixels.judged.where((v1 > 0) & (v1 < torch.inf) & (p >= 0) & (p <= 1))
         d, v, g = chosen
-        v1, p = chosen.map(3), chosen.map(4)
+        v1, p = chosen.map("inlier"), chosen.map("outlier")
         v2 = torch.maximum((v - (1 - p) * v1) / p.clamp_min(1e-12), v1)
         error, tolerance, squared = g - d, TOLERANCE * d.abs(), chosen.squared
         inner, outer = ((2 * part).sqrt() for part in (v1, v2))

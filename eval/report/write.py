@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ufmstar_torch.eval.engine.files import remove_temporaries
+from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.report import efficiency, figures_calibration, figures_error, figures_sweep
 from ufmstar_torch.eval.report.data import Results, load_results
 from ufmstar_torch.eval.report.page import write_page
@@ -28,11 +29,11 @@ class Report(NamedTuple):
     undrawn: Mapping[str, str]
 
 
-def write_report(out: Path, *, figures: bool = True) -> Report:
+def write_report(out: Path, *, figures: bool = True, progress: Callable[[Progress], object] = lambda _: None) -> Report:
     """Write the report of an evaluation, finished or not, into its folder.
 
     ``figures=False`` writes tables and results alone, without a page, and needs no matplotlib. The page names figures
-    that cannot be drawn.
+    that cannot be drawn. ``progress`` is called before the first figure and after each.
 
     Raises:
         ResultsError: the folder is no evaluation, or its records are inconsistent.
@@ -48,7 +49,7 @@ def write_report(out: Path, *, figures: bool = True) -> Report:
     tables = all_tables(results)
     files, undrawn = [write_tidy(results), *write_tables(out / "tables", tables)], dict[str, str]()
     if figures:
-        drawn, pictures = _draw(results, undrawn)
+        drawn, pictures = _draw(results, undrawn, progress)
         page = write_page(results, tables, drawn, pictures, undrawn)
         files += [*drawn, *(out / "figures" / picture.file for picture in pictures), page]
     return Report(files, undrawn)
@@ -70,13 +71,17 @@ def figures_of(results: Results) -> Iterator[tuple[str, Callable[[], Any]]]:
     yield "latency stages", partial(efficiency.draw_stages, results)
 
 
-def _draw(results: Results, undrawn: dict[str, str]) -> tuple[list[Path], list[Picture]]:
+def _draw(
+    results: Results, undrawn: dict[str, str], progress: Callable[[Progress], object]
+) -> tuple[list[Path], list[Picture]]:
     """Draw figures and pictures into ``figures/``; add the reasons for failures to ``undrawn``."""
     folder = results.out / "figures"
     folder.mkdir(exist_ok=True)
     figures: list[Path] = []
     pictures: list[Picture] = []
-    for name, draw in [*figures_of(results), *pictures_of(results, folder)]:
+    named = [*figures_of(results), *pictures_of(results, folder)]
+    progress(Progress("figures", 0, len(named)))
+    for number, (name, draw) in enumerate(named, 1):
         try:
             drawn = draw()
             if isinstance(drawn, Picture):
@@ -87,4 +92,5 @@ def _draw(results: Results, undrawn: dict[str, str]) -> tuple[list[Path], list[P
                 figures.append(path)
         except _DRAWING_ERRORS as error:
             undrawn[name] = " ".join(str(error).split()) or type(error).__name__
+        progress(Progress("figures", number, len(named)))
     return figures, pictures

@@ -16,12 +16,12 @@ from ufmstar_torch.anchors.pose_fit import FollowedCorners, ImageFit
 from ufmstar_torch.anchors.sources import landmark_source
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.check.image_fit import image_fit, track_corners
-from ufmstar_torch.eval.engine.anchors import AnchorSource, Tracks
+from ufmstar_torch.eval.engine.anchors import AnchorSource
 from ufmstar_torch.eval.engine.estimators import Gaussians
 from ufmstar_torch.eval.engine.judge import UFM
 from ufmstar_torch.eval.engine.predictions import DepthSource, content_digest
 from ufmstar_torch.eval.engine.rows import RowRunner
-from ufmstar_torch.eval.methods.setting import CORNERS, Setting
+from ufmstar_torch.eval.methods.setting import CORNERS
 from ufmstar_torch.eval.run.scale import NetworkScale
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.posterior.recalibrate import Recalibration
@@ -61,7 +61,7 @@ class RunJob:
         estimator = Gaussians(self.config, torch.device("cpu"), recalibration=self.recalibration)
         anchors = None
         if self.config.anchors is not None:
-            anchors = AnchorSource(Setting(anchors=CORNERS), Tracks(landmark_source(self.landmarks)), self.sensor)
+            anchors = AnchorSource(landmark_source(self.landmarks), self.sensor)
         row = RowRunner(UFM, self.source, estimator, every=self.every, anchors=anchors)
         return row, estimator.ufm
 

@@ -39,6 +39,7 @@ def write_summary(folder: RunFolder, mixture: GaussianMixture, state: str, reaso
     job, records = folder.job, folder.records
     done = [record for record in records if record["state"] == "done"]
     figures = {name: metrics.compute() for name, metrics in folder.metrics.items()}
+    parts = {name: values for name, values in figures.items() if "." in name}  # what moves, what stands still
     result = UFM if job.config.posterior is None else POSTERIOR
     no_truth = "no ground truth" if job.sensor is None else "the recording's depth serves as anchors"
     alone_reason = "the depth comes without a variance of its own"
@@ -60,7 +61,7 @@ def write_summary(folder: RunFolder, mixture: GaussianMixture, state: str, reaso
         "network_alone": figures.get(ALONE),
         "network_alone_reason": None if ALONE in figures else alone_reason,
         **_posterior(done, figures.get(UFM)),
-        **_parts(figures),
+        **({"parts": parts} if parts else {}),
         "uncertainty": _uncertainty(done),
         "recalibrated": job.recalibration is not None,
         "anchors": _anchors(done),
@@ -105,26 +106,17 @@ def _part_of_image(folder: RunFolder, done: Records) -> str:
     if not isinstance(source, MapSource) or source.is_truth or not done:
         return ""
     for record in (done[i] for i in np.unique(np.linspace(0, len(done) - 1, _MAPS).astype(int))):
-        frame, stored = job.sequence[record["index"]], _stored(folder, record)
+        frame, stored = job.sequence[record["index"]], read_frame(frame_file(folder.path, record["name"]))
         if frame.image is not None:
-            depth, K_map = np.where(stored["valid"], _of_network(stored), 0.0), pinhole(*record["intrinsics"])
+            of_network = stored.get("network_depth", stored["depth"])
+            depth, K_map = np.where(stored["valid"], of_network, 0.0), pinhole(*record["intrinsics"])
             shown.append((image_at_map(frame.image, frame.intrinsics, K_map, depth.shape), depth))
     return part_of_image(shown) if shown else ""
 
 
-def _stored(folder: RunFolder, record: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """The arrays of a finished frame."""
-    return read_frame(frame_file(folder.path, record["name"]))
-
-
-def _of_network(stored: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The depth that the posterior corrects, or the depth of a plain run."""
-    return stored["network_depth"] if "network_depth" in stored else stored["depth"]
-
-
 def _travelled(folder: RunFolder, done: Records) -> float:
     """Length of the camera's path over the mean depth of the last frame; 0 without a depth."""
-    entries, stored = folder.job.sequence.entries, _stored(folder, done[-1])
+    entries, stored = folder.job.sequence.entries, read_frame(frame_file(folder.path, done[-1]["name"]))
     path = np.stack([entries[record["index"]].T_world_cam[:3, 3] for record in done])
     depth = stored["depth"][stored["valid"]]
     return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum() / depth.mean()) if depth.size else 0.0
@@ -154,12 +146,6 @@ def _posterior(done: Records, figures: Mapping[str, float] | None) -> dict[str, 
         return {}
     before = {"metrics": figures, "mean_sigma": _pixel_mean(done, "mean_ufm_sigma")}
     return {"posterior": done[-1]["posterior"], "ufm": before}
-
-
-def _parts(figures: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
-    """The metrics on what moves and on what stands still, by the names of ``judge_run``; {} without masks."""
-    parts = {name: values for name, values in figures.items() if "." in name}
-    return {"parts": parts} if parts else {}
 
 
 def _sequence(sequence: FrameSequence) -> dict[str, Any]:

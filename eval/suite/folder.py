@@ -4,7 +4,7 @@
 OUT/eval.json                          suite, rows, networks, sequences, settings
 OUT/eval.lock                          locked during an evaluation
 OUT/eval.stop                          exists while tasks in other processes must end
-OUT/records/DATASET/SEQUENCE/ROW.json  a record, written after ROW.pt: if it exists, both are complete
+OUT/records/DATASET/SEQUENCE/ROW.json  a record, written after ROW.npz: if it exists, both are complete
 OUT/records/DATASET/SEQUENCE/failed.json
 ```
 """
@@ -12,29 +12,22 @@ OUT/records/DATASET/SEQUENCE/failed.json
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.engine.files import remove_temporaries, write_json_atomic
-from ufmstar_torch.eval.engine.record import FORMAT, Record, ResultsError
+from ufmstar_torch.eval.engine.record import FORMAT, SUMS, Record, ResultsError
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
+from ufmstar_torch.eval.run.folder import FolderError, FolderKind
 from ufmstar_torch.eval.suite.work_items import WorkItem
 from ufmstar_torch.files.limits import read_json
 
 FAILED, CACHE, STOP = "failed.json", "cache", "eval.stop"
 # Files of a report; --overwrite removes them.
 _REPORT = ("efficiency.json", "results.csv", "report.html", "tables/*.tex", "figures/*.png", "figures/*.svg")
-_OF_SEQUENCE = ("*.json", "*.pt", "examples/*.npz")
-
-
-def evaluation_folder(out: Path, about: Mapping[str, Any], *, overwrite: bool = False) -> AbstractContextManager[None]:
-    """Create the folder, or continue the evaluation in it, and lock it; see ``output_folder``. Rows, sequences and
-    networks of ``about`` (eval.json) are added to the earlier evaluation; suite, settings and the networks of the same
-    base must be equal. The cache of predictions is never removed."""
-    return output_folder(out, EVALUATION, about, overwrite=overwrite)
+_OF_SEQUENCE = ("*.json", f"*{SUMS}", "examples/*.npz")
 
 
 @dataclass(frozen=True)
@@ -68,7 +61,7 @@ class EvalFolder:
         """The finished rows of a sequence, by slug."""
         records = {}
         for path in sorted(self.sequence_folder(item).glob("*.json")):
-            if path.name != FAILED and path.with_suffix(".pt").is_file():
+            if path.name != FAILED and path.with_suffix(SUMS).is_file():
                 with suppress(ResultsError):
                     records[path.stem] = Record.load(path)
         return records
@@ -140,6 +133,8 @@ def _merged(earlier: Mapping[str, Any], current: Mapping[str, Any]) -> dict[str,
     }
 
 
+# Rows, sequences and networks are added to the earlier evaluation; suite, settings and the networks of the same base
+# must be equal. The cache of predictions is never removed.
 EVALUATION = FolderKind(
     program="ufmstar eval",
     noun="evaluation",

@@ -26,9 +26,10 @@ import torch
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.engine.stream import Stopped
+from ufmstar_torch.eval.run.folder import output_folder
 from ufmstar_torch.eval.run.machine import available_cores, device_of
 from ufmstar_torch.eval.suite.evaluate import evaluate_item
-from ufmstar_torch.eval.suite.folder import STOP, evaluation_folder
+from ufmstar_torch.eval.suite.folder import EVALUATION, STOP
 from ufmstar_torch.eval.suite.job import EvalJob
 from ufmstar_torch.eval.suite.work_items import WorkItem
 from ufmstar_torch.runtime.optional import optional
@@ -68,7 +69,7 @@ def evaluate_suite(
             processes need this package, and all files and the working folder under the paths that they have here.
             Each evaluates one sequence at a time, whatever its number of threads.
         threads: CPU threads of each process of the executor; None = its own choice.
-        overwrite: see ``evaluation_folder``.
+        overwrite: see ``output_folder``.
         stop: called before every frame; True ends the work.
         report: receives a line for every finished sequence.
         progress: called after every frame, with the sequence's label as the stage; with an executor, after every
@@ -81,7 +82,7 @@ def evaluate_suite(
     """
     device = torch.device(device_of(job.device, 0) if executor is None else "cpu")
     networks, folder = job.load(device), job.folder
-    with evaluation_folder(job.out, job.about(networks), overwrite=overwrite), warned_once():
+    with output_folder(job.out, EVALUATION, job.about(networks), overwrite=overwrite), warned_once():
         if executor is None:
             finished = _one_by_one(job, networks, device, stop, report, progress)
         else:

@@ -5,31 +5,21 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias, cast
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ufmstar_torch.runtime.kinds import require
+
 Shapes = Sequence[tuple[int, ...]]
 _RESOLUTION, _TOO_FAR = 0.01, 1e10  # [m] coarsest accepted pose coordinates, and the value that replaces coarser ones
 Array: TypeAlias = Tensor | NDArray[Any]
 # An image may also be Pillow's, and intrinsics four numbers.
 ImageLike: TypeAlias = Any
-CameraLike: TypeAlias = "Tensor | NDArray[Any] | Sequence[float] | PinholeCamera"
-
-
-class PinholeCamera(Protocol):
-    """kornia's camera, accepted as the pose, the intrinsics or both."""
-
-    @property
-    def extrinsics(self) -> Tensor:
-        """[B, 4, 4] world-to-camera [m]."""
-
-    @property
-    def intrinsics(self) -> Tensor:
-        """[B, 4, 4] [px], first pixel's centre at (0, 0)."""
+CameraLike: TypeAlias = "Tensor | NDArray[Any] | Sequence[float]"
 
 
 def as_tensor(name: str, value: object) -> Tensor:
@@ -55,18 +45,6 @@ def _unmasked(name: str, value: np.ma.MaskedArray[Any, Any]) -> NDArray[Any]:
     if value.dtype.kind in "iu" and np.ma.is_masked(value):
         raise TypeError(f"{name} must not be masked, since {value.dtype} has no value that is not valid: pass floats")
     return np.asarray(value.filled(np.nan if value.dtype.kind == "f" else False))
-
-
-def require_kind(name: str, value: Any, kinds: type | tuple[type, ...], expected: str) -> Any:
-    """Return the argument ``name`` if it has one of the types. Raises TypeError; ``expected`` describes them."""
-    if not isinstance(value, kinds):
-        raise TypeError(f"{name} must be {expected}, got {type(value).__name__}")
-    return value
-
-
-def require_flag(name: str, value: object) -> bool:
-    """The argument ``name`` if it is True or False. Raises TypeError: another type."""
-    return bool(require_kind(name, value, (bool, np.bool_), "True or False"))
 
 
 def require_whole(name: str, value: object, least: int | None = None) -> int:
@@ -106,7 +84,7 @@ def as_device(name: str, value: Any) -> torch.device:
     """The argument ``name`` as a device, the CPU for None. Raises TypeError, ValueError: no device."""
     if value is None:
         return torch.device("cpu")
-    require_kind(name, value, (torch.device, str), "a torch.device, its name or None")
+    require(name, value, torch.device | str)
     try:
         return torch.device(value)
     except RuntimeError as error:
@@ -115,7 +93,7 @@ def as_device(name: str, value: Any) -> torch.device:
 
 def as_path(name: str, value: object) -> Path:
     """The argument ``name`` as a path. Raises TypeError: no text and no path."""
-    return Path(require_kind(name, value, (str, os.PathLike), "a file name or path"))
+    return Path(require(name, value, str | os.PathLike))
 
 
 def as_image(image: ImageLike) -> Tensor:
@@ -152,18 +130,12 @@ def as_pose(pose: CameraLike) -> Tensor:
     that :func:`ufmstar_torch.frames.frame.pose_fault` rejects them.
 
     Args:
-        pose: [B, 4, 4], [4, 4], or [..., 3, 4] without the last row; or a :class:`PinholeCamera`, whose world-to-camera
-            matrix is inverted.
+        pose: [B, 4, 4], [4, 4], or [..., 3, 4] without the last row.
 
     Raises:
         TypeError: another type.
         ValueError: another shape.
     """
-    if (camera := _camera(pose)) is not None:
-        T_cam_world = require_float("pose.extrinsics", camera.extrinsics)
-        if T_cam_world.dim() != 3 or T_cam_world.shape[1:] != (4, 4):
-            raise ValueError(f"pose.extrinsics must be [B, 4, 4] world-to-camera, got {tuple(T_cam_world.shape)}")
-        return torch.linalg.inv_ex(T_cam_world.double()).inverse  # of a singular matrix: infinite, so not rigid
     T = _numbers("pose", pose)
     if T.dtype != torch.float64 and T.shape[-1:] == (4,):
         coarse = T.abs() > _RESOLUTION / torch.finfo(T.dtype).eps
@@ -182,17 +154,13 @@ def as_intrinsics(intrinsics: CameraLike) -> Tensor:
     """Convert intrinsics to [B, 3, 3] or [3, 3] [px].
 
     Args:
-        intrinsics: [B, 3, 3], [3, 3], [..., 4, 4] with the fourth row and column of an identity, the four numbers fx,
-            fy, cx, cy [px], or a :class:`PinholeCamera`.
+        intrinsics: [B, 3, 3], [3, 3], [..., 4, 4] with the fourth row and column of an identity, or fx, fy, cx, cy.
 
     Raises:
         TypeError: another type.
         ValueError: another shape, or another fourth row or column.
     """
-    camera = _camera(intrinsics)
-    K = _numbers("intrinsics", intrinsics if camera is None else camera.intrinsics)
-    if camera is not None and K.shape[-2:] == (4, 4):
-        K = K[..., :3, :3]  # kornia ignores the fourth row and column, too
+    K = _numbers("intrinsics", intrinsics)
     if K.shape == (4,):
         (fx, fy, cx, cy), zero, one = K, K.new_zeros(()), K.new_ones(())
         return torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one]).view(3, 3)
@@ -208,16 +176,6 @@ def as_intrinsics(intrinsics: CameraLike) -> Tensor:
 def _of_intrinsics(values: Tensor) -> bool:
     """True if the shape fits intrinsics but no pose."""
     return values.shape == (4,) or values.shape[-2:] == (3, 3)
-
-
-def _camera(value: object) -> PinholeCamera | None:
-    """``value`` if it is kornia's camera, else None; does not import kornia."""
-    if isinstance(value, Tensor | np.ndarray):
-        return None
-    is_kornia = any(
-        cls.__name__ == "PinholeCamera" and cls.__module__.startswith("kornia.") for cls in type(value).__mro__
-    )
-    return cast("PinholeCamera", value) if is_kornia else None
 
 
 def _numbers(name: str, value: object) -> Tensor:

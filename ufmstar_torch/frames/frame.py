@@ -43,7 +43,7 @@ FRAME_FAULTS = (
 NOT_FINITE = 1  # index of a pose with NaN or infinity
 # Accepted ranges. Within them, no square or quotient of the algorithm leaves the range of float32.
 DEPTH_RANGE = (1e-6, 1e6)  # [m]
-LARGEST = 1e12  # A and E [m^2], and entries of features
+LARGEST = 1e12  # A and E [m^2]
 FOCAL_RANGE = (1e-2, 1e7)  # [px]
 FARTHEST = 1e9  # [m] any coordinate of a camera
 
@@ -57,9 +57,9 @@ class FrameInput:
         T_world_cam: [B, 4, 4] float64 camera-to-world, rotation projected onto SO(3); identity if faulty.
         intrinsics: [B, 3, 3] float64 [px]; the identity if faulty.
         aleatoric, epistemic: [B, H, W] [m^2] in the depth's dtype, or None.
-        features: [B, F, H, W] or None.
+        features: [B, 3, H, W] A, E and 1, which are averaged in H, or None.
         valid: [B, H, W] True where depth lies in ``DEPTH_RANGE`` and not beyond the largest depth, A and E in
-            [0, ``LARGEST``], features in +-``LARGEST``, the caller's mask agrees and the stream has no fault.
+            [0, ``LARGEST``], the caller's mask agrees and the stream has no fault.
         beyond: [B] number of pixels of the mask with a finite depth beyond the largest one.
         out_of_range: [B] number of other pixels of the mask with a finite positive depth that are not valid.
         valid_pixels: [B] number of valid pixels.
@@ -109,7 +109,6 @@ def check_values(
     intrinsics: Tensor,
     aleatoric: Tensor | None,
     epistemic: Tensor | None,
-    features: Tensor | None,
     mask: Tensor | None,
     *,
     rotation_tolerance: float,
@@ -122,7 +121,6 @@ def check_values(
         pose: [B, 4, 4], or [1, 4, 4] or [4, 4] for all streams, of any floating dtype, on any device.
         intrinsics: likewise [B, 3, 3] and so on [px].
         aleatoric, epistemic: [B, H, W] [m^2] or None.
-        features: [B, F, H, W] or None.
         mask: [B, H, W] bool, True = use, or None.
         rotation_tolerance, max_depth: as :func:`check_frame`.
     """
@@ -142,12 +140,10 @@ def check_values(
     for variance in (aleatoric, epistemic):
         if variance is not None:
             use = use & (variance.detach() >= 0) & (variance.detach() <= LARGEST)
-    if features is not None:
-        use = use & (features.abs() <= LARGEST).all(1)
     T_safe, K_safe = _harmless(_moved(pose, device), _moved(intrinsics, device), fine)
     safe_depth = torch.where(use, depth, torch.zeros_like(depth))
     return FrameInput(
-        safe_depth, T_safe, K_safe, aleatoric, epistemic, features, use, fault, _moved(deviation, device),
+        safe_depth, T_safe, K_safe, aleatoric, epistemic, None, use, fault, _moved(deviation, device),
         beyond.sum((1, 2)), (near & ~use).sum((1, 2)), use.sum((1, 2)), host_fault,
     )  # fmt: skip
 
@@ -162,9 +158,7 @@ def check_frame(
     aleatoric: Array | None,
     epistemic: Array | None,
     valid: Array | None,
-    features: Array | None,
     *,
-    feature_count: int,
     variances_in_h: bool = False,
     rotation_tolerance: float,
     max_depth: float = DEPTH_RANGE[1],
@@ -175,8 +169,7 @@ def check_frame(
     """Check and normalise one frame (shapes as in :meth:`ufmstar_torch.UfMStar.forward`).
 
     Args:
-        feature_count: F.
-        variances_in_h: append A, E (0 where the network predicts none) and 1 to the features.
+        variances_in_h: the frame has features: A, E (0 where the network predicts none) and 1.
         rotation_tolerance: largest deviation of a pose's rotation from an orthogonal matrix.
         max_depth: farther pixels are not valid [m].
         member: index of the network, for all streams or [B].
@@ -202,16 +195,14 @@ def check_frame(
 
     a = None if aleatoric is None else converted("aleatoric", aleatoric)
     e = None if epistemic is None else converted("epistemic", epistemic)
-    extra = _features(features, feature_count, plain) if feature_count or features is not None else None
-    if variances_in_h:
-        in_h = _variances(a, e, plain)
-        extra = in_h if extra is None else torch.cat([extra, in_h], 1)
     T, K = _of_depth("pose", as_pose(pose), plain), _of_depth("intrinsics", as_intrinsics(intrinsics), plain)
     mask = None
     if valid is not None:
         either = [*shapes, (shape[0], 1, *shape[-2:])]
         mask = _as(require_mask("valid", as_tensor("valid", valid), either, depth), size, torch.bool)
-    frame = kernel(plain, T, K, a, e, extra, mask, rotation_tolerance=rotation_tolerance, max_depth=max_depth)
+    frame = kernel(plain, T, K, a, e, mask, rotation_tolerance=rotation_tolerance, max_depth=max_depth)
+    if variances_in_h:
+        frame = replace(frame, features=_variances(a, e, plain))
     if informative is not None:
         informative = _of_streams("informative", informative, plain)
         if informative.is_cpu and bool(informative.all()):
@@ -247,17 +238,8 @@ def raise_faults(frame: FrameInput) -> None:
         raise ValueError("; ".join(f"stream {b}: {FRAME_FAULTS[code]}" for b, code in enumerate(faults) if code))
 
 
-def _features(features: Array | None, count: int, plain: Tensor) -> Tensor:
-    expected = (plain.shape[0], count, *plain.shape[1:])
-    if features is None:
-        raise ValueError(f"features must be given with shape {expected}: config.features is {count}")
-    return _as(
-        _constant(require_float("features", as_tensor("features", features), [expected], plain)), expected, plain.dtype
-    )
-
-
 def _variances(aleatoric: Tensor | None, epistemic: Tensor | None, plain: Tensor) -> Tensor:
-    """[B, 3, H, W] A, E and 1, which are averaged with the features; 0 for one that the network does not predict."""
+    """[B, 3, H, W] A, E and 1; 0 for one that the network does not predict."""
     if aleatoric is None and epistemic is None:
         raise ValueError("aleatoric or epistemic must be given with config.variances_in_h, which averages them")
     maps = (torch.zeros_like(plain) if value is None else _constant(value) for value in (aleatoric, epistemic))

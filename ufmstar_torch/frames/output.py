@@ -38,7 +38,7 @@ EVERY_FRAME: dict[str, str] = {
     "valid_pixels": "pixels used.",
     "beyond": "pixels not used because their depth is beyond ``config.segment.max_depth``.",
     "out_of_range": (
-        "other pixels with a finite positive depth that are not used, because depth, A, E or features lie outside the "
+        "other pixels with a finite positive depth that are not used, because depth, A or E lie outside the "
         "ranges of ``UfMStar.forward``."
     ),
     "unmeasured": (
@@ -135,7 +135,6 @@ MAPS: dict[str, MapKind] = {
     "posterior_outlier": MapKind("p", "1", "the probability of another surface than that of the anchors, or of motion"),
     "posterior_inlier_variance": MapKind("V_1", "m^2", "the variance otherwise, limited to a quantile of the image's"),
     "confidence": MapKind("c", "1", "the network's confidence, in its own unit"),
-    "features": MapKind("", "1", "the regressed further entries of H, [B, H, W, F], in the caller's units"),
 }
 
 
@@ -149,10 +148,9 @@ class UncertaintyOutput:
     Attributes:
         depth: the best that is known [m]: the posterior's, NaN where not valid, or else the network's. Before the first
             anchor of a stream, the posterior's equals the network's.
-        variance: of ``depth`` [m^2]: the posterior's, or else V of UfM*: M, plus A and E if passed (and not switched
-            off in the config), plus B with ``config.anchors``; at least ``config.variance_floor``. NaN where not valid.
-            The posterior's is that of a mixture: ``posterior_inlier_variance`` with the probability
-            1 - ``posterior_outlier``.
+        variance: of ``depth`` [m^2]: the posterior's, or else V of UfM*: M, plus A and E if passed, plus B with
+            ``config.anchors``; at least ``config.variance_floor``. NaN where not valid. The posterior's is that of a
+            mixture: ``posterior_inlier_variance`` with the probability 1 - ``posterior_outlier``.
         valid: True where the pixel was used.
         maps: the further maps by name.
         statistics: per-stream counts of this frame.

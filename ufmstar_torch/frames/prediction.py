@@ -10,9 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from inspect import signature
 from itertools import chain
-from pathlib import Path
 from typing import Any, Self
-from zlib import crc32
 
 import torch
 from torch import Tensor, nn
@@ -23,7 +21,6 @@ from ufmstar_torch.gaussians.camera import camera_of
 _OPTIONAL = ("aleatoric_variance", "epistemic_variance", "confidence")
 # Number of indices of random samples: exact in float32.
 SAMPLES = 2**20
-_PART = 2**16  # [bytes] of a file's beginning and end
 # image [B, 3, H, W], intrinsics [B, 3, 3] -> network image and the intrinsics of that image
 Preprocess = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
@@ -325,28 +322,6 @@ def shared_preprocess(networks: Sequence[nn.Module]) -> Preprocess:
             f"networks must have the same preprocess, got {attributes}: pass one to UncertainDepth(preprocess=...)"
         )
     return attributes[0] if attributes else in_unit_range
-
-
-def weights_mark(networks: nn.Module) -> int:
-    """A checksum that changes with the weights: of 16 entries of every dense tensor of the state, and of the first and
-    last 64 kB of files that networks run (their attribute ``path``)."""
-    mark = 0
-    for module in networks.modules():
-        path = getattr(module, "path", None)
-        if isinstance(path, str) and Path(path).is_file():
-            with Path(path).open("rb") as file:
-                mark = crc32(file.read(_PART), mark)
-                file.seek(max(Path(path).stat().st_size - _PART, 0))
-                mark = crc32(file.read(), mark)
-    for value in networks.state_dict().values():
-        # Quantised layers also hold other values, and offloaded layers hold tensors without entries.
-        dense = type(value) in (Tensor, nn.Parameter) and value.layout == torch.strided and not value.is_quantized
-        if dense and not value.is_meta and value.numel():
-            index = [n * (value.numel() - 1) // 15 for n in range(16)]
-            stored = value.detach() if value.element_size() > 1 else value.detach().view(torch.uint8)
-            entries = stored.take(torch.tensor(index, device=value.device))
-            mark = crc32(entries.cpu().view(torch.uint8).numpy().tobytes(), mark)
-    return mark
 
 
 def in_unit_range(image: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:

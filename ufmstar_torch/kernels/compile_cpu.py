@@ -315,6 +315,16 @@ def cached(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return decorated
 
 
+def on_disk(compiled: Any) -> bool:
+    """True if another process could not spare this one to compile a kernel: it is compiled or on disk, or no folder can
+    hold it."""
+    return (
+        bool(compiled.signatures)
+        or compiled.stats.cache_path is None
+        or bool(compiled._cache._cache_file._load_index())
+    )
+
+
 def _inner(**options: Any) -> Any:
     register = register_jitable(error_model="numpy", no_cfunc_wrapper=True, pipeline_class=_Part, **options)
 

@@ -137,7 +137,6 @@ def _require_fixed(ufm: UfMStar, device_type: str) -> None:
         "no anchors, overlap weights or merging": (
             config.anchors is not None or config.overlap_weighted or config.merges_on(device_type)
         ),
-        "disagreement='w2'": config.disagreement != "w2",
         "no features": bool(config.entries),
     }
     if missing := [text for text, bad in wrong.items() if bad]:

@@ -1,11 +1,16 @@
-"""Compile all kernels by running two synthetic frames."""
+"""Compile all kernels by running two synthetic frames, those of the search for anchors in a second process."""
 
 from __future__ import annotations
 
 import gc
+import os
+import subprocess
+import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,15 +18,21 @@ import torch
 
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.dense import DenseEvidence
+from ufmstar_torch.anchors.kernels.bundle import refine
 from ufmstar_torch.anchors.tracker import LandmarkTracker
-from ufmstar_torch.frames import arguments
-from ufmstar_torch.frames.arguments import require_whole
+from ufmstar_torch.frames.arguments import require_size, require_whole
 from ufmstar_torch.gaussians.camera import camera_of
+from ufmstar_torch.kernels.compile_cpu import on_disk
 
 _DISTANCE = 2.0  # [m]
 _WALL, _SQUARE = (96, 128), 4  # [px] images of a wall, and its squares, by one of which the camera moves
 _FRAMES = 8  # of the wall
 _TOTAL = 3 * 7  # stages of a step, for two frames and an image average
+Source = LandmarkTracker | DenseEvidence
+# The second process: it imports what this one would, without running the program's main file again.
+_SECOND = """import sys; sys.path[:] = {path}
+from ufmstar_torch.runtime import warm_up as w
+for kind in ({kinds}): w.along_wall(kind())"""
 
 
 class _Stages:
@@ -44,19 +55,20 @@ def warm_up(
     size: tuple[int, int],
     streams: int,
     progress: Callable[[int, int], object] | None = None,
-    also: Sequence[Callable[[], object]] = (),
+    sources: Sequence[type[Source]] = (),
 ) -> None:
     """Run a module on two frames of ``size`` (H, W) and an image average; see ``UfMStar.warm_up``.
 
     Args:
         module: a ``UfMStar`` before its first frame; its state changes.
         size, streams, progress: see ``UfMStar.warm_up``.
-        also: functions that call further kernels to compile.
+        sources: of landmarks, whose kernels are compiled, too.
 
     Raises:
         ValueError: a size or number of streams that is not positive.
     """
-    require_size(size, streams)
+    require_size("size", size)
+    require_whole("streams", streams, 1)
     if progress is not None and not callable(progress):
         raise TypeError(f"progress must be a function of two numbers or None, got {type(progress).__name__}")
     height, width = size
@@ -65,31 +77,25 @@ def warm_up(
     depth = torch.full((streams, height, width), distance, device=device)
     pose = torch.eye(4)
     K = camera_of(size)
-    features = depth.new_zeros(streams, config.features, height, width) if config.features else None
     aleatoric = depth if config.variances_in_h else None
     corner = depth[:, 0, :1]
     anchors = None
     if config.anchors is not None:
         anchors = Anchors(torch.zeros(streams, 1, 2, device=device), corner, 1e-4 * corner)
-    with warnings.catch_warnings(), _no_collection():
+    with warnings.catch_warnings(), _no_collection(), _second_process(sources) as finish:
         warnings.simplefilter("ignore", UserWarning)  # a small image has no segment
-        stages = _Stages(progress, _TOTAL + len(also))
+        stages = _Stages(progress, _TOTAL + len(sources))
         module.observer = stages
         for _ in range(2):  # the fusion needs a mixture, from the second frame on
-            module(depth, pose, K, aleatoric, features=features, **({} if anchors is None else {"anchors": anchors}))
-        module.mean_uncertainty(depth, pose, K, aleatoric, features=features, pixels=1)
-        for function in also:
-            function()
+            module(depth, pose, K, aleatoric, **({} if anchors is None else {"anchors": anchors}))
+        module.mean_uncertainty(depth, pose, K, aleatoric, pixels=1)
+        finish()
+        for kind in sources:
+            along_wall(kind())
             stages.stage("")
 
 
-def require_size(size: tuple[int, int], streams: int) -> None:
-    """Raise a TypeError or ValueError unless ``size`` is (H, W) and all three numbers are positive."""
-    arguments.require_size("size", size)
-    require_whole("streams", streams, 1)
-
-
-def along_wall(evidence: LandmarkTracker | DenseEvidence) -> None:
+def along_wall(evidence: Source) -> None:
     """Compile the kernels of a new source of landmarks: run it on a camera's way along a textured wall."""
     height, width = _WALL
     squares = np.random.default_rng(0).integers(0, 256, (height // _SQUARE, width // _SQUARE + _FRAMES, 3), np.uint8)
@@ -98,6 +104,35 @@ def along_wall(evidence: LandmarkTracker | DenseEvidence) -> None:
         T_world_cam = np.eye(4)
         T_world_cam[0, 3] = frame * _SQUARE / width * evidence.config.start_depth
         evidence.update(wall[:, frame * _SQUARE :][:, :width].copy(), T_world_cam, K)
+
+
+@contextmanager
+def _second_process(sources: Sequence[type[Source]]) -> Iterator[Callable[[], None]]:
+    """Compile the kernels of sources of landmarks in a second process while this one compiles others, unless they are
+    on disk or there is one core. Yields a function that waits for it, at most as long again; this process then loads
+    the kernels, and compiles what that one, which may fail, has not."""
+    process, started = None, time.monotonic()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    # A frozen program, or one with Python inside, has no interpreter to start.
+    python = Path(sys.executable or "").stem.startswith("python") and not hasattr(sys, "frozen")
+    if sources and cores > 1 and python and not on_disk(refine):
+        code = _SECOND.format(path=sys.path, kinds="".join(f"w.{kind.__name__}, " for kind in sources))
+        nothing = subprocess.DEVNULL
+        with suppress(OSError):  # no process or no memory: this one compiles all
+            process = subprocess.Popen([sys.executable, "-c", code], stdin=nothing, stdout=nothing, stderr=nothing)
+
+    def finish() -> None:
+        if process is not None:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(time.monotonic() - started)
+            process.kill()
+
+    try:
+        yield finish
+    finally:
+        if process is not None:
+            process.kill()
+            process.wait()
 
 
 @contextmanager

@@ -28,20 +28,17 @@ class Correspondence:
     Attributes:
         match: [B, C, K] True where k is in the correspondence set F_c after the occlusion filter.
         overlap: [B, C, K] Bhattacharyya coefficient beta_ck, 0 where c or k is no candidate.
-        distance: [B, C, K] squared disagreement [m^2] of the pairs, which fusion averages; None = W2^2.
     """
 
     match: Tensor
     overlap: Tensor
-    distance: Tensor | None = None
 
     def padded(self, capacity: int) -> Correspondence:
         """The pairs for a mixture that has grown to ``capacity`` slots: the new ones match nothing."""
         missing = capacity - self.match.shape[2]
         if not missing:
             return self
-        distance = None if self.distance is None else pad(self.distance, (0, missing))
-        return Correspondence(pad(self.match, (0, missing)), pad(self.overlap, (0, missing)), distance)
+        return Correspondence(pad(self.match, (0, missing)), pad(self.overlap, (0, missing)))
 
 
 def correspond(

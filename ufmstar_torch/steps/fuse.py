@@ -56,8 +56,7 @@ def fuse(
     averaged with lambda, pi_k <- pi_k + pi_c. With the weight w_k of the comparison (:func:`view_weights`; 1 in the
     paper) and rho = w_k pi_c / (W_k + w_k pi_c): m_k <- (1-rho) m_k + rho W2^2(G_k, G_c), W_k <- W_k + w_k pi_c; in the
     paper rho = lambda. n_k <- n_k + w_k. Where w_k = 0, k is unchanged: it would only outweigh its neighbours more.
-    ``pairs.distance`` replaces W2^2 if it is not None. A c that matches several k is fused into each of them with its
-    full weight.
+    A c that matches several k is fused into each of them with its full weight.
 
     Args:
         mixture: M_(i-1), [B, K], in the first camera's frame.
@@ -105,9 +104,6 @@ def _fuse_one_each(
     cov_k = torch.where(used[..., None, None], mixture.covariance.to(dtype), eye)
     cov_c = torch.where(used[..., None, None], of_c(current.covariance), eye)
     mean, covariance, distance = geodesic(mixture.mean.to(dtype), cov_k, of_c(current.mean), cov_c, lam)
-
-    if pairs.distance is not None:
-        distance = torch.gather(pairs.distance, 1, c[:, None])[:, 0].to(dtype)
 
     covariance = floor_covariance(covariance, storage_floor(covariance, mixture.covariance.dtype))
 

@@ -295,5 +295,4 @@ def query(state: UfMStarState, points: Tensor, frame: str, config: UfMStarConfig
             local = apply(T[:, None, :3, :3], local.double()) + T[:, None, :3, 3]
         dtype = torch.float64 if points.dtype == torch.float64 else torch.float32
         result = regress(with_measured_share(state.mixture), local.to(dtype), config)
-        result = set_unmeasured(result, None, config)[0]
-        return replace(result, features=result.features[..., : config.features])
+        return set_unmeasured(result, None, config)[0]

@@ -27,7 +27,6 @@ from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.gaussians.state import UfMStarState
 from ufmstar_torch.steps import correspond, fuse, regress, segment
 from ufmstar_torch.steps.correspond import Correspondence
-from ufmstar_torch.steps.disagree import with_overlap_disagreement
 from ufmstar_torch.steps.regress import Regression
 
 
@@ -38,10 +37,10 @@ class StepObserver(Protocol):
         """Called at the end of a stage: check, segment, correspond, fuse, append, regress or average, in this order.
 
         Work between two kernels belongs to the later stage. segment: SPGF and the floor of its covariances.
-        correspond: the transformation of the mixture into the camera frame, and the matching. fuse: the disagreement of
-        overlaps, the transformation of the segments into the first camera's frame, growth, and the fusion. append: the
-        new components, the transformation of the mixture into the camera frame, and the columns of anchors. regress:
-        the regression. average: the moving average, statistics and the new state. The caller of the step ends "check".
+        correspond: the transformation of the mixture into the camera frame, and the matching. fuse: the transformation
+        of the segments into the first camera's frame, growth, and the fusion. append: the new components, the
+        transformation of the mixture into the camera frame, and the columns of anchors. regress: the regression.
+        average: the moving average, statistics and the new state. The caller of the step ends "check".
         """
         ...
 
@@ -124,8 +123,6 @@ def step(
     pairs = kernels.correspond(previous_cam, current_cam, frame.intrinsics, frame.size, config)
     stage("correspond")
 
-    if config.disagreement == "overlap":
-        pairs = with_overlap_disagreement(pairs, previous_cam, current_cam)
     # A Gaussian nearer than the near plane is not appended: it could never be matched.
     far_enough = current_cam.mean[..., 2] > config.near_plane
     new = current_cam.valid & far_enough & ~pairs.match.any(2)

@@ -30,7 +30,6 @@ def check_values(
     intrinsics: Tensor,
     aleatoric: Tensor | None,
     epistemic: Tensor | None,
-    features: Tensor | None,
     mask: Tensor | None,
     *,
     rotation_tolerance: float,
@@ -39,17 +38,17 @@ def check_values(
     """As :func:`ufmstar_torch.frames.frame.check_values`, for the CPU. Depth that is valid everywhere is not copied."""
     z, wanted = array(depth), _NO_MASK if mask is None else array(mask)
     allowed, size = wanted, z.shape[1:]
-    for values, least in ((aleatoric, 0.0), (epistemic, 0.0), (features, -LARGEST)):
+    for values in (aleatoric, epistemic):
         if values is not None:
             allowed = np.ones(z.shape, np.bool_) if allowed is _NO_MASK else allowed.copy()
-            _restrict(allowed.reshape(len(z), -1), array(values).reshape(len(z), -1, z[0].size), least)
+            _restrict(allowed.reshape(len(z), -1), array(values).reshape(len(z), -1))
     limits = DEPTH_RANGE[0], min(max_depth, DEPTH_RANGE[1]), max_depth
     cameras = _matrices(array(pose), array(intrinsics))
     checked = _check(*cameras, float(size[0]), float(size[1]), rotation_tolerance, z, wanted, allowed, limits)
     T, K, deviation, fault, valid, safe, *counts = map(torch.from_numpy, (*checked[:-1], *checked[-1]))
     beyond, out_of_range, usable = counts
     return FrameInput(
-        safe, T, K, aleatoric, epistemic, features, valid, fault, deviation, beyond, out_of_range, usable, fault
+        safe, T, K, aleatoric, epistemic, None, valid, fault, deviation, beyond, out_of_range, usable, fault
     )
 
 
@@ -204,13 +203,12 @@ def _intrinsics_fault(K, height, width):
 
 
 @kernel
-def _restrict(use, values, least):
-    """Clear ``use`` [B, P] where a channel of values [B, C, P] is outside [least, LARGEST] or NaN."""
-    low, high = values.dtype.type(least), values.dtype.type(LARGEST)
+def _restrict(use, values):
+    """Clear ``use`` [B, P] where values [B, P] are outside [0, LARGEST] or NaN."""
+    low, high = values.dtype.type(0), values.dtype.type(LARGEST)
     for b in range(values.shape[0]):
-        for channel in range(values.shape[1]):
-            for i in range(values.shape[2]):
-                use[b, i] &= (values[b, channel, i] >= low) & (values[b, channel, i] <= high)
+        for i in range(values.shape[1]):
+            use[b, i] &= (values[b, i] >= low) & (values[b, i] <= high)
 
 
 @leaf

@@ -167,13 +167,12 @@ def view_weight(mean, reference, view, baseline, near):
 @leaf
 def fuse_pairs(
     mean, covariance, weight, disagreement, compared, views, references, features,
-    mean_c, cov_c, weight_c, features_c, pair_c, pair_k, overlap, distance, view, settings, w, work,
+    mean_c, cov_c, weight_c, features_c, pair_c, pair_k, overlap, view, settings, w, work,
 ):  # fmt: skip
     """Fuse the pairs [P] of one stream in their order, in place.
 
-    After each pair the values are rounded to the dtype of the state. A ``distance`` [P] that is not empty replaces
-    W2^2. With ``weighted``, pi_c is multiplied by the overlap [P]. ``view`` [4]: see ``ufmstar_torch.steps.fuse.fuse``;
-    ``w`` [K] is written.
+    After each pair the values are rounded to the dtype of the state. With ``weighted``, pi_c is multiplied by the
+    overlap [P]. ``view`` [4]: see ``ufmstar_torch.steps.fuse.fuse``; ``w`` [K] is written.
     """
     weighted, epsilon, baseline, near = settings
     mean_k, cov_k = work[6, 1], work[7]
@@ -203,8 +202,6 @@ def fuse_pairs(
             for j in range(3):
                 cov_k[i, j] = covariance[k, i, j]
         squared = geodesic(mean_k, cov_k, mean_c[c], cov_c[c], lam, work)
-        if distance.size > 0:
-            squared = distance[p]
         floor_covariance(cov_k, 8 * epsilon * (cov_k[0, 0] + cov_k[1, 1] + cov_k[2, 2]), work)
         for i in range(3):
             mean[k, i] = mean_k[i]

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.kernels.compile_cpu import kernel, leaf
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
 from ufmstar_torch.kernels.cpu.calls import array
 
 _FIRST_PAIRS = 8  # room for pairs per component, at first
@@ -44,21 +44,21 @@ def _close_pairs(mean, covariance, weight, views, log_det, fresh, limit, pairs, 
     """Write the pairs and their losses as far as there is room; returns their number."""
     reach = 4 * math.expm1(limit) * (1 + 1e-9)
     count, n = 0, weight.size
+    position, spread, far = empty((3, n), np.float64), empty((3, n), np.float64), empty(n, np.float64)
+    for i in range(n):
+        for axis in range(3):
+            position[axis, i], spread[axis, i] = mean[i, axis], weight[i] * covariance[i, axis, axis]
     for i in range(n):
         if not fresh[i]:
             continue
+        far[:] = -np.inf
+        for axis in range(3):
+            for j in range(n):
+                gap = position[axis, i] - position[axis, j]
+                excess = gap * gap * (weight[i] + weight[j]) - reach * (spread[axis, i] + spread[axis, j])
+                far[j] = max(far[j], excess)
         for j in range(n):
-            if fresh[j] and j <= i:  # a pair of two fresh components once
-                continue
-            share = weight[i] / (weight[i] + weight[j])
-            close = True
-            for axis in range(3):
-                gap = mean[i, axis] - mean[j, axis]
-                spread = share * covariance[i, axis, axis] + (1 - share) * covariance[j, axis, axis]
-                if not gap * gap <= reach * spread:
-                    close = False
-                    break
-            if not close:
+            if not far[j] <= 0 or (fresh[j] and j <= i):  # a pair of two fresh components once
                 continue
             first, second = min(i, j), max(i, j)
             a = weight[first] / (weight[first] + weight[second])
@@ -90,22 +90,28 @@ def _joint_log_det(mean, covariance, i, j, a, b):
 
 @kernel
 def _evidence(points, mean, sigma, whitening, log_peak, reach, beyond, out):
-    """Add the densities of the components that matter at the points [n, P] of each component."""
+    """Add the densities that matter at the points [n, P] of each component: those above exp(-``beyond``) of its peak.
+    Most exponents are smaller; computing them takes half as long as their exponential."""
     n = mean.shape[0]
-    for i in range(n):
+    position, variance, far = empty((3, n), np.float64), empty((3, n), np.float64), empty(n, np.float64)
+    for axis in range(3):
         for k in range(n):
-            radius2 = 2 * (log_peak[k] - log_peak[i] + beyond)
-            near = True
-            for axis in range(3):
-                gap = abs(mean[i, axis] - mean[k, axis]) - reach * sigma[i, axis]
-                if gap > 0 and not gap * gap <= max(radius2, 0.0) * (sigma[k, axis] * sigma[k, axis]):
-                    near = False
-                    break
-            if not near:
+            position[axis, k], variance[axis, k] = mean[k, axis], sigma[k, axis] * sigma[k, axis]
+    for i in range(n):
+        far[:] = -np.inf
+        for axis in range(3):
+            for k in range(n):
+                gap = max(abs(position[axis, i] - position[axis, k]) - reach * sigma[i, axis], 0.0)
+                radius2 = max(2 * (log_peak[k] - log_peak[i] + beyond), 0.0)
+                far[k] = max(far[k], gap * gap - radius2 * variance[axis, k])
+        for k in range(n):
+            if not far[k] <= 0:
                 continue
             for p in range(points.shape[1]):
                 x, y, z = points[i, p, 0] - mean[k, 0], points[i, p, 1] - mean[k, 1], points[i, p, 2] - mean[k, 2]
                 a = whitening[k, 0, 0] * x
                 b = whitening[k, 1, 0] * x + whitening[k, 1, 1] * y
                 c = whitening[k, 2, 0] * x + whitening[k, 2, 1] * y + whitening[k, 2, 2] * z
-                out[i, p] += math.exp(log_peak[k] - 0.5 * (a * a + b * b + c * c))
+                exponent = log_peak[k] - 0.5 * (a * a + b * b + c * c)
+                if exponent >= log_peak[i] - beyond:
+                    out[i, p] += math.exp(exponent)

@@ -25,7 +25,7 @@ Reals = NDArray[np.floating[Any]]
 # Share of the sums that culling may leave out: about the rounding of a sum in the dtype, so that culling is no
 # coarser than the arithmetic itself.
 EPSILON = {torch.float32: 1e-6, torch.float64: 1e-14}
-# The same for maps without features: sigma, a square root, is off by half of it at most.
+# The same for maps: sigma, a square root, is off by half of it at most.
 ERROR = {torch.float32: 1e-2, torch.float64: 1e-14}
 _DTYPES: dict[Any, torch.dtype] = {np.dtype(np.float32): torch.float32, np.dtype(np.float64): torch.float64}
 
@@ -36,7 +36,7 @@ def views_of(
     """The components in view of each stream, for the exact sum. The error for anchors is that of the most precise dtype
     among the depth's and the ``others``."""
     dtype = _DTYPES[depth.dtype]
-    epsilon, error = min(map(EPSILON.__getitem__, (dtype, *others))), (EPSILON if config.features else ERROR)[dtype]
+    epsilon, error = min(map(EPSILON.__getitem__, (dtype, *others))), ERROR[dtype]
     settings = settings_of(config.prior_weight, config.prior_mean, epsilon, error)
     views = []
     for b, one in enumerate(seen):

@@ -32,7 +32,6 @@ from ufmstar_torch.kernels.cpu.regress_cull import Seen, View
 from ufmstar_torch.kernels.cpu.rigid import FIELDS, padded
 from ufmstar_torch.kernels.cpu.segment import gaussians
 from ufmstar_torch.kernels.cpu.stream import COMPONENTS, COUNTS, DROPPED, NEW, SINGLE_VIEW, UNMEASURED, join, match
-from ufmstar_torch.steps.disagree import overlap_disagreement
 from ufmstar_torch.steps.fuse import Room, make_room
 from ufmstar_torch.steps.regress import distribute, memory_for
 from ufmstar_torch.steps.step import StepObserver, step_output, unobserved
@@ -40,7 +39,6 @@ from ufmstar_torch.steps.step import StepObserver, step_output, unobserved
 _MIXTURE = tuple(field.name for field in fields(GaussianMixture))
 _STREAM = ("T_world_first", "started", "frames", "skipped")
 _EPSILON = {dtype: torch.finfo(dtype).eps for dtype in (torch.float32, torch.float64)}
-_SQUARED_W2 = np.empty(0)  # in place of distances: the step computes W2^2
 _of_mixture, _of_stream = attrgetter(*_MIXTURE), attrgetter(*_STREAM)
 _Arrays = Sequence[NDArray[Any]]
 _Match = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_], int]  # the result of ``match``
@@ -136,10 +134,7 @@ def _join(
     members = np.zeros(b) if frame.member is None else array(frame.member)
     rest = settings, slots[-1].shape[2] + columns + 1, counts
     fixed, current = (camera, first, members, updated), (*segments[:3], segments[-1])
-    distances: Sequence[NDArray[np.float64]] = [_SQUARED_W2] * b
-    if config.disagreement == "overlap":
-        distances = _distances(state, frame, first, segments, matched)
-    joined = each(join, [(i, *fixed, current, matched[i], distances[i], *rest) for i in range(b)])
+    joined = each(join, [(i, *fixed, current, matched[i], *rest) for i in range(b)])
     seen = [Seen(*one) for one in joined]
     mixture, sums = dict(zip(_MIXTURE, map(torch.from_numpy, updated), strict=True)), dict(state.by_component)
     limit = config.max_components
@@ -193,16 +188,3 @@ def _learn(
     for one, values in zip(seen, array(learnt.beyond), strict=True):
         one.features[:, -COLUMNS - 1 : -1] = values[: len(one.disagreement)]
     return learnt, None
-
-
-def _distances(
-    state: UfMStarState, frame: FrameInput, first: NDArray[np.float64], segments: _Arrays, matched: Sequence[_Match]
-) -> list[NDArray[np.float64]]:
-    """The overlap disagreement [P] of the pairs of each stream."""
-    motion = relative_pose(torch.from_numpy(first), frame.T_world_cam)
-    mixture = state.mixture.to(torch.float64).rigid(*motion)
-    mean, covariance = map(torch.from_numpy, segments[:2])
-    return [
-        overlap_disagreement(mean[b, c], covariance[b, c], mixture.mean[b, k], mixture.covariance[b, k]).numpy()
-        for b, (c, k) in enumerate(torch.from_numpy(pairs) for pairs, *_ in matched)
-    ]

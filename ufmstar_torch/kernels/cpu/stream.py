@@ -70,7 +70,7 @@ def match(b, camera, stream, mixture, segments, size, thresholds, counts):
 
 
 @kernel
-def join(b, camera, first, members, slots, segments, matched, distance, settings, width, counts):
+def join(b, camera, first, members, slots, segments, matched, settings, width, counts):
     """Step 4 for stream ``b``: fuse the pairs, append the new components, and transform the mixture into the camera
     frame for the regression.
 
@@ -82,7 +82,6 @@ def join(b, camera, first, members, slots, segments, matched, distance, settings
             mixture; changed.
         segments: mean, covariance, weight and features [B, C, ...] of C_i.
         matched: the result of :func:`match`.
-        distance: as :func:`fuse_pairs`.
         settings: as :func:`fuse_pairs`: whether weighted by overlap, epsilon, b_0 (0 = the paper) and near plane.
         width: number of features for the regression: the mixture's, some that are not written, and the last, that of
             ``regress.with_measured_share``.
@@ -109,7 +108,7 @@ def join(b, camera, first, members, slots, segments, matched, distance, settings
     view[3] = members[b]
     fuse_pairs(
         mean, covariance, weight, disagreement, compared, views, references, features, moved, turned, weight_c,
-        features_c, pairs[0], pairs[1], overlap, distance, view, settings, empty(weight.size, np.float64), work,
+        features_c, pairs[0], pairs[1], overlap, view, settings, empty(weight.size, np.float64), work,
     )  # fmt: skip
     n = append(
         mean, covariance, weight, disagreement, compared, views, references, features, moved, turned, weight_c,

@@ -28,7 +28,6 @@ def check_values(
     intrinsics: Tensor,
     aleatoric: Tensor | None,
     epistemic: Tensor | None,
-    features: Tensor | None,
     mask: Tensor | None,
     *,
     rotation_tolerance: float,
@@ -52,16 +51,16 @@ def check_values(
         farthest=FARTHEST, shortest=FOCAL_RANGE[0], longest=FOCAL_RANGE[1], steps=POLAR_STEPS, warps=1,
     )  # fmt: skip
     safe, valid = torch.empty_like(depth), torch.empty_like(depth, dtype=torch.bool)
-    optional = (mask, aleatoric, epistemic, features)
+    optional = (mask, aleatoric, epistemic)
     launch(
         _maps, (triton.cdiv(height * width, 1024), b), depth,
         *(depth if v is None else v.detach().contiguous() for v in optional), fault, safe, valid, counts,
         height * width, b, masked=mask is not None, has_aleatoric=aleatoric is not None,
-        has_epistemic=epistemic is not None, channels=0 if features is None else features.shape[1],
-        nearest=DEPTH_RANGE[0], deepest=DEPTH_RANGE[1], max_depth=float(max_depth), largest=LARGEST, chunk=1024,
+        has_epistemic=epistemic is not None, nearest=DEPTH_RANGE[0], deepest=DEPTH_RANGE[1],
+        max_depth=float(max_depth), largest=LARGEST, chunk=1024,
     )  # fmt: skip
     return FrameInput(
-        safe, T_safe, K_safe, aleatoric, epistemic, features, valid, fault, deviation, counts[0], counts[1], counts[2],
+        safe, T_safe, K_safe, aleatoric, epistemic, None, valid, fault, deviation, counts[0], counts[1], counts[2],
         host_fault,
     )  # fmt: skip
 
@@ -148,8 +147,8 @@ def _camera(
 
 @triton.jit
 def _maps(
-    depth, mask, aleatoric, epistemic, features, faults, safe, valid, counts, pixels, streams,
-    masked: tl.constexpr, has_aleatoric: tl.constexpr, has_epistemic: tl.constexpr, channels: tl.constexpr,
+    depth, mask, aleatoric, epistemic, faults, safe, valid, counts, pixels, streams,
+    masked: tl.constexpr, has_aleatoric: tl.constexpr, has_epistemic: tl.constexpr,
     nearest: tl.constexpr, deepest: tl.constexpr, max_depth: tl.constexpr, largest: tl.constexpr, chunk: tl.constexpr,
 ):  # fmt: skip
     b = tl.program_id(1).to(tl.int64)
@@ -169,9 +168,6 @@ def _maps(
     if has_epistemic:
         variance = tl.load(epistemic + pixel, mask=inside, other=0.0)
         use = use & (variance >= 0) & (variance <= exact(largest, variance))
-    for channel in tl.static_range(channels):
-        value = tl.load(features + (b * channels + channel) * pixels + i, mask=inside, other=0.0)
-        use = use & (tl.abs(value) <= exact(largest, value))
     tl.store(safe + pixel, tl.where(use, z, 0.0), mask=inside)
     tl.store(valid + pixel, use, mask=inside)
     tl.atomic_add(counts + b, tl.sum(beyond.to(tl.int32), 0))

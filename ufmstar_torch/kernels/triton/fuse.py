@@ -73,25 +73,23 @@ def fuse_bits(
             listed c's [B].
         view: [B, 4] as :func:`ufmstar_torch.steps.fuse.fuse`.
         config: of UfM*.
-        pairs: overlaps and distances if the config needs them; None = W2^2, not weighted by overlap.
+        pairs: overlaps if the config needs them; None = not weighted by overlap.
     """
     b, k = mixture.weight.shape
     out = GaussianMixture(**{name: torch.empty_like(value.contiguous()) for name, value in mixture.tensors().items()})
     bits, index, position, count = matches
-    has_distance = pairs is not None and pairs.distance is not None
     weighted = pairs is not None and config.overlap_weighted
     unused = current.weight
     overlap = pairs.overlap.contiguous() if pairs is not None and weighted else unused
-    distance = pairs.distance.contiguous() if pairs is not None and pairs.distance is not None else unused
     channels = mixture.features.shape[2]
     launch(
         _fuse, (triton.cdiv(k, _LANES), b),
         *(v.contiguous() for v in mixture.tensors().values()),
         *(v.contiguous() for v in (current.mean, current.covariance, current.weight, current.features)),
-        *motion, bits, index, position, count, overlap, distance, view.contiguous(), *out.tensors().values(),
+        *motion, bits, index, position, count, overlap, view.contiguous(), *out.tensors().values(),
         k, current.capacity, bits.shape[2], epsilon=8 * torch.finfo(mixture.covariance.dtype).eps,
         baseline=config.view_baseline or 0.0, near=config.near_plane, complete=COMPLETE, least=LEAST,
-        weighted=weighted, has_distance=has_distance, channels=channels, padded=power_of_two(channels), word=WORD,
+        weighted=weighted, channels=channels, padded=power_of_two(channels), word=WORD,
         lanes=_LANES, warps=1,
     )  # fmt: skip
     return out
@@ -186,11 +184,11 @@ def _next_match(remaining, index_c, first, use):
 def _fuse(
     mean, covariance, weight, disagreement, compared, views, reference, features,
     mean_c, covariance_c, weight_c, features_c,
-    R, t, bits, index_c, position, listed_c, overlap, distances, view,
+    R, t, bits, index_c, position, listed_c, overlap, view,
     mean_o, covariance_o, weight_o, disagreement_o, compared_o, views_o, reference_o, features_o,
     capacity_k, capacity_c, words,
     epsilon: tl.constexpr, baseline: tl.constexpr, near: tl.constexpr, complete: tl.constexpr, least: tl.constexpr,
-    weighted: tl.constexpr, has_distance: tl.constexpr, channels: tl.constexpr, padded: tl.constexpr,
+    weighted: tl.constexpr, channels: tl.constexpr, padded: tl.constexpr,
     word: tl.constexpr, lanes: tl.constexpr,
 ):  # fmt: skip
     b = tl.program_id(1).to(tl.int64)
@@ -234,8 +232,6 @@ def _fuse(
             nx, ny, nz, n0, n1, n2, n3, n4, n5, d = geodesic(
                 x, y, z, a0, a1, a2, a3, a4, a5, cx, cy, cz, c0, c1, c2, c3, c4, c5, lam
             )
-            if has_distance:
-                d = _number(distances + index * capacity_k + slot, use)
             n0, n1, n2, n3, n4, n5 = floored(n0, n1, n2, n3, n4, n5, epsilon * (n0 + n3 + n5))
             # After each match, the values are rounded to the stored precision.
             x, y, z = _updated(use, nx, x, mean), _updated(use, ny, y, mean), _updated(use, nz, z, mean)

@@ -4,8 +4,7 @@ The mixture grows one frame ahead: before a frame it has slots for all Gaussians
 host needs only the number of components after the frame before. The device copies this number to the host after every
 frame, and the host waits for it only if it is more than a frame ahead of the device.
 
-What is not in the paper's step (anchors, a subset of pixels, ``config.disagreement == "overlap"``,
-``config.overlap_weighted``) runs as ``step.step`` with the GPU's kernels.
+Anchors, a subset of pixels and ``config.overlap_weighted`` run as ``step.step`` with the GPU's kernels.
 """
 
 from __future__ import annotations
@@ -84,7 +83,7 @@ class DeviceStep:
         observer: StepObserver | None = None,
     ) -> tuple[UfMStarState, UncertaintyOutput]:
         state = self._with_room(state, frame, config)
-        plain = config.disagreement == "w2" and config.anchors is None and not config.overlap_weighted
+        plain = config.anchors is None and not config.overlap_weighted
         if plain and pixels is None and observer is None:
             updated, out = device_step(state, frame, config, smooth=smooth)
         else:
