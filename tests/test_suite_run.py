@@ -162,7 +162,7 @@ def test_poses_of_another_program(tmp_path):
     assert json.loads((job.out / "eval.json").read_text())["settings"]["trajectory"] == "slam.txt"
     with pytest.raises(FolderError, match="settings"):
         go(job_from(read(words)))
-    for wrong, message in (("--poses sideways", "--poses"), ("--fps 0", "fps must be positive")):
+    for wrong, message in (("--poses sideways", "--poses"), ("--fps 0", "fps must lie in")):
         with pytest.raises(ValueError, match=message):
             job_from(read([*words, *wrong.split()]))
 
