@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.frames.arguments import require_flag, require_float, require_mask, require_number, require_whole
+from ufmstar_torch.frames.arguments import require_float, require_mask, require_number, require_whole
 from ufmstar_torch.frames.prediction import DepthPrediction, infer
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import as_map
@@ -216,7 +216,7 @@ def _fit(
     if valid is not None:
         require_mask("valid", valid, [tuple(depth.shape)])
     shift = None if shift is None else require_number("shift", shift)
-    pooled, robust = require_flag("pooled", pooled), require_flag("robust", robust)
+    pooled, robust = bool(require("pooled", pooled, bool)), bool(require("robust", robust, bool))
     unknowns = 2 if shift is None else 1
     if require_whole("min_points", min_points) < unknowns:
         raise ValueError(f"min_points must be at least {unknowns}, got {min_points}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -13,7 +12,7 @@ from modules import CONFIG, H, K, W, frame, same
 from PIL import Image
 from torch import nn
 
-from ufmstar_torch import AnchorConfig, ConfidenceConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch import AnchorConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch import uncertain_depth as pipeline
 from ufmstar_torch.anchors import Anchors, LandmarkMap
 from ufmstar_torch.config import SPGFConfig
@@ -101,14 +100,6 @@ REFUSED = {
     "points in the plane": (lambda: seen().query(torch.zeros(1, 5, 2)), ValueError, r"points must be \[1, N, 3\]"),
     "points of another frame": (lambda: seen().query(torch.zeros(1, 5, 3), "camera"), ValueError, "frame must be"),
     "points of no mixture": (lambda: UfMStar().query(torch.zeros(1, 5, 3)), ValueError, "query needs a mixture"),
-    **{
-        f"a mixture of other {name}": (
-            lambda n=name, v=value: replace(seen().mixture, **{n: v}), ValueError, f"{name} must have shape"
-        )
-        for name, value in (
-            ("weight", torch.ones(4)), ("mean", torch.ones(1, 4, 2)), ("features", torch.ones(1, 4))
-        )
-    },
     "an image of one channel": (lambda: model(IMAGE[:, :1]), ValueError, r"image must be \[B, 3, H, W\]"),
     "a tensor with channels last": (lambda: model(torch.tensor(PICTURE)[None]), ValueError, "image .*permute"),
     "an array with channels first": (lambda: model(IMAGE.numpy()), ValueError, r"image as a NumPy array .*\[H, W, 3\]"),
@@ -172,7 +163,7 @@ REFUSED = {
         lambda: ufm(DEPTH, POSE, K, confidence=DEPTH), ValueError, "confidence must be None where"
     ),
     "a confidence in whole numbers": (
-        lambda: UfMStar(CONFIG.replace(anchors=AnchorConfig(), confidence=ConfidenceConfig()))(
+        lambda: UfMStar(CONFIG.replace(anchors=AnchorConfig(), confidence=True))(
             DEPTH, POSE, K, confidence=DEPTH.int()
         ),
         TypeError, "confidence must have a floating-point",
@@ -343,7 +334,7 @@ def test_the_mask_of_an_array_is_valid(name):
 
 
 def test_numbers_of_numpy_are_numbers():
-    config = UfMStarConfig(max_components=np.int64(100), eta=np.float32(0.5), add_aleatoric=np.bool_(True))
+    config = UfMStarConfig(max_components=np.int64(100), eta=np.float32(0.5), variances_in_h=np.bool_(False))
     assert config == UfMStarConfig(max_components=100, eta=0.5)
     assert type(config.max_components) is int
     assert seen().query(np.zeros((1, 5, 3))).disagreement.shape == (1, 5)

@@ -160,14 +160,6 @@ def test_a_reduced_image_is_that_of_opencv_to_the_bit(size):
     np.testing.assert_array_equal(small, cv2.resize(image, small.shape[::-1], interpolation=cv2.INTER_AREA))
 
 
-def test_no_contrast_no_depth():
-    flat = np.full((72, 96), 90, np.uint8)
-    pixel = np.array([[40.0, 30.0]])
-    result = measure(flat, pixel, views([flat] * 3, MOVED, np.eye(4)), SEARCH)
-    assert result.agreed.tolist() == [0]
-    assert len(free_pixels(flat, 8, np.zeros((0, 2)))) == 0
-
-
 def test_the_pixel_of_a_cell_has_the_largest_gradient():
     image = np.random.default_rng(3).integers(0, 255, (40, 48)).astype(np.uint8)
     pixel, x = free_pixels(image, 8, np.zeros((0, 2))).reshape(5, 6, 2).astype(int), image.astype(int)

@@ -192,7 +192,7 @@ def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, who
     monkeypatch.undo()
     assert len(stored_results(job.out)) == 6
     folder = job.folder.sequence_folder(job.items[1])
-    begun, mine = folder / ".A.pt.0123456789ab.tmp", folder / ".mine.tmp"
+    begun, mine = folder / ".A.npz.0123456789ab.tmp", folder / ".mine.tmp"
     for file in (begun, mine):
         file.write_text("x")
     stub = Stub()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from types import NoneType
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -13,7 +12,7 @@ from torch import Tensor
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.check import AnchorDoubts, check_anchors
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.frames.arguments import Array, CameraLike, as_device, as_tensor, require_flag, require_kind
+from ufmstar_torch.frames.arguments import Array, CameraLike, as_device, as_tensor
 from ufmstar_torch.frames.frame import FrameInput, as_confidence, check_frame, raise_faults
 from ufmstar_torch.frames.output import MeanUncertainty, UncertaintyOutput
 from ufmstar_torch.frames.warnings import StreamWarnings
@@ -21,6 +20,7 @@ from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.gaussians.state import ALWAYS_FLOAT64, NAMES, UfMStarState
 from ufmstar_torch.kernels.select import FrameKernels, select_frame, select_step
 from ufmstar_torch.posterior.recalibrate import CONFIDENCE, Recalibration
+from ufmstar_torch.runtime.kinds import require
 from ufmstar_torch.runtime.stateful import StatefulModule, full_precision, one_caller, outliving
 from ufmstar_torch.runtime.warm_up import warm_up
 from ufmstar_torch.steps import variance
@@ -67,7 +67,7 @@ class UfMStar(StatefulModule):
         device: torch.device | str | None = None,
     ) -> None:
         super().__init__()
-        require_kind("config", config, (UfMStarConfig, NoneType), "a UfMStarConfig or None")
+        require("config", config, UfMStarConfig | None)
         if not isinstance(dtype, torch.dtype) or dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         self.config = config if config is not None else UfMStarConfig()
@@ -167,7 +167,7 @@ class UfMStar(StatefulModule):
         )  # fmt: skip
         kernels = self._kernels(depth.device.type)[1].sample
         index, used = kernels.pixels(frame.valid, *sample_size(frame.size, pixels, fraction, seed))
-        out = self._observe(frame, index, average=require_flag("average", average))
+        out = self._observe(frame, index, average=bool(require("average", average, bool)))
         return mean_uncertainty(out, used, kernels.summary)
 
     def warm_up(
@@ -222,7 +222,7 @@ class UfMStar(StatefulModule):
             IndexError: an index is out of range.
             ValueError: a mask of the wrong length; ``keep_evidence`` without ``config.anchors``.
         """
-        if require_flag("keep_evidence", keep_evidence) and not self._empty.by_stream:
+        if require("keep_evidence", keep_evidence, bool) and not self._empty.by_stream:
             raise ValueError("keep_evidence needs UfMStarConfig(anchors=AnchorConfig()), got one without anchors")
         with outliving(), torch.no_grad():  # buffers must outlive the caller's inference mode
             old, b = self.state, self.mean.shape[0]
@@ -238,7 +238,7 @@ class UfMStar(StatefulModule):
     def uses_confidence(self) -> bool:
         """True if V depends on the network's confidence."""
         mapped = isinstance(self.recalibration, Recalibration) and self.recalibration.covariate == CONFIDENCE
-        return self.config.confidence is not None or mapped
+        return self.config.confidence or mapped
 
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
         self._empty.with_tensors(state).require(self.config, self._empty)
@@ -250,7 +250,7 @@ class UfMStar(StatefulModule):
         used = {"anchors": self.config.anchors is not None, "confidence": self.uses_confidence}
         for name, value in (("anchors", anchors), ("confidence", confidence)):
             if value is not None and not used[name]:
-                raise ValueError(f"{name} must be None where UfMStarConfig.{name} is None, which switches it off")
+                raise ValueError(f"{name} must be None where UfMStarConfig.{name} is off")
         frame = check_frame(
             depth, T, K, *maps, **view, variances_in_h=self.config.variances_in_h,
             rotation_tolerance=self.config.rotation_tolerance, max_depth=self.config.segment.depth_limit,
@@ -260,7 +260,7 @@ class UfMStar(StatefulModule):
             frame = replace(frame, confidence=as_confidence(confidence, frame))
         if anchors is None:
             return frame
-        variances = [v for v in variance.network_variances(frame, self.config) if v is not None]
+        variances = [v for v in (frame.aleatoric, frame.epistemic) if v is not None]
         checked = check_anchors(anchors, frame, variances, self._kernels(depth.device.type)[1].check_anchors)
         self._doubts.judge(anchors, checked, frame.size)
         return replace(frame, anchors=checked)

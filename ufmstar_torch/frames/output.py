@@ -149,10 +149,9 @@ class UncertaintyOutput:
     Attributes:
         depth: the best that is known [m]: the posterior's, NaN where not valid, or else the network's. Before the first
             anchor of a stream, the posterior's equals the network's.
-        variance: of ``depth`` [m^2]: the posterior's, or else V of UfM*: M, plus A and E if passed (and not switched
-            off in the config), plus B with ``config.anchors``; at least ``config.variance_floor``. NaN where not valid.
-            The posterior's is that of a mixture: ``posterior_inlier_variance`` with the probability
-            1 - ``posterior_outlier``.
+        variance: of ``depth`` [m^2]: the posterior's, or else V of UfM*: M, plus A and E if passed, plus B with
+            ``config.anchors``; at least ``config.variance_floor``. NaN where not valid. The posterior's is that of a
+            mixture: ``posterior_inlier_variance`` with the probability 1 - ``posterior_outlier``.
         valid: True where the pixel was used.
         maps: the further maps by name.
         statistics: per-stream counts of this frame.

@@ -69,9 +69,8 @@ class UfMStarState:
         if config.anchors is not None:
             by_component["evidence"] = torch.zeros(streams, capacity, SUMS, dtype=dtype, device=device)
             by_stream["overall_evidence"] = torch.zeros(streams, SUMS, dtype=dtype, device=device)
-        if config.confidence is not None:
-            size = confidence.size(config.confidence)
-            by_stream["confidence"] = torch.zeros(streams, size, dtype=dtype, device=device)
+        if config.confidence:
+            by_stream["confidence"] = torch.zeros(streams, confidence.SIZE, dtype=dtype, device=device)
         if config.posterior is not None:
             by_stream["posterior"] = torch.zeros(streams, running.SIZE, dtype=torch.float64, device=device)
         return cls(
@@ -161,8 +160,8 @@ class UfMStarState:
         for name in ("evidence", "overall_evidence") if config.anchors is not None else ():
             if bool((tensors[name][..., 0] < 0).any()) or bool((tensors[name].abs() > LARGEST).any()):
                 raise ValueError(f"{name} holds negative weights or values beyond {LARGEST:g}")
-        if config.confidence is not None:
-            confidence.require(tensors["confidence"], config.confidence)
+        if config.confidence:
+            confidence.require(tensors["confidence"])
         if config.posterior is not None:
             running.require(tensors["posterior"])
 

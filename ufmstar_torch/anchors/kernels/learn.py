@@ -99,13 +99,9 @@ def _inliers(pixel, predicted, depth, variance, valid, out):
 
 
 def learn_in_view(
-    tensors: Mapping[str, Tensor],
-    capacity: int,
-    seen: Sequence[Seen],
-    views: Sequence[View],
-    frame: FrameInput,
+    tensors: Mapping[str, Tensor], capacity: int, seen: Sequence[Seen], views: Sequence[View], frame: FrameInput,
     config: UfMStarConfig,
-) -> Learnt:
+) -> Learnt:  # fmt: skip
     """As :func:`ufmstar_torch.anchors.learn.learn` with the exact sum over the components in view
     (``kernels.cpu.regress.views_of``); the error of the shares is at most twice the regression's.
 
