@@ -22,7 +22,6 @@ from torch import Tensor
 
 from ufmstar_torch import (
     AnchorConfig,
-    ConfidenceConfig,
     DepthPrediction,
     PosteriorConfig,
     UfMStarConfig,
@@ -80,7 +79,7 @@ def prepare(source: str) -> list[Prepared]:
 def figures(prepared: list[Prepared], source: str, unit: str) -> list[float]:
     """``FIGURES`` of V, the share of frames in which the confidence is used, and the NLL of the posterior."""
     to_unit = UNITS[unit]
-    sections = {"confidence": None if to_unit is None else ConfidenceConfig(), "posterior": PosteriorConfig()}
+    sections = {"confidence": to_unit is not None, "posterior": PosteriorConfig()}
     model = UncertainDepth(None, UfMStarConfig(anchors=AnchorConfig(), **sections))
     metrics, corrected, used = SequenceMetrics(), SequenceMetrics(), 0.0
     for one in prepared:

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.frames.arguments import require_flag, require_float, require_mask, require_number, require_whole
+from ufmstar_torch.frames.arguments import require_float, require_mask, require_number, require_whole
 from ufmstar_torch.frames.prediction import DepthPrediction, infer
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import as_map
@@ -161,12 +161,7 @@ class AlignedNetwork(DepthNetwork):
 
 @check_kinds
 def fit_inverse_depth(
-    prediction: Tensor,
-    depth: Tensor,
-    valid: Tensor | None = None,
-    *,
-    shift: float | None = None,
-    **options: Any,
+    prediction: Tensor, depth: Tensor, valid: Tensor | None = None, *, shift: float | None = None, **options: Any
 ) -> AlignmentFit:
     """Scale and shift with 1/depth = scale prediction + shift, by least squares in inverse depth.
 
@@ -193,12 +188,7 @@ def fit_inverse_depth(
 
 @check_kinds
 def fit_affine_depth(
-    prediction: Tensor,
-    depth: Tensor,
-    valid: Tensor | None = None,
-    *,
-    shift: float | None = 0.0,
-    **options: Any,
+    prediction: Tensor, depth: Tensor, valid: Tensor | None = None, *, shift: float | None = 0.0, **options: Any
 ) -> AlignmentFit:
     """Scale (and shift) with depth = scale prediction + shift [m], by least squares in depth.
 
@@ -226,7 +216,7 @@ def _fit(
     if valid is not None:
         require_mask("valid", valid, [tuple(depth.shape)])
     shift = None if shift is None else require_number("shift", shift)
-    pooled, robust = require_flag("pooled", pooled), require_flag("robust", robust)
+    pooled, robust = bool(require("pooled", pooled, bool)), bool(require("robust", robust, bool))
     unknowns = 2 if shift is None else 1
     if require_whole("min_points", min_points) < unknowns:
         raise ValueError(f"min_points must be at least {unknowns}, got {min_points}")

@@ -13,7 +13,6 @@ from zipfile import BadZipFile
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.frames.arguments import require_flag
 from ufmstar_torch.frames.prediction import DepthPrediction, infer, require_switchable
 from ufmstar_torch.frames.prediction import takes_intrinsics as declares_intrinsics
 from ufmstar_torch.frames.warnings import LOGGER
@@ -21,6 +20,7 @@ from ufmstar_torch.models.hugging_face import from_hugging_face, of_transformers
 from ufmstar_torch.models.network import DeclaredNetwork, DepthNetwork
 from ufmstar_torch.models.outputs import METRIC, OutputSpec, PlainSpec, ProgramSpec, Spread
 from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.runtime.kinds import require
 
 # Programs in files, by name of the network (``load_network``), and what their format can do.
 PROGRAMS = {
@@ -144,7 +144,7 @@ def wrap_network(
     if isinstance(network, type) or not callable(network):
         raise TypeError(f"network must be an nn.Module or a function, got {_described(network)}")
     for name, value in (("inverse", inverse), ("resize", resize), ("takes_intrinsics", takes_intrinsics)):
-        require_flag(name, value)
+        require(name, value, bool)
     refuse_relative(network)
     if isinstance(network, nn.Module):
         require_switchable(network)

@@ -9,7 +9,6 @@ import pytest
 import ufmstar_torch
 from ufmstar_torch import (
     AnchorConfig,
-    ConfidenceConfig,
     MergeConfig,
     PosteriorConfig,
     UfMStar,
@@ -24,7 +23,6 @@ PUBLIC = {
     "LiveDepth",
     "LiveResult",
     "AnchorConfig",
-    "ConfidenceConfig",
     "MergeConfig",
     "PosteriorConfig",
     "Recalibration",
@@ -77,9 +75,9 @@ def test_signatures():
 
 
 def test_few_settings():
-    """The core has at most 48 settings, those of all sections together."""
-    sections = {"anchors": AnchorConfig(), "confidence": ConfidenceConfig(), "posterior": PosteriorConfig()}
-    assert len(flat(UfMStarConfig(**sections, merge=MergeConfig()).to_dict())) <= 48
+    """The core has at most 45 settings, those of all sections together."""
+    sections = {"anchors": AnchorConfig(), "posterior": PosteriorConfig()}
+    assert len(flat(UfMStarConfig(**sections, merge=MergeConfig()).to_dict())) <= 45
 
 
 def test_the_papers_defaults():

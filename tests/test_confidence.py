@@ -15,7 +15,6 @@ from torch import nn
 
 from ufmstar_torch import (
     AnchorConfig,
-    ConfidenceConfig,
     DepthPrediction,
     Recalibration,
     UfMStar,
@@ -38,7 +37,7 @@ from ufmstar_torch.models import Ensemble, OutputSpec, Preprocess, wrap_network
 from ufmstar_torch.models.onnx_network import OnnxNetwork
 
 PLAIN = UfMStarConfig(anchors=AnchorConfig())
-CONFIG = PLAIN.replace(confidence=ConfidenceConfig())
+CONFIG = PLAIN.replace(confidence=True)
 SIZE = H, W = 24, 32
 CPU = torch.device("cpu")
 K = torch.tensor([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]], dtype=torch.float64)
@@ -201,11 +200,11 @@ def test_a_network_states_it():
     image = torch.rand(1, 3, *SIZE, generator=torch.Generator().manual_seed(0))
     assert torch.equal(network(image).confidence, image[:, 0])
     torch.testing.assert_close(Ensemble([network, network])(image).confidence, image[:, 0])
-    assert UncertainDepth(network, posterior=False).ufm.config.confidence is None
+    assert UncertainDepth(network, posterior=False).ufm.config.confidence is False
     model = UncertainDepth(
         [network, copy.deepcopy(network)], UfMStarConfig(anchors=AnchorConfig()), preprocess=network.preprocess
     )
-    assert model.ufm.config.confidence == ConfidenceConfig()
+    assert model.ufm.config.confidence
     anchors = next(frames(1, dtype=torch.float32))[2]
     out = model(image, torch.eye(4), K, anchors=anchors)
     assert torch.equal(out.prediction.confidence, image[:, 0])
@@ -218,7 +217,7 @@ def test_the_engine_passes_it(tmp_path):
     source = NetworkSource(NetworksInTurn(network, preprocess=network.preprocess), CPU, {}, digest="a" * 64)
     method, sequence = Method.parse("UfM*-DepthOnly"), tour_sequence(seed=3, frames=3, size=(48, 64))
     rows = [Row(method), Row(method, Setting(anchors="truth"))]
-    assert make_estimator(rows[1], CPU, source).ufm.config.confidence == ConfidenceConfig()
+    assert make_estimator(rows[1], CPU, source).ufm.config.confidence
     for _ in range(2):
         for result in evaluate_sequence(sequence, rows, {"depth_only": source}, cache=PredictionCache(tmp_path)):
             samples = result.sums["confidence"]["samples"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -13,10 +12,13 @@ from modules import CONFIG, H, K, W, frame, same
 from PIL import Image
 from torch import nn
 
-from ufmstar_torch import AnchorConfig, ConfidenceConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch import AnchorConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch import uncertain_depth as pipeline
+from ufmstar_torch.anchors import Anchors, LandmarkMap
+from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.frames.prediction import combine
 from ufmstar_torch.gaussians.camera import crop_intrinsics, resize_intrinsics
+from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.models import Preprocess, load_network, save_checkpoint, wrap_network
 from ufmstar_torch.posterior.recalibrate import Recalibration
 
@@ -98,14 +100,6 @@ REFUSED = {
     "points in the plane": (lambda: seen().query(torch.zeros(1, 5, 2)), ValueError, r"points must be \[1, N, 3\]"),
     "points of another frame": (lambda: seen().query(torch.zeros(1, 5, 3), "camera"), ValueError, "frame must be"),
     "points of no mixture": (lambda: UfMStar().query(torch.zeros(1, 5, 3)), ValueError, "query needs a mixture"),
-    **{
-        f"a mixture of other {name}": (
-            lambda n=name, v=value: replace(seen().mixture, **{n: v}), ValueError, f"{name} must have shape"
-        )
-        for name, value in (
-            ("weight", torch.ones(4)), ("mean", torch.ones(1, 4, 2)), ("features", torch.ones(1, 4))
-        )
-    },
     "an image of one channel": (lambda: model(IMAGE[:, :1]), ValueError, r"image must be \[B, 3, H, W\]"),
     "a tensor with channels last": (lambda: model(torch.tensor(PICTURE)[None]), ValueError, "image .*permute"),
     "an array with channels first": (lambda: model(IMAGE.numpy()), ValueError, r"image as a NumPy array .*\[H, W, 3\]"),
@@ -169,7 +163,7 @@ REFUSED = {
         lambda: ufm(DEPTH, POSE, K, confidence=DEPTH), ValueError, "confidence must be None where"
     ),
     "a confidence in whole numbers": (
-        lambda: UfMStar(CONFIG.replace(anchors=AnchorConfig(), confidence=ConfidenceConfig()))(
+        lambda: UfMStar(CONFIG.replace(anchors=AnchorConfig(), confidence=True))(
             DEPTH, POSE, K, confidence=DEPTH.int()
         ),
         TypeError, "confidence must have a floating-point",
@@ -191,6 +185,16 @@ REFUSED = {
     "a pose of half precision": (
         lambda: ufm(DEPTH, far(torch.float16, 20.0), K), ValueError, "its dtype is exact to 1 cm .*expected float64"
     ),
+    "an image size in text": (lambda: SPGFConfig().scaled_to("480", 640), TypeError, "height must be a whole number"),
+    "a rotation of an array": (
+        lambda: GaussianMixture.empty(1, 2, dtype=torch.float32, device="cpu").rigid(np.eye(3), torch.zeros(1, 3)),
+        TypeError, r"R must be a dense torch\.Tensor, got nd",
+    ),
+    "a camera of numbers": (
+        lambda: Anchors(torch.zeros(1, 2, 2), torch.ones(1, 2), torch.ones(1, 2)).moved([1.0], K),
+        TypeError, r"K_from must be a dense torch\.Tensor, got list of float",
+    ),
+    "a map of text": (lambda: LandmarkMap("abc", None), TypeError, "points_world and sigma must be arrays of numbers"),
     "a map without knots": (lambda: Recalibration((), ()), ValueError, "Recalibration needs knots"),
 }  # fmt: skip
 
@@ -330,7 +334,7 @@ def test_the_mask_of_an_array_is_valid(name):
 
 
 def test_numbers_of_numpy_are_numbers():
-    config = UfMStarConfig(max_components=np.int64(100), eta=np.float32(0.5), add_aleatoric=np.bool_(True))
+    config = UfMStarConfig(max_components=np.int64(100), eta=np.float32(0.5), variances_in_h=np.bool_(False))
     assert config == UfMStarConfig(max_components=100, eta=0.5)
     assert type(config.max_components) is int
     assert seen().query(np.zeros((1, 5, 3))).disagreement.shape == (1, 5)

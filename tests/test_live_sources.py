@@ -81,8 +81,9 @@ def test_a_recording_comes_at_its_pace():
         assert event.image.shape == (64, 96, 3)
     assert all(moment >= n / 15 / 2 for n, moment in enumerate(moments))
     assert [event.stamp for event in replay(sequence, np.inf)] == [n / 15 for n in range(5)]
-    entries = [replace(entry, timestamp=None) for entry in sequence.entries]
-    assert [event.stamp for event in replay(replace(sequence, entries=tuple(entries)), np.inf)][1] == 1 / 30
+    for stamps in ([None] * 5, [0.0, 1.0, 2.0, 3.0, 4.0]):
+        entries = [replace(entry, timestamp=stamp) for entry, stamp in zip(sequence.entries, stamps, strict=True)]
+        assert [event.stamp for event in replay(replace(sequence, entries=tuple(entries)), np.inf)][1] == 1 / 30
 
 
 def test_poses_are_read_as_their_lines_are_completed(tmp_path):
@@ -217,10 +218,7 @@ def test_an_unfinished_last_line_and_names_that_no_file_has_are_left_out(tmp_pat
         ('{"stamp": 1, "pose": [1, 2, 3, 0, 0, 0, 2]}', "line 1: pose: the quaternion's norm is 2"),
         ('{"stamp": 1, "pose": [[1, 2], [3]]}', "line 1: a pose has 7"),
         ('{"stamp": 1, "pose": {"x": 1}}', "line 1: a pose has 7"),
-        (
-            '{"stamp": 1, "image": "none.png"}',
-            "line 1: an image needs intrinsics, in its line, an earlier",
-        ),
+        ('{"stamp": 1, "image": "none.png"}', "line 1: an image needs intrinsics, in its line, an earlier"),
         ('{"intrinsics": [1, 2]}', "line 1: intrinsics are fx, fy, cx, cy"),
         ('{"intrinsics": "9 9 4 4"}', "line 1: intrinsics are fx, fy, cx, cy"),
         ('{"intrinsics": [0, 9, 4, 4]}', "line 1: intrinsics must be a finite 3x3 matrix with positive focal lengths"),

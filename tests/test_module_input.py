@@ -11,7 +11,7 @@ from modules import CONFIG, POSES, SPGF, H, K, W, frame, same, snapshot, unchang
 from torch import Tensor
 
 import scenes
-from ufmstar_torch import ConfidenceConfig, PosteriorConfig, SPGFConfig, UfMStar, UfMStarConfig
+from ufmstar_torch import PosteriorConfig, SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.gaussians.camera import resize_intrinsics
 from ufmstar_torch.gaussians.gaussian import barycenter
 
@@ -42,7 +42,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: settings({"backend": "cuda"}), "backend"),
     (lambda: settings({"max_components": 0}), "max_components"),
     (lambda: settings({"variance_floor": NAN}), "variance_floor"),
-    (lambda: settings({"add_aleatoric": 1}), "add_aleatoric"),
+    (lambda: settings({"variances_in_h": 1}), "variances_in_h"),
     (lambda: settings({"initial_capacity": 1.5}), "initial_capacity"),
     (lambda: settings({"initial_capacity": True}), "initial_capacity"),
     (lambda: settings({"eta_oclusion": 0.7}), "eta_oclusion"),
@@ -50,7 +50,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: UfMStarConfig(segment=None), "segment"),  # type: ignore[arg-type]
     (lambda: UfMStarConfig(merge=1.0), "merge"),  # type: ignore[arg-type]
     (lambda: UfMStarConfig(posterior=PosteriorConfig()), "posterior needs anchors"),
-    (lambda: UfMStarConfig(confidence=ConfidenceConfig()), "confidence needs anchors"),
+    (lambda: UfMStarConfig(confidence=True), "confidence needs anchors"),
     (lambda: UfMStarConfig().with_values({"merge": 0.5}), "merge"),
     (lambda: UfMStarConfig().with_values({"merge.los": 0.5}), "los"),
     (lambda: UfMStarConfig().with_values({"eta.low": 0.5}), "eta"),

@@ -88,10 +88,7 @@ def distorted(x, y, coefficients, fisheye):
     k1, k2, p1, p2 = coefficients
     r2 = x * x + y * y
     radial = 1 + k1 * r2 + k2 * r2 * r2
-    return (
-        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-    )
+    return (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
 
 
 @pytest.mark.parametrize(("coefficients", "fisheye"), [(RADIAL, False), (FISHEYE, True)])
@@ -263,7 +260,6 @@ def edited(path, change):
         (lambda c: c.update(frames=3), "a list 'frames'"),
         (lambda c: c["frames"][1].update(file_path=7), "file_path must be text"),
         (lambda c: c["frames"][1].update(transform_matrix=[[1, 2], [3]]), "must be 4x4 numbers"),
-        (lambda c: c["frames"][1].update(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()), "must be a rotation"),
         (lambda c: c.update(fl_x="wide"), "fl_x must be a number"),
         (lambda c: c.update(camera_model="EQUIRECTANGULAR"), "camera_model must be one of"),
         (lambda c: c.update(w=1000), "the camera has 1000x48 pixels, an image 64x48"),

@@ -284,8 +284,7 @@ def test_unknown_and_ambiguous_layouts(tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     with pytest.raises(
-        ValueError,
-        match=r"no known layout: expected images .*, K\.txt; or the files of tum, .*kitti360.* \(docs/data",
+        ValueError, match=r"no known layout: expected images .*, K\.txt; or the files of tum, .*kitti360.* \(docs/data"
     ):
         open_sequence(empty)
     with pytest.raises(ValueError, match=r"has not the layout 'tartanair': looked for pose_left\.txt"):
@@ -318,8 +317,8 @@ def test_no_frames_at_all(tmp_path, layout):
     [
         ({"truth_scale": 1000}, "truth_scale is in metres per unit"),
         ({"truth_scale": 0}, "truth_scale is in metres per unit"),
-        ({"fps": 0}, "fps must be positive"),
-        ({"max_pose_gap": -1}, "max_pose_gap must be a time"),
+        ({"fps": 0}, r"fps must lie in \(0\.0, inf"),
+        ({"max_pose_gap": -1}, r"max_pose_gap must lie in \[0\.0, inf"),
         ({"max_time_difference": float("nan")}, "max_time_difference must be a number, got nan"),
         ({"images": "rgb"}, "layout 'tum' takes no images"),
         ({"topics": ["/image"]}, "layout 'tum' takes no topics: topics is an option of bag$"),

@@ -150,19 +150,18 @@ def test_a_place_never_seen_starts_afresh():
     assert outputs[3].statistics.matched.item() > 0
 
 
-@pytest.mark.parametrize("which", ["none", "a", "e", "both", "off"])
+@pytest.mark.parametrize("which", ["none", "a", "e", "both"])
 def test_total_variance(which):
     depths, poses, K = scenes.sequence(2, HEIGHT, WIDTH, 0.06)
     a, e = torch.full((1, HEIGHT, WIDTH), 0.25).double(), torch.full((1, HEIGHT, WIDTH), 0.5).double()
-    config = CONFIG.replace(add_aleatoric=which != "off", add_epistemic=which != "off", view_baseline=None)
-    ufm = UfMStar(config, dtype=torch.float64)
+    ufm = UfMStar(CONFIG.replace(view_baseline=None), dtype=torch.float64)
     network_variances = {
-        "aleatoric": a if which in ("a", "both", "off") else None,
-        "epistemic": e if which in ("e", "both", "off") else None,
+        "aleatoric": a if which in ("a", "both") else None,
+        "epistemic": e if which in ("e", "both") else None,
     }
     for depth, T in zip(depths, poses, strict=True):
         out = ufm(torch.tensor(depth)[None], torch.tensor(T), torch.tensor(K), **network_variances)
-    added = {"none": 0.0, "a": 0.25, "e": 0.5, "both": 0.75, "off": 0.0}[which]
+    added = {"none": 0.0, "a": 0.25, "e": 0.5, "both": 0.75}[which]
     torch.testing.assert_close(out.variance, out.disagreement + added, equal_nan=True)
     torch.testing.assert_close(out.std, out.variance.sqrt(), equal_nan=True)
     assert (out.disagreement[out.valid] > 0).any()

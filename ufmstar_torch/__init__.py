@@ -6,7 +6,6 @@ from ufmstar_torch.runtime.optional import lazy_names
 
 if TYPE_CHECKING:
     from ufmstar_torch.config import AnchorConfig as AnchorConfig
-    from ufmstar_torch.config import ConfidenceConfig as ConfidenceConfig
     from ufmstar_torch.config import MergeConfig as MergeConfig
     from ufmstar_torch.config import PosteriorConfig as PosteriorConfig
     from ufmstar_torch.config import SPGFConfig as SPGFConfig
@@ -26,7 +25,6 @@ else:
 __version__ = "0.1.0"
 __all__ = [
     "AnchorConfig",
-    "ConfidenceConfig",
     "DepthPrediction",
     "GaussianMixture",
     "LiveDepth",

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 from ufmstar_torch.files.limits import require_bytes
 from ufmstar_torch.posterior.config import PosteriorConfig as PosteriorConfig
 from ufmstar_torch.runtime.checked import Checked, choice, number, section
+from ufmstar_torch.runtime.kinds import check_kinds
 
 _SLOT = 84  # [bytes] of a component's state without features
 # Implementations of SPGF iterate over the depth bins; more than this indicate a mistake in the units.
@@ -161,6 +162,7 @@ class SPGFConfig(Checked):
 
 
 @functools.lru_cache(maxsize=16)  # constructing a config repeats its checks in every frame
+@check_kinds
 def _scaled(config: SPGFConfig, height: int, width: int) -> SPGFConfig:
     across, down = width / config.reference_width, height / config.reference_height
     resized = max(across, down) if config.slope_focal == "camera" else 1.0
@@ -188,31 +190,6 @@ class AnchorConfig(Checked):
 
     half_life: float = number(30.0, "ln 2/ln(1/gamma)", "frames", 0.0, open_low=True)
     shrinkage: float = number(2.0, "kappa", "anchors", 0.0, open_low=True)
-
-
-@dataclass(frozen=True)
-class ConfidenceConfig(Checked):
-    """A network's confidence as a factor of the variance (``ufmstar_torch.anchors.confidence``).
-
-    Attributes:
-        shrinkage: anchors in a bin with which its factor counts half, and 1 the other half
-        half_life: age after which a frame's verdict on the confidence counts half
-    """
-
-    shrinkage: float = number(16.0, "kappa", "anchors", 0.0, open_low=True)
-    half_life: float = number(20.0, "ln 2/ln(1/gamma)", "frames", 5.0)
-
-    # Constants, chosen on rendered tours (docs/measure_confidence.py).
-    # N [1]: the factor is learnt from so many last anchors of a stream
-    anchors: ClassVar[int] = 1024
-    # n [1]: at most so many of them are of one frame
-    each: ClassVar[int] = 64
-    # K [1]: bins of equal size, by confidence
-    bins: ClassVar[int] = 16
-    # h_min [1]: smallest factor of the variance
-    least: ClassVar[float] = 0.1
-    # h_max [1]: largest factor, and largest squared error of an anchor over the variance
-    largest: ClassVar[float] = 25.0
 
 
 @dataclass(frozen=True)
@@ -253,8 +230,6 @@ class UfMStarConfig(Checked):
         regression: exact sum over the Gaussians in view, or the paper's neighbourhood
         ema_alpha: weight of the new disagreement map in the running average
         variance_floor: smallest variance of a pixel
-        add_aleatoric: add the network's aleatoric variance to the result
-        add_epistemic: add the network's epistemic variance to the result
         variances_in_h: average the network's variances, aleatoric and epistemic, over views in the Gaussians (the
             paper's H), and add these averages instead of the pixel's own
         initial_capacity: slots for Gaussians at the start; the number grows as needed
@@ -288,8 +263,6 @@ class UfMStarConfig(Checked):
     regression: str = choice("exact", "neighbourhood")
     ema_alpha: float = number(0.5, "alpha", "1", 0.0, 1.0, open_low=True)
     variance_floor: float = number(0.0, "v_min", "m^2", 0.0)
-    add_aleatoric: bool = True
-    add_epistemic: bool = True
 
     # State
     variances_in_h: bool = False
@@ -302,7 +275,7 @@ class UfMStarConfig(Checked):
 
     # Not in the paper
     anchors: AnchorConfig | None = section(AnchorConfig, optional=True, on=False)
-    confidence: ConfidenceConfig | None = section(ConfidenceConfig, optional=True, on=False)
+    confidence: bool = False
     posterior: PosteriorConfig | None = section(PosteriorConfig, optional=True, on=False)
     merge: MergeConfig | None = section(MergeConfig, optional=True)
 
@@ -319,13 +292,10 @@ class UfMStarConfig(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("posterior", "confidence"):
-            if getattr(self, name) is not None and self.anchors is None:
+            if getattr(self, name) and self.anchors is None:
                 raise ValueError(f"UfMStarConfig.{name} needs anchors: set anchors=AnchorConfig() as well")
-        if self.variances_in_h and (self.anchors is not None or not (self.add_aleatoric or self.add_epistemic)):
-            raise ValueError(
-                "UfMStarConfig.variances_in_h goes with add_aleatoric=True or add_epistemic=True and without anchors "
-                "(posterior=False; --plain), got another setting"
-            )
+        if self.variances_in_h and self.anchors is not None:
+            raise ValueError("UfMStarConfig.variances_in_h goes without anchors (posterior=False; --plain)")
         require_bytes("UfMStarConfig.initial_capacity", self.initial_capacity * (_SLOT + 4 * self.entries))
 
     @classmethod
@@ -362,13 +332,13 @@ class UfMStarConfig(Checked):
         return self.merge is not None and (device_type == "cpu" or self.merge.accelerators)
 
     def within(self, max_depth: float | None, states_confidence: bool = False) -> UfMStarConfig:
-        """The settings for a network that states its largest depth [m], for ``segment.max_depth``, or a confidence, for
-        the section ``confidence`` where there are anchors; each only where the setting is None."""
+        """The settings for a network that states its largest depth [m], for ``segment.max_depth`` where that is None,
+        or a confidence, for ``confidence`` where there are anchors."""
         changes: dict[str, Any] = {}
         if max_depth is not None and self.segment.max_depth is None:
             changes["segment"] = replace(self.segment, max_depth=max_depth)
-        if states_confidence and self.anchors is not None and self.confidence is None:
-            changes["confidence"] = ConfidenceConfig()
+        if states_confidence and self.anchors is not None:
+            changes["confidence"] = True
         return self.replace(**changes) if changes else self
 
     def replace(self, **changes: Any) -> UfMStarConfig:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from types import NoneType
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -13,7 +12,7 @@ from torch import Tensor
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.check import AnchorDoubts, check_anchors
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.frames.arguments import Array, CameraLike, as_device, as_tensor, require_flag, require_kind
+from ufmstar_torch.frames.arguments import Array, CameraLike, as_device, as_tensor
 from ufmstar_torch.frames.frame import FrameInput, as_confidence, check_frame, raise_faults
 from ufmstar_torch.frames.output import MeanUncertainty, UncertaintyOutput
 from ufmstar_torch.frames.warnings import StreamWarnings
@@ -21,7 +20,8 @@ from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.gaussians.state import ALWAYS_FLOAT64, NAMES, UfMStarState
 from ufmstar_torch.kernels.select import FrameKernels, select_frame, select_step
 from ufmstar_torch.posterior.recalibrate import CONFIDENCE, Recalibration
-from ufmstar_torch.runtime.stateful import StatefulModule, full_precision, one_caller, outliving
+from ufmstar_torch.runtime.kinds import require
+from ufmstar_torch.runtime.stateful import StatefulModule, one_caller, undisturbed
 from ufmstar_torch.runtime.warm_up import warm_up
 from ufmstar_torch.steps import variance
 from ufmstar_torch.steps.regress import Regression, query
@@ -67,7 +67,7 @@ class UfMStar(StatefulModule):
         device: torch.device | str | None = None,
     ) -> None:
         super().__init__()
-        require_kind("config", config, (UfMStarConfig, NoneType), "a UfMStarConfig or None")
+        require("config", config, UfMStarConfig | None)
         if not isinstance(dtype, torch.dtype) or dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         self.config = config if config is not None else UfMStarConfig()
@@ -165,9 +165,9 @@ class UfMStar(StatefulModule):
             depth, pose, intrinsics, aleatoric, epistemic, valid, member=member, informative=informative,
             anchors=anchors, confidence=confidence,
         )  # fmt: skip
-        kernels = self._kernels(depth.device.type)[1].sample
+        kernels = self._kernels(depth)[1].sample
         index, used = kernels.pixels(frame.valid, *sample_size(frame.size, pixels, fraction, seed))
-        out = self._observe(frame, index, average=require_flag("average", average))
+        out = self._observe(frame, index, average=bool(require("average", average, bool)))
         return mean_uncertainty(out, used, kernels.summary)
 
     def warm_up(
@@ -198,8 +198,7 @@ class UfMStar(StatefulModule):
         Raises:
             ValueError: wrong shape or frame, or there was no frame yet.
         """
-        with torch.no_grad():
-            return query(self.state, as_tensor("points", points), frame, self.config)
+        return query(self.state, as_tensor("points", points), frame, self.config)
 
     @property
     def mixture(self) -> GaussianMixture:
@@ -222,9 +221,9 @@ class UfMStar(StatefulModule):
             IndexError: an index is out of range.
             ValueError: a mask of the wrong length; ``keep_evidence`` without ``config.anchors``.
         """
-        if require_flag("keep_evidence", keep_evidence) and not self._empty.by_stream:
+        if require("keep_evidence", keep_evidence, bool) and not self._empty.by_stream:
             raise ValueError("keep_evidence needs UfMStarConfig(anchors=AnchorConfig()), got one without anchors")
-        with outliving(), torch.no_grad():  # buffers must outlive the caller's inference mode
+        with undisturbed(self.mean):
             old, b = self.state, self.mean.shape[0]
             if streams is None:
                 self._warnings.reset()
@@ -238,7 +237,7 @@ class UfMStar(StatefulModule):
     def uses_confidence(self) -> bool:
         """True if V depends on the network's confidence."""
         mapped = isinstance(self.recalibration, Recalibration) and self.recalibration.covariate == CONFIDENCE
-        return self.config.confidence is not None or mapped
+        return self.config.confidence or mapped
 
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
         self._empty.with_tensors(state).require(self.config, self._empty)
@@ -250,18 +249,18 @@ class UfMStar(StatefulModule):
         used = {"anchors": self.config.anchors is not None, "confidence": self.uses_confidence}
         for name, value in (("anchors", anchors), ("confidence", confidence)):
             if value is not None and not used[name]:
-                raise ValueError(f"{name} must be None where UfMStarConfig.{name} is None, which switches it off")
+                raise ValueError(f"{name} must be None where UfMStarConfig.{name} is off")
         frame = check_frame(
             depth, T, K, *maps, **view, variances_in_h=self.config.variances_in_h,
             rotation_tolerance=self.config.rotation_tolerance, max_depth=self.config.segment.depth_limit,
-            kernel=self._kernels(depth.device.type)[1].check,
+            kernel=self._kernels(depth)[1].check,
         )  # fmt: skip
         if confidence is not None:
             frame = replace(frame, confidence=as_confidence(confidence, frame))
         if anchors is None:
             return frame
-        variances = [v for v in variance.network_variances(frame, self.config) if v is not None]
-        checked = check_anchors(anchors, frame, variances, self._kernels(depth.device.type)[1].check_anchors)
+        variances = [v for v in (frame.aleatoric, frame.epistemic) if v is not None]
+        checked = check_anchors(anchors, frame, variances, self._kernels(depth)[1].check_anchors)
         self._doubts.judge(anchors, checked, frame.size)
         return replace(frame, anchors=checked)
 
@@ -271,14 +270,13 @@ class UfMStar(StatefulModule):
     ) -> UncertaintyOutput:  # fmt: skip
         """Run the step and the corrections by anchors, and store the new state. The maps are [B, n] at ``pixels``,
         indices into the flattened image; without these, ``network`` has the caller's maps, whose shape they get."""
-        # Outside the caller's inference mode, since the state must outlive it.
-        with outliving(), torch.set_grad_enabled(False), full_precision(frame.depth.device):
+        with undisturbed(frame.depth):
             state = self._stored().for_frame(frame, self.config)
             if self.config.on_bad_frame == "raise":
                 raise_faults(frame)
             if self.observer is not None:
                 self.observer.stage("check")
-            step, kernels = self._kernels(frame.depth.device.type)
+            step, kernels = self._kernels(frame.depth)
             state, out = step(state, frame, self.config, pixels=pixels, smooth=average, observer=self.observer)
             merging = kernels.merge
             state, out, factor = variance.corrected(state, frame, out, self.config, self.recalibration, pixels, merging)
@@ -290,7 +288,7 @@ class UfMStar(StatefulModule):
         if network is not None:
             maps = self._shaped(maps, network, frame.confidence)
         depth, V, valid = maps.pop("depth"), maps.pop("variance"), maps.pop("valid")
-        out = replace(out, depth=depth, variance=V, valid=valid, maps=maps)
+        out = UncertaintyOutput(depth, V, valid, maps, out.statistics, out.quantiles)
         self._store(state.tensors())  # last, so that an earlier error changes nothing
         self._warnings.after_frame(frame, out.statistics, state.frames, self.config)
         return out
@@ -309,11 +307,11 @@ class UfMStar(StatefulModule):
         return {name: value.reshape(depth.shape) for name, value in maps.items()} if depth.dim() == 4 else maps
 
     def _stored(self) -> UfMStarState:
-        return self._empty.with_tensors(cast("dict[str, Tensor]", self._buffers))  # avoids ``__getattr__``
+        return self._empty.with_tensors(self._buffers)  # type: ignore[arg-type]  # avoids ``__getattr__``
 
-    def _kernels(self, device_type: str) -> tuple[Step, FrameKernels]:
-        """The step and the check for a device. The step is cached, since a GPU's counts components."""
-        key = (self.config.backend, device_type)
+    def _kernels(self, like: Tensor) -> tuple[Step, FrameKernels]:
+        """The step and the check for a tensor's device. The step is cached, since a GPU's counts components."""
+        key = (self.config.backend, "cpu" if like.is_cpu else like.device.type)
         if self._cached_step is None or self._cached_step[0] != key:
             self._cached_step = key, select_step(*key), select_frame(*key)
         return self._cached_step[1:]

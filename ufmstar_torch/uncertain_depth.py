@@ -6,7 +6,6 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from types import NoneType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
@@ -24,8 +23,7 @@ from ufmstar_torch.frames.arguments import (
     as_image,
     as_intrinsics,
     as_pose,
-    require_flag,
-    require_kind,
+    require_size,
     require_whole,
 )
 from ufmstar_torch.frames.image_check import warn_of_range
@@ -41,8 +39,9 @@ from ufmstar_torch.frames.prediction import (
     shared_preprocess,
 )
 from ufmstar_torch.posterior.recalibrate import Recalibration
+from ufmstar_torch.runtime.kinds import require
 from ufmstar_torch.runtime.stateful import OneCaller, one_caller
-from ufmstar_torch.runtime.warm_up import require_size, warm_up
+from ufmstar_torch.runtime.warm_up import warm_up
 from ufmstar_torch.ufmstar import UfMStar
 
 # Keys of a stream's state, or prefixes of keys: of UfM*, of the anchors' source, and the number of processed images.
@@ -154,9 +153,9 @@ class UncertainDepth(NetworksInTurn):
         _require_passes(members, mode, samples)
         super().__init__(members or None, samples=samples, preprocess=preprocess)
         self._caller, self.mode = OneCaller(), mode
-        require_kind("config", config, (UfMStarConfig, NoneType), "a UfMStarConfig or None")
-        require_kind("recalibration", recalibration, (Recalibration, NoneType), "a Recalibration or None")
-        posterior = require_flag("posterior", posterior)
+        require("config", config, UfMStarConfig | None)
+        require("recalibration", recalibration, Recalibration | None)
+        posterior = bool(require("posterior", posterior, bool))
         config, source = with_evidence(config or UfMStarConfig(), networks, posterior, anchors)
         self.ufm = UfMStar(config.within(self.max_depth, self.states_confidence), recalibration=recalibration)
         self._evidence = ImageEvidence(
@@ -295,7 +294,7 @@ class UncertainDepth(NetworksInTurn):
         Raises:
             ValueError, TypeError: as :meth:`UfMStar.forward`; the image is then not counted.
         """
-        require_kind("prediction", prediction, DepthPrediction, "a DepthPrediction")
+        require("prediction", prediction, DepthPrediction)
         maps = prediction.arguments(confidence=self.ufm.uses_confidence)
         out = self.ufm(pose=pose, intrinsics=intrinsics, valid=valid, anchors=anchors, **maps)
         self._next += 1
@@ -323,7 +322,7 @@ class UncertainDepth(NetworksInTurn):
         if isinstance(frames, Tensor | np.ndarray):
             raise TypeError(f"frames must be an iterable of (image, pose, intrinsics), got {type(frames).__name__}")
         with ThreadPoolExecutor(1, thread_name_prefix="network") as pool:
-            for frame in require_kind("frames", frames, Iterable, "an iterable of (image, pose, intrinsics)"):
+            for frame in require("frames", frames, Iterable):
                 if not isinstance(frame, tuple | list) or len(frame) != 3:
                     raise TypeError(f"frames must yield (image, pose, intrinsics), got {type(frame).__name__}")
                 if waiting is None or not self._networks_on_cpu():
@@ -414,7 +413,7 @@ class UncertainDepth(NetworksInTurn):
         Raises:
             ValueError: as :meth:`UfMStar.warm_up`.
         """
-        require_size(size, streams)
+        size, streams = require_size("size", size), require_whole("streams", streams, 1)
         searching = () if self.landmarks is None else self.landmarks.searching
         if self.networks:
             size = self.run_on_noise(size, streams)
@@ -464,7 +463,7 @@ class UncertainDepth(NetworksInTurn):
         """
         before = self.stream_state()
         try:
-            self._load(require_kind("state", state, Mapping, "a mapping of names to tensors"))
+            self._load(require("state", state, Mapping))
         except BaseException:
             self._load(before)
             raise

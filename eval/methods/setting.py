@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ufmstar_torch.anchors.names import CORNERS, DENSE, FILE_TYPES
-from ufmstar_torch.config import AnchorConfig, ConfidenceConfig, MergeConfig, PosteriorConfig, UfMStarConfig
+from ufmstar_torch.config import AnchorConfig, MergeConfig, PosteriorConfig, UfMStarConfig
 from ufmstar_torch.runtime.checked import Checked, choice, flat, number
 
 TRUTH = "truth"
@@ -168,7 +168,7 @@ def default_of(name: str, preset: str = DEFAULTS) -> Any:
     if name in _OWN:
         return getattr(DEFAULT, name)
     # The row's ``anchors`` and ``posterior`` switch their sections on; the paper's preset switches merging off.
-    on = started(preset, anchors=True, posterior=True).replace(confidence=ConfidenceConfig())
+    on = started(preset, anchors=True, posterior=True).replace(confidence=True)
     off = dict.fromkeys(flat(MergeConfig().to_dict(), "merge.")) if on.merge is None else {}
     values = flat(on.to_dict()) | off
     if inner := [other for other in values if other.startswith(f"{name}.")]:

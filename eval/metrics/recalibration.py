@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 LEVELS = np.arange(0.1, 0.91, 0.1)
 NORMAL = ndtri(0.5 + LEVELS / 2)  # quantiles of |z| at these levels
 GROUPS, CONFIDENCE_GROUPS = 32, 16
-LARGEST = 25.0  # limit of squared error over variance, as for anchors (``ConfidenceConfig.largest``)
+LARGEST = 25.0  # limit of squared error over variance, as for anchors (``anchors.confidence.MOST``)
 
 
 def centres(bins: int) -> Array:

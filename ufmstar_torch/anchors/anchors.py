@@ -72,13 +72,9 @@ class Anchors:
     @classmethod
     @check_kinds
     def from_points(
-        cls,
-        points_cam: Tensor,
-        variance: Tensor,
-        intrinsics: Tensor,
-        size: tuple[int, int],
+        cls, points_cam: Tensor, variance: Tensor, intrinsics: Tensor, size: tuple[int, int],
         valid: Tensor | None = None,
-    ) -> Anchors:
+    ) -> Anchors:  # fmt: skip
         """Convert points in the camera frame, such as landmarks of a map or returns of a range sensor, to anchors.
 
         A point is invalid if it lies behind the camera or outside the image, or if a value is not finite. Rows of
@@ -121,6 +117,7 @@ class Anchors:
         """[B, N] ``valid``, all True for None."""
         return torch.ones_like(self.depth, dtype=torch.bool) if self.valid is None else self.valid
 
+    @check_kinds
     def moved(self, K_from: Tensor, K_to: Tensor) -> Anchors:
         """Map the anchors to the pixels of a resized or cropped image of the same camera.
 

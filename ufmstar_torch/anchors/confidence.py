@@ -3,7 +3,7 @@
 A confidence c orders the pixels by quality. Its unit is unknown, and so is whether large values are good or bad. At an
 anchor (depth g, variance s^2) of a pixel with prediction d and variance V, the network's squared error is
 
-    y = min((g - d)^2 / (V + s^2), largest),      with the weight w = (V / (V + s^2))^2;
+    y = min((g - d)^2 / (V + s^2), 25),      with the weight w = (V / (V + s^2))^2;
 
 y is 1 on average where V is right, and w is small for an anchor that is noisier than V. The last anchors of a stream
 are divided by c into bins of equal size. The mean of each bin includes a prior of kappa anchors with y = 1,
@@ -32,7 +32,6 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
-from ufmstar_torch.config import ConfidenceConfig
 from ufmstar_torch.frames.frame import LARGEST, FrameInput
 
 # Numbers per anchor: c, y, w. Statistics of the gains: the number of frames, and, for the gain over V and over one
@@ -41,6 +40,11 @@ FIELDS, GAINS = 3, 5
 # c is used after this many frames with a gain, and a frame has a gain from this many anchors per bin on. The mean gain
 # [nat] must exceed its standard error by USEFUL; a smaller gain is rounding or useless.
 FEWEST, FULL, USEFUL = 5, 4, 1e-3
+# Constants, chosen on rendered tours (docs/measure_confidence.py): number of last anchors of a stream from which the
+# factor is learnt, and of those of one frame at most; bins of equal size; kappa, anchors in a bin with which its factor
+# counts half, and 1 the other half; age at which a frame's verdict counts half [frames]; range of the factor, whose
+# upper end is the largest squared error over the variance, too.
+ANCHORS, EACH, BINS, SHRINKAGE, HALF_LIFE, LEAST, MOST = 1024, 64, 16, 16.0, 20.0, 0.1, 25.0
 
 
 @dataclass(frozen=True)
@@ -68,18 +72,18 @@ class Learnt:
         """[B, 3 N + 5], for :meth:`of`."""
         return torch.cat([torch.stack([self.c, self.y, self.w], 1).flatten(1), self.gains], 1)
 
-    def added(self, c: Tensor, y: Tensor, w: Tensor, limit: int) -> Learnt:
-        """A copy with at most ``limit`` anchors of a frame [B, n], evenly chosen, in place of the oldest."""
-        chosen = evenly(w > 0, limit)
+    def added(self, c: Tensor, y: Tensor, w: Tensor) -> Learnt:
+        """A copy with at most ``EACH`` anchors of a frame [B, n], evenly chosen, in place of the oldest."""
+        chosen = evenly(w > 0, EACH)
         pairs = ((self.c, c), (self.y, y), (self.w, w))
         every = [torch.cat([old, torch.where(chosen, new, 0)], 1) for old, new in pairs]
         order = (every[2] > 0).to(torch.int8).argsort(dim=1, stable=True)[:, c.shape[1] :]
         return replace(self, **dict(zip("cyw", (value.gather(1, order) for value in every), strict=True)))
 
-    def judged(self, gains: Sequence[Tensor], fresh: Tensor, half_life: float) -> Learnt:
+    def judged(self, gains: Sequence[Tensor], fresh: Tensor) -> Learnt:
         """A copy with the frame's mean gains over V and over one factor, each [B], added for the streams ``fresh``."""
         one = torch.stack([torch.ones_like(gains[0]), *(f(g) for g in gains for f in (torch.clone, torch.square))], 1)
-        faded = 0.5 ** (1 / half_life) * self.gains + one.to(self.gains)
+        faded = 0.5 ** (1 / HALF_LIFE) * self.gains + one.to(self.gains)
         return replace(self, gains=torch.where(fresh[:, None], faded, self.gains))
 
     def gain(self) -> Tensor:
@@ -100,25 +104,24 @@ def evenly(valid: Tensor, limit: int) -> Tensor:
     return valid & ((valid.cumsum(1) - 1) % stride.clamp_min(1) == 0)
 
 
-def factors(learnt: Learnt, config: ConfidenceConfig) -> tuple[Tensor, Tensor, Tensor]:
+def factors(learnt: Learnt) -> tuple[Tensor, Tensor, Tensor]:
     """The map h: edges [B, K - 1] of the bins in c, factors [B, K], and the single factor without c [B, 1].
 
     Bin k holds the values c that have k edges at or below them. The edges are quantiles of the anchors' c.
     """
-    learnt_from, bins = learnt.w > 0, config.bins
+    learnt_from = learnt.w > 0
     ordered = torch.where(learnt_from, learnt.c, torch.inf).sort(1).values
-    step = torch.arange(1, bins, device=ordered.device) * learnt_from.sum(1, keepdim=True) // bins
+    step = torch.arange(1, BINS, device=ordered.device) * learnt_from.sum(1, keepdim=True) // BINS
     edges = ordered.gather(1, step)
     at = torch.searchsorted(edges.contiguous(), learnt.c.contiguous(), right=True)
-    w, wy = (torch.zeros_like(ordered[:, :bins]).scatter_add(1, at, v) for v in (learnt.w, learnt.w * learnt.y))
-    prior = config.shrinkage
-    weight, mean = w + prior, (wy + prior) / (w + prior)
+    w, wy = (torch.zeros_like(ordered[:, :BINS]).scatter_add(1, at, v) for v in (learnt.w, learnt.w * learnt.y))
+    weight, mean = w + SHRINKAGE, (wy + SHRINKAGE) / (w + SHRINKAGE)
     rising, falling = isotonic(*(torch.cat([v, v.flip(1)]) for v in (mean, weight))).chunk(2)
     falling = falling.flip(1)
     misfit = [(weight * (mean - fitted).square()).sum(1, keepdim=True) for fitted in (rising, falling)]
     h = torch.where(misfit[0] <= misfit[1], rising, falling)
-    one = (wy.sum(1, keepdim=True) + prior) / (w.sum(1, keepdim=True) + prior)
-    return edges, h.clamp(config.least, config.largest), one.clamp(config.least, config.largest)
+    one = (wy.sum(1, keepdim=True) + SHRINKAGE) / (w.sum(1, keepdim=True) + SHRINKAGE)
+    return edges, h.clamp(LEAST, MOST), one.clamp(LEAST, MOST)
 
 
 def isotonic(value: Tensor, weight: Tensor) -> Tensor:
@@ -139,16 +142,13 @@ def read(c: Tensor, edges: Tensor, h: Tensor) -> Tensor:
     return torch.where(c.isnan(), 1.0, h.gather(1, bins))
 
 
-def after_frame(
-    packed: Tensor, frame: FrameInput, variance: Tensor | None, config: ConfidenceConfig
-) -> tuple[Tensor, Tensor, Tensor]:
+def after_frame(packed: Tensor, frame: FrameInput, variance: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Test the map at the frame's anchors, update it with them, and apply it.
 
     Args:
         packed: [B, S] the statistics of the frames before (:class:`Learnt`).
         frame: with a confidence.
         variance: V before the map [B, H, W] [m^2]; None = the map is applied but not updated.
-        config: of the confidence.
 
     Returns:
         The statistics, h(c) [B, H, W], and the gain [B] (:meth:`Learnt.gain`); h is 1 where the gain is not positive.
@@ -156,15 +156,15 @@ def after_frame(
     assert frame.confidence is not None
     learnt = Learnt.of(packed)
     if variance is not None and frame.anchors is not None:
-        learnt = _taught(learnt, frame.confidence, frame.anchors, variance, config)
-    edges, h, _ = factors(learnt, config)
+        learnt = _taught(learnt, frame.confidence, frame.anchors, variance)
+    edges, h, _ = factors(learnt)
     gain = learnt.gain()
     h = torch.where(gain[:, None] > 0, h, torch.ones_like(h))
     factor = read(frame.confidence.flatten(1).to(edges), edges, h).view_as(frame.confidence)
     return learnt.packed(), factor, gain
 
 
-def _taught(learnt: Learnt, confidence: Tensor, anchors: Anchors, variance: Tensor, config: ConfidenceConfig) -> Learnt:
+def _taught(learnt: Learnt, confidence: Tensor, anchors: Anchors, variance: Tensor) -> Learnt:
     """The statistics after a frame's anchors."""
     dtype = learnt.c.dtype
     c = confidence.flatten(1).gather(1, anchors.index).to(dtype)
@@ -172,25 +172,22 @@ def _taught(learnt: Learnt, confidence: Tensor, anchors: Anchors, variance: Tens
     usable = anchors.mask & V.isfinite() & (V > 0) & ~c.isnan()
     V = torch.where(usable, V, torch.ones_like(V))
     spread = V + anchors.variance
-    y = ((anchors.depth - anchors.predicted).square() / spread).clamp_max(config.largest).to(dtype)
+    y = ((anchors.depth - anchors.predicted).square() / spread).clamp_max(MOST).to(dtype)
     w = torch.where(usable, (V / spread).square(), torch.zeros_like(V)).to(dtype)
-    edges, h, one = factors(learnt, config)
+    edges, h, one = factors(learnt)
     likelihood = [-0.5 * (y / f + f.log()) for f in (read(c, edges, h), torch.ones_like(one), one)]
     weight = w.sum(1)
     gains = [(w * (likelihood[0] - other)).sum(1) / weight.clamp_min(1e-6) for other in likelihood[1:]]
-    enough = (learnt.w > 0).sum(1) >= FULL * config.bins
-    judged = learnt.judged(gains, enough & (weight > 0), config.half_life)
-    return judged.added(c.nan_to_num(), y, w, config.each)
+    enough = (learnt.w > 0).sum(1) >= FULL * BINS
+    return learnt.judged(gains, enough & (weight > 0)).added(c.nan_to_num(), y, w)
 
 
-def size(config: ConfidenceConfig) -> int:
-    """Numbers per stream of the statistics."""
-    return FIELDS * config.anchors + GAINS
+SIZE = FIELDS * ANCHORS + GAINS  # numbers per stream of the statistics
 
 
-def require(packed: Tensor, config: ConfidenceConfig) -> None:
+def require(packed: Tensor) -> None:
     """Raise a ValueError if no anchors can have led to the statistics."""
     learnt = Learnt.of(packed)
-    bad = (learnt.w < 0) | (learnt.w > 1) | (learnt.y < 0) | (learnt.y > config.largest)
+    bad = (learnt.w < 0) | (learnt.w > 1) | (learnt.y < 0) | (learnt.y > MOST)
     if bool(bad.any()) or bool((learnt.gains[:, ::2] < 0).any()) or bool((learnt.gains.abs() > LARGEST).any()):
         raise ValueError("confidence holds impossible errors, weights or gains")

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.anchors.kernels.landmarks import Columns, Sighted, settle, sight
+from ufmstar_torch.anchors.kernels.windows import SIDE
 from ufmstar_torch.anchors.saved_state import SavedState
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
-
-if TYPE_CHECKING:
-    from ufmstar_torch.anchors.kernels.landmarks import Columns, Sighted
 
 _FIRST_APART = 0.01**2  # first value of the running estimate
 
@@ -48,8 +47,6 @@ class Memory(SavedState):
 
     def reset(self) -> None:
         """Forget everything."""
-        from ufmstar_torch.anchors.kernels.windows import SIDE
-
         n = self._count
         self._point, self._pose = np.zeros((n, 3)), np.tile(np.eye(4), (n, 1, 1))
         self._sigma = np.zeros(n)  # of the distance from the measuring camera, as a share of it
@@ -62,14 +59,10 @@ class Memory(SavedState):
         self, image: NDArray[np.uint8], T_world_cam: NDArray[np.float64], K: NDArray[np.float64], cell: int
     ) -> Sighted:
         """Find the landmarks that the next image shows, see :func:`ufmstar_torch.anchors.kernels.landmarks.sight`."""
-        from ufmstar_torch.anchors.kernels.landmarks import sight
-
         self.frame += 1
         return sight(self._columns(), self.frame, image, T_world_cam, K, cell)
 
     def _columns(self) -> Columns:
-        from ufmstar_torch.anchors.kernels.landmarks import Columns
-
         of_cameras = self._point, self._pose, self._sigma, self._patch
         return Columns(*of_cameras, self._used, self._confirmed, self._failed, self._seen)
 
@@ -83,15 +76,10 @@ class Memory(SavedState):
         self._used[:] = False
 
     def settle(
-        self,
-        sighted: Sighted,
-        image: NDArray[np.uint8],
-        T_world_cam: NDArray[np.float64],
-        K: NDArray[np.float64],
-        depth: float,
-        measured: tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]],
+        self, sighted: Sighted, image: NDArray[np.uint8], T_world_cam: NDArray[np.float64], K: NDArray[np.float64],
+        depth: float, measured: tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]],
         trusted: bool,
-    ) -> tuple[int, int, float]:
+    ) -> tuple[int, int, float]:  # fmt: skip
         """Confirm or refute landmarks by new measurements, and store these.
 
         Args:
@@ -107,8 +95,6 @@ class Memory(SavedState):
         Returns:
             n; the number of refuted landmarks; the new median of the scene's depth [m].
         """
-        from ufmstar_torch.anchors.kernels.landmarks import settle
-
         numbers, camera = np.array([self.apart, depth]), (T_world_cam, inverse_intrinsics(K))
         arguments = sighted, *measured, trusted, self._fading, numbers
         found, refuted = settle(self._columns(), self.frame, image, *camera, *arguments)

@@ -12,6 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ufmstar_torch.runtime.kinds import require
+
 Shapes = Sequence[tuple[int, ...]]
 _RESOLUTION, _TOO_FAR = 0.01, 1e10  # [m] coarsest accepted pose coordinates, and the value that replaces coarser ones
 Array: TypeAlias = Tensor | NDArray[Any]
@@ -43,18 +45,6 @@ def _unmasked(name: str, value: np.ma.MaskedArray[Any, Any]) -> NDArray[Any]:
     if value.dtype.kind in "iu" and np.ma.is_masked(value):
         raise TypeError(f"{name} must not be masked, since {value.dtype} has no value that is not valid: pass floats")
     return np.asarray(value.filled(np.nan if value.dtype.kind == "f" else False))
-
-
-def require_kind(name: str, value: Any, kinds: type | tuple[type, ...], expected: str) -> Any:
-    """Return the argument ``name`` if it has one of the types. Raises TypeError; ``expected`` describes them."""
-    if not isinstance(value, kinds):
-        raise TypeError(f"{name} must be {expected}, got {type(value).__name__}")
-    return value
-
-
-def require_flag(name: str, value: object) -> bool:
-    """The argument ``name`` if it is True or False. Raises TypeError: another type."""
-    return bool(require_kind(name, value, (bool, np.bool_), "True or False"))
 
 
 def require_whole(name: str, value: object, least: int | None = None) -> int:
@@ -94,7 +84,7 @@ def as_device(name: str, value: Any) -> torch.device:
     """The argument ``name`` as a device, the CPU for None. Raises TypeError, ValueError: no device."""
     if value is None:
         return torch.device("cpu")
-    require_kind(name, value, (torch.device, str), "a torch.device, its name or None")
+    require(name, value, torch.device | str)
     try:
         return torch.device(value)
     except RuntimeError as error:
@@ -103,7 +93,7 @@ def as_device(name: str, value: Any) -> torch.device:
 
 def as_path(name: str, value: object) -> Path:
     """The argument ``name`` as a path. Raises TypeError: no text and no path."""
-    return Path(require_kind(name, value, (str, os.PathLike), "a file name or path"))
+    return Path(require(name, value, str | os.PathLike))
 
 
 def as_image(image: ImageLike) -> Tensor:
@@ -196,7 +186,9 @@ def _numbers(name: str, value: object) -> Tensor:
         except (TypeError, ValueError) as error:
             raise TypeError(f"{name} must hold numbers, got {value!r:.60}") from error
     numbers = as_tensor(name, value)
-    whole = not numbers.is_floating_point() and not numbers.is_complex() and numbers.dtype != torch.bool
+    if numbers.is_floating_point():
+        return numbers
+    whole = not numbers.is_complex() and numbers.dtype != torch.bool
     return require_float(name, numbers.double() if whole else numbers)
 
 

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from ufmstar_torch.frames.arguments import as_tensor, require_number
 from ufmstar_torch.frames.prediction import DepthPrediction
-from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.posterior.distribution import LEAST_VARIANCE, DepthDistribution
 
 _WITHOUT_EVIDENCE = (
@@ -149,17 +148,15 @@ class UncertaintyOutput:
     Attributes:
         depth: the best that is known [m]: the posterior's, NaN where not valid, or else the network's. Before the first
             anchor of a stream, the posterior's equals the network's.
-        variance: of ``depth`` [m^2]: the posterior's, or else V of UfM*: M, plus A and E if passed (and not switched
-            off in the config), plus B with ``config.anchors``; at least ``config.variance_floor``. NaN where not valid.
-            The posterior's is that of a mixture: ``posterior_inlier_variance`` with the probability
-            1 - ``posterior_outlier``.
+        variance: of ``depth`` [m^2]: the posterior's, or else V of UfM*: M, plus A and E if passed, plus B with
+            ``config.anchors``; at least ``config.variance_floor``. NaN where not valid. The posterior's is that of a
+            mixture: ``posterior_inlier_variance`` with the probability 1 - ``posterior_outlier``.
         valid: True where the pixel was used.
         maps: the further maps by name.
         statistics: per-stream counts of this frame.
         quantiles: [B, 3] half-widths of the central intervals of 50, 90 and 99 %, in standard deviations of a normal
             distribution (``posterior.conformal``). NaN in a stream without evidence; None without a posterior or a
             ``Recalibration``.
-        current_cam: C_i, the segments of this frame in the camera frame, float64, or None.
         prediction: the network's output, for "full" the predictive mean with mean A and E over the members; None for a
             module without networks.
         member: index of the network that was run; None if all were, or none.
@@ -172,7 +169,6 @@ class UncertaintyOutput:
     maps: Mapping[str, Tensor]
     statistics: FrameStatistics
     quantiles: Tensor | None = None
-    current_cam: GaussianMixture | None = None
     prediction: DepthPrediction | None = None
     member: int | None = None
     corrected: UncertaintyOutput | None = None

@@ -26,10 +26,7 @@ class GaussianMixture:
         views: [B, K] n, the sum of w over the views that were compared; 0 = seen in a single view.
         reference: [B, K, 5] the reference view (``steps.fuse``): the camera's centre in the first camera's frame [m],
             the index of the network, and the largest change q of the view since.
-        features: [B, K, F] further entries of H, running averages in the caller's units.
-
-    Raises:
-        ValueError: a tensor has another shape.
+        features: [B, K, F] further entries of H, running averages.
     """
 
     mean: Tensor
@@ -89,6 +86,7 @@ class GaussianMixture:
         """``Tensor.to`` on every field."""
         return GaussianMixture(**{name: value.to(*args, **kwargs) for name, value in self.tensors().items()})
 
+    @check_kinds
     def rigid(self, R: Tensor, t: Tensor) -> GaussianMixture:
         """The mixture in another frame (section "Projection to the Image Plane", step 1).
 
@@ -122,17 +120,3 @@ class GaussianMixture:
             return torch.cat([value, value.new_zeros(value.shape[0], missing, *value.shape[2:])], dim=1)
 
         return GaussianMixture(**{name: pad(value) for name, value in self.tensors().items()})
-
-    def __post_init__(self) -> None:
-        if wrong := [name for name, value in vars(self).items() if not isinstance(value, Tensor)]:
-            raise TypeError(f"{wrong[0]} must be a torch.Tensor, got {type(getattr(self, wrong[0])).__name__}")
-        if self.weight.dim() != 2:
-            raise ValueError(f"weight must have shape (B, K), got {tuple(self.weight.shape)}")
-        slots = b, k = self.weight.shape
-        expected = {
-            "mean": (b, k, 3), "covariance": (b, k, 3, 3), "disagreement": slots, "compared": slots,
-            "views": slots, "reference": (b, k, 5), "features": (b, k, *self.features.shape[-1:]),
-        }  # fmt: skip
-        for name, shape in expected.items():
-            if getattr(self, name).shape != shape:
-                raise ValueError(f"{name} must have shape {tuple(shape)}, got {tuple(getattr(self, name).shape)}")

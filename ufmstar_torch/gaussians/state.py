@@ -69,9 +69,8 @@ class UfMStarState:
         if config.anchors is not None:
             by_component["evidence"] = torch.zeros(streams, capacity, SUMS, dtype=dtype, device=device)
             by_stream["overall_evidence"] = torch.zeros(streams, SUMS, dtype=dtype, device=device)
-        if config.confidence is not None:
-            size = confidence.size(config.confidence)
-            by_stream["confidence"] = torch.zeros(streams, size, dtype=dtype, device=device)
+        if config.confidence:
+            by_stream["confidence"] = torch.zeros(streams, confidence.SIZE, dtype=dtype, device=device)
         if config.posterior is not None:
             by_stream["posterior"] = torch.zeros(streams, running.SIZE, dtype=torch.float64, device=device)
         return cls(
@@ -91,13 +90,13 @@ class UfMStarState:
         Raises:
             ValueError: the frame has another number of streams, or lies on another device.
         """
-        streams, device, before = frame.depth.shape[0], frame.depth.device, self.mean.shape[0]
+        depth, streams, before = frame.depth, frame.depth.shape[0], self.mean.shape[0]
         if before == 0:
-            return UfMStarState.initial(streams, config, self.mean.dtype, device)
+            return UfMStarState.initial(streams, config, self.mean.dtype, depth.device)
         if before != streams:
             raise ValueError(f"depth has {streams} streams but the state holds {before}: call reset() first")
-        if self.mean.device != device:
-            raise ValueError(f"depth lies on {device} but the state on {self.mean.device}: move one with .to()")
+        if not (self.mean.is_cpu and depth.is_cpu) and self.mean.device != depth.device:
+            raise ValueError(f"depth lies on {depth.device} but the state on {self.mean.device}: move one with .to()")
         return self
 
     @property
@@ -161,8 +160,8 @@ class UfMStarState:
         for name in ("evidence", "overall_evidence") if config.anchors is not None else ():
             if bool((tensors[name][..., 0] < 0).any()) or bool((tensors[name].abs() > LARGEST).any()):
                 raise ValueError(f"{name} holds negative weights or values beyond {LARGEST:g}")
-        if config.confidence is not None:
-            confidence.require(tensors["confidence"], config.confidence)
+        if config.confidence:
+            confidence.require(tensors["confidence"])
         if config.posterior is not None:
             running.require(tensors["posterior"])
 
@@ -176,8 +175,11 @@ class UfMStarState:
         """A copy with some tensors replaced, by name."""
         named = {**vars(self), **changed}
         for group in ("by_component", "by_stream"):
-            named[group] = {name: named.pop(name, value) for name, value in getattr(self, group).items()}
-        return UfMStarState(**named)
+            if own := named[group]:
+                named[group] = {name: named.pop(name, value) for name, value in own.items()}
+        state = UfMStarState.__new__(UfMStarState)  # the constructor takes ten times as long
+        vars(state).update(named)
+        return state
 
     def restarted(self, again: Tensor) -> UfMStarState:
         """A copy with the streams of the mask ``again`` [B] set to the state before their first frame."""

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ufmstar_torch.frames.arguments import require_kind, require_number
+from ufmstar_torch.frames.arguments import require_number
+from ufmstar_torch.runtime.kinds import require
 
 # [s] An image this close to a sample has the sample's pose, whatever the gap around it: timestamps are printed with
 # four to six decimals, and at 1 m/s the camera moves 1 mm in that time.
@@ -42,7 +43,7 @@ def interpolate_pose(trajectory: Trajectory, time: float, max_gap: float = 0.1) 
         ValueError: the trajectory has no timestamps.
     """
     time, max_gap = require_number("time", time), require_number("max_gap", max_gap)
-    times = require_kind("trajectory", trajectory, Trajectory, "a Trajectory").timestamps
+    times = require("trajectory", trajectory, Trajectory).timestamps
     if times is None:
         raise ValueError("trajectory has no timestamps, so it cannot be interpolated")
     after = int(np.searchsorted(times, time))

@@ -60,11 +60,12 @@ def check_fields(instance: Any) -> None:
             raise ValueError(error) from error
 
 
-def require(name: str, value: object, hint: Any) -> None:
-    """Raises TypeError: the argument ``name`` has not the kind of a type hint."""
+def require(name: str, value: Any, hint: Any) -> Any:
+    """The argument ``name``. Raises TypeError: it has not the kind of a type hint."""
     if not _fits(value, hint):
         inside = f" of {type(value[0]).__name__}" if isinstance(value, list | tuple) and value else ""
         raise TypeError(f"{name} must be {_described(hint)}, got {type(value).__name__}{inside}")
+    return value
 
 
 def _fits(value: object, hint: Any) -> bool:
@@ -118,4 +119,4 @@ def _described(hint: Any) -> str:
     if origin is type:
         return f"a class derived from {args[0].__name__}"
     kind = NoneType if hint is None else origin or hint
-    return _NAMES[kind][1] if kind in _NAMES else f"{'an' if kind.__name__[0] in 'AEIOU' else 'a'} {kind.__name__}"
+    return _NAMES[kind][1] if kind in _NAMES else f"{'an' if kind.__name__[0] in 'AEIO' else 'a'} {kind.__name__}"

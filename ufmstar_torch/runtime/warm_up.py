@@ -20,8 +20,7 @@ from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.anchors.kernels.bundle import refine
 from ufmstar_torch.anchors.tracker import LandmarkTracker
-from ufmstar_torch.frames import arguments
-from ufmstar_torch.frames.arguments import require_whole
+from ufmstar_torch.frames.arguments import require_size, require_whole
 from ufmstar_torch.gaussians.camera import camera_of
 from ufmstar_torch.kernels.compile_cpu import on_disk
 
@@ -68,7 +67,8 @@ def warm_up(
     Raises:
         ValueError: a size or number of streams that is not positive.
     """
-    require_size(size, streams)
+    require_size("size", size)
+    require_whole("streams", streams, 1)
     if progress is not None and not callable(progress):
         raise TypeError(f"progress must be a function of two numbers or None, got {type(progress).__name__}")
     height, width = size
@@ -93,12 +93,6 @@ def warm_up(
         for kind in sources:
             along_wall(kind())
             stages.stage("")
-
-
-def require_size(size: tuple[int, int], streams: int) -> None:
-    """Raise a TypeError or ValueError unless ``size`` is (H, W) and all three numbers are positive."""
-    arguments.require_size("size", size)
-    require_whole("streams", streams, 1)
 
 
 def along_wall(evidence: Source) -> None:

@@ -1,8 +1,8 @@
 """V = M + A + E + B of a frame, and the corrections that follow it, in their order.
 
-M is the step's (section "Uncertainty Regression"); A and E are the network's, as far as the config adds them. What is
-not in the paper: B (``anchors.learn``), the factor of the network's confidence (``anchors.confidence``), the user's map
-of V (``posterior.recalibrate``), the posterior (``posterior.update``) and merging (``steps.merge``).
+M is the step's (section "Uncertainty Regression"); A and E are the network's. What is not in the paper: B
+(``anchors.learn``), the factor of the network's confidence (``anchors.confidence``), the user's map of V
+(``posterior.recalibrate``), the posterior (``posterior.update``) and merging (``steps.merge``).
 """
 
 from __future__ import annotations
@@ -40,22 +40,18 @@ def require_map(mapped: VarianceMap | None, config: UfMStarConfig) -> VarianceMa
     return mapped
 
 
-def network_variances(frame: FrameInput, config: UfMStarConfig) -> tuple[Tensor | None, Tensor | None]:
-    """A and E of a frame [B, H, W] [m^2]; None = not predicted, or not added."""
-    A, E = frame.aleatoric, frame.epistemic
-    return A if config.add_aleatoric else None, E if config.add_epistemic else None
-
-
 def network_maps(
     frame: FrameInput, features: Tensor, config: UfMStarConfig, pixels: Tensor | None
 ) -> dict[str, Tensor]:
-    """A and E by name, as far as they are predicted and added: [B, H, W], or [B, n] at ``pixels``, whose regressed
+    """A and E by name, as far as they are predicted: [B, H, W], or [B, n] at ``pixels``, whose regressed
     features are [..., F].
 
     With ``config.variances_in_h`` the last three features are the mixture's A, E and weight share s; each of A and E is
     then its mean over the mixture plus (1 - s) times the pixel's own.
     """
-    pairs = zip(("aleatoric", "epistemic"), network_variances(frame, config), strict=True)
+    if frame.aleatoric is None and frame.epistemic is None:
+        return {}
+    pairs = ("aleatoric", frame.aleatoric), ("epistemic", frame.epistemic)
     maps = {name: at_pixels(value, pixels) for name, value in pairs if value is not None}
     if config.variances_in_h:
         *means, explained = features[..., -3:].unbind(-1)
@@ -101,14 +97,15 @@ def corrected(
         at the pixels (``anchors.confidence``), None = 1.
     """
     M, factor, quantiles = out.maps["disagreement"], None, None
-    maps, counts = dict[str, Tensor](), dict[str, Tensor]()
-    if config.confidence is not None and frame.confidence is not None:
+    maps: dict[str, Tensor] = {}
+    counts: dict[str, Tensor] = {}
+    if config.confidence and frame.confidence is not None:
         V = None
         if pixels is None:
             network = network_maps(frame, out.maps["features"], config, pixels)
             V = total_variance(out.variance, network, frame, config, mapped, pixels)
         before = state.by_stream["confidence"]
-        after, factor, counts["confidence"] = learn_confidence(before, frame, V, config.confidence)
+        after, factor, counts["confidence"] = learn_confidence(before, frame, V)
         factor, state = at_pixels(factor, pixels), state.with_tensors({"confidence": after})
     if config.posterior is not None and pixels is None:
         network = network_maps(frame, out.maps["features"], config, pixels)
