@@ -227,9 +227,9 @@ def _too_near(others: Landmarks, sensor: Landmarks) -> NDArray[np.bool_]:
     """[N] True for uncertain landmarks of the images that are much nearer than the sensor's depth beside them."""
     if not len(sensor.depth):
         return np.zeros(len(others.depth), np.bool_)
-    beside = np.square(others.pixel[:, None] - sensor.pixel).sum(axis=-1).argmin(axis=1)
+    nearest = np.square(others.pixel[:, None] - sensor.pixel).sum(axis=-1).argmin(axis=1)
     uncertain = others.variance > np.square(_UNCERTAIN * others.depth)
-    return uncertain & (others.depth < _SHARE_BESIDE * sensor.depth[beside])
+    return uncertain & (others.depth < _SHARE_BESIDE * sensor.depth[nearest])
 
 
 def _without_common_errors(others: Landmarks, z: NDArray[np.float64], size: tuple[int, int], kind: str) -> Landmarks:
