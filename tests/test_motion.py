@@ -321,6 +321,23 @@ def test_an_exact_network_s_posterior_covers_what_moves_in_a_tour(moving_tour):
     assert outlier[p < 0.05].mean() < 0.05
 
 
+def test_what_comes_nearer_by_little_is_covered():
+    """An exact network, and precise anchors of a board at .95 times its distance: no test fails."""
+    rng, packed, z = np.random.default_rng(0), torch.zeros(1, SIZE, dtype=torch.float64), []
+    depth, board = np.full((48, 64), 3.0), np.zeros((48, 64), bool)
+    board[12:36, 20:44], depth[12:36, 20:44] = True, 2.0
+    for _ in range(8):
+        pixel = (rng.uniform(0.02, 0.96, (600, 2)) * [64, 48]).round()
+        u, v = pixel.astype(int).T
+        found = depth[v, u] * np.where(board[v, u], 0.95, 1.0) * np.exp(rng.normal(0, 0.005, 600))
+        frame, rows = checked(depth, pixel, found, (0.005 * found) ** 2)
+        rows = replace(rows, motion=torch.from_numpy(points(-4.0, (48, 64)))[None])
+        packed, out = update(packed, frame, rows, torch.zeros(1, 48, 64, dtype=torch.float64), MODEL)
+        z.append((out.depth[0].numpy() - depth)[board] / out.variance[0].sqrt().numpy()[board])
+    assert np.mean(np.square(z[2:])) ** 0.5 < 3
+    assert (out.variance[0].sqrt().numpy() > 0.0199 * out.depth[0].numpy()).all()
+
+
 def test_motion_widens_the_variance_and_a_range_sensor_s_anchors_need_none():
     depth, _, claimed, *anchors = scene(0)
     frame, rows = checked(depth, *anchors)
