@@ -37,7 +37,7 @@ from ufmstar_torch.posterior.running import LARGEST_FACTOR, LEAST_FACTOR
 _SLOPE: Final = tuple(2 * z * math.exp(-z * z / 2) / math.sqrt(2 * math.pi) for z in NORMAL)
 # Factors from the scores' quantiles to the pixels', fitted on tours (docs/measure_thresholds.py --fit), and exponent of
 # the scores' quantiles over the normal ones.
-TRANSFER: Final = (0.91, 1.11, 1.05)
+TRANSFER: Final = (0.88, 1.1, 1.02)
 TRUST: Final = 0.5
 RATE: Final = 0.1  # step of the adaptation in frames with many scores
 PRIOR: Final = 3.0  # number of frames that the start counts for
