@@ -61,7 +61,7 @@ the certainty of every pixel.
 Anchors that matching has measured are wrong on surfaces that move. Those whose ratio to the prediction no surface of
 the stream has are left out (``motion.plausible``). With the probability P of ``motion``, the depth is that of the
 prediction at the scale of most surfaces: the variance becomes (1 - P) V + P tail, with the tail about their ratio
-instead of b . x, and p includes P.
+instead of b . x, and p includes P. V is at least ``motion.LEAST``.
 
 A stream whose anchors were all invalid so far has the network's depth with the variance of a node without evidence. A
 stream without anchors has UfM*'s output.
@@ -90,7 +90,7 @@ from ufmstar_torch.posterior.distribution import LEVELS
 from ufmstar_torch.posterior.field import at
 from ufmstar_torch.posterior.learn import sums_of
 from ufmstar_torch.posterior.moments import divide, second_moments
-from ufmstar_torch.posterior.motion import in_image, plausible, probability, surfaces, tested, tests_at
+from ufmstar_torch.posterior.motion import LEAST, in_image, plausible, probability, surfaces, tested, tests_at
 from ufmstar_torch.posterior.overlap import confirm, scale_elsewhere
 from ufmstar_torch.posterior.running import (
     BETWEEN,
@@ -344,6 +344,7 @@ def _add_motion(nodes, x, mean, c, wide, motion, beyond, size, scene, b, ratios,
             tail = second_moments(config, nodes[2, i], 1.0, e[i], wide[i])[0]
             nodes[2, i] = (1 - P[i]) * nodes[2, i] + P[i] * tail
             nodes[4, i] = 1 - (1 - nodes[4, i]) * (1 - P[i])
+        nodes[2, i] = max(nodes[2, i], LEAST)
 
 
 @kernel
