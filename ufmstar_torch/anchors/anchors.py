@@ -72,13 +72,9 @@ class Anchors:
     @classmethod
     @check_kinds
     def from_points(
-        cls,
-        points_cam: Tensor,
-        variance: Tensor,
-        intrinsics: Tensor,
-        size: tuple[int, int],
+        cls, points_cam: Tensor, variance: Tensor, intrinsics: Tensor, size: tuple[int, int],
         valid: Tensor | None = None,
-    ) -> Anchors:
+    ) -> Anchors:  # fmt: skip
         """Convert points in the camera frame, such as landmarks of a map or returns of a range sensor, to anchors.
 
         A point is invalid if it lies behind the camera or outside the image, or if a value is not finite. Rows of

@@ -3,7 +3,7 @@
 An error (w, s) of a keyframe's relative pose shifts all pixels of its image consistently, and so do errors of the focal
 length, the centre or the distortion. A shift across the epipolar lines is measured directly. A shift along them is
 measured where keyframes of other baselines, or other pixels, contradict it. To first order, with the errors d and the
-Jacobians of ``anchors.kernels.poses``,
+Jacobians of ``anchors.kernels.pose_equations``,
 
     value_k = rho + c_k d + noise,      across_k = a_k d + noise,
 
@@ -43,13 +43,9 @@ class PoseErrors(SavedState):
     """
 
     HELD: ClassVar = {
-        "_initialised": "pose_known",
-        "_variance": "pose_variance",
-        "_unexplained": "pose_left",
-        "_disagreement": "pose_disagreement",
-        "_camera": "camera_error",
-        "_covariance": "camera_covariance",
-    }
+        "_initialised": "pose_known", "_variance": "pose_variance", "_unexplained": "pose_left",
+        "_disagreement": "pose_disagreement", "_camera": "camera_error", "_covariance": "camera_covariance",
+    }  # fmt: skip
 
     def __init__(self, baselines: int, memory: float) -> None:
         self._baselines, self._memory = baselines, memory
@@ -79,30 +75,13 @@ class PoseErrors(SavedState):
         return np.array([[K[0, 0] * (1 + focal), 0, K[0, 2] + u], [0, K[1, 1] * (1 + focal), K[1, 2] + v], [0, 0, 1]])
 
     def corrected(
-        self,
-        pixel: NDArray[np.float64],
-        accepted: NDArray[np.bool_],
-        measured: Measured,
-        views: Views,
-        K: NDArray[np.float64],
-        depth: float,
-        trusted: bool = True,
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        self, pixel: NDArray[np.float64], accepted: NDArray[np.bool_], measured: Measured, views: Views,
+        K: NDArray[np.float64], depth: float, trusted: bool = True,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
         """Correct depths for errors of the poses and the camera, and update the estimates of these errors.
 
-        Args:
-            pixel: [M, 2] (u, v).
-            accepted: [M] bool, True for the pixels to use, each with a match in at least one view.
-            measured: their matches.
-            views: V keyframes.
-            K: [3, 3] from :meth:`camera`, as in the views [px].
-            depth: median of the scene [m].
-            trusted: False = poses and images contradict each other; the camera's errors are not updated.
-
-        Returns:
-            [M] inverse depths [1/m], their variances [1/m^2], and the largest squared distance of a match from its
-            epipolar line, over its variance, of all views, NaN where no view measures it. Of other pixels: 0, 0, NaN.
-        """
+        Arguments, with ``K`` from :meth:`camera`, and results ``rho``, ``variance`` and ``off`` as of
+        :func:`ufmstar_torch.anchors.kernels.poses.correct`; 0, 0 and NaN for pixels that are not accepted."""
         rho, variance, off_line = np.zeros(len(pixel)), np.zeros(len(pixel)), np.full(len(pixel), np.nan)
         errors = Errors(self._variance, self._unexplained, self._camera, self._covariance, self._disagreement)
         cameras = views, K, inverse_intrinsics(K), depth, trusted, self._memory

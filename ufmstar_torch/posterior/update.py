@@ -36,13 +36,10 @@ Variance over the squared depth at a node, with share = min(1, distance/reach):
   Gaussian window of width ``near``, and of one virtual anchor with z^2 = 1.
 - ``steepness`` is the variance of f over a node and its neighbours: a depth edge may be one node off in f.
 - m exceeds v where v is large, because the error of the depth is log-normal. Errors beyond a factor F (``farthest``) do
-  not count: without this limit, errors that never occur would decide the variance. The output ``inlier`` is m(v), at
-  most its 70 % quantile over the image.
-- p is the probability that the depth is of another surface than its evidence. Where the inliers' variance exceeds the
-  usual one of the image, a larger output ``outlier`` stands for the difference (``moments.divide``).
-- The ratios include the held-out anchors of this frame.
-
-In views that share little with the evidence, v has a part for the change of the network's scale (``overlap``).
+  not count: without this limit, errors that never occur would decide the variance.
+- p is the probability that the depth is of another surface than its evidence. The outputs ``inlier`` and ``outlier``
+  are m(v) and p, changed by ``moments.divide``.
+- In views that share little with the evidence, v has a part for the change of the network's scale (``overlap``).
 
 Before the first anchor the network may be off by any factor. The squared share of the variance of b's constant in that
 before the first anchor is ``unmeasured``: with it p is raised towards ``misscaled``, w towards ``widest``, and a_0
