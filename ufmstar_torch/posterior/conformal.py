@@ -7,12 +7,11 @@ value):
 
     log t_L <- log t_L + step (share of the frame's scores above t_L - (1 - L)) / slope,
 
-with step = max(rate, 1/(n + 3)). n counts frames with scores.
-``slope`` is the change of the share per unit of log t for a normal distribution, so that
-all levels adapt at the same rate; the constant rate forgets old frames. A frame with few scores takes a smaller step.
+with step = max(rate, 1/(n + 3)). n counts frames with scores; the constant rate forgets old ones. ``slope`` is the
+change of the share per unit of log t for a normal distribution, so that all levels adapt at the same rate.
 
-Anchors lie on textured surfaces, and a held-out one is farther from the others than most pixels are. Each score
-therefore has as weight the share of the image at its distance from evidence, relative to the share of the scores there.
+A held-out anchor is farther from the others than most pixels are. Each score therefore has as weight the share of the
+image at its distance from evidence, relative to the share of the scores there.
 At pixels the quantile is
 
     ``TRANSFER`` normal value (t_L/normal value)^``TRUST``.
