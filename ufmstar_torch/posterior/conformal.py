@@ -44,8 +44,7 @@ FEW: Final = 20.0  # number of scores of a frame at which its step is halved
 LEAST_FRAMES: Final = 3  # frames with scores before intervals exist
 # Upper bounds of the classes of distance from evidence in which scores are weighted [image widths].
 DISTANCES: Final = (0.015, 0.05, 0.12, 0.25, math.inf)
-# Largest weight of a score over the mean.
-MOST_WEIGHT: Final = 10.0
+MOST_WEIGHT: Final = 10.0  # largest weight of a score over the mean
 
 
 @leaf

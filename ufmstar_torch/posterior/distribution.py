@@ -20,12 +20,9 @@ from torch.special import ndtr, ndtri
 LEVELS: Final = (0.5, 0.9, 0.99)
 # |z| of the normal distribution at the levels.
 NORMAL: Final = (0.6744897501960817, 1.6448536269514722, 2.5758293035489004)
-# [m^2] of a component: a variance of 0 has no density.
-LEAST_VARIANCE = 1e-12
-# Least distance of F from 0 and 1 [1]: z stays finite in float64.
-TAIL = 1e-15
-# Steps of the bisection: a bracket of 20 m shrinks to a micrometre.
-_BISECTIONS = 24
+LEAST_VARIANCE = 1e-12  # [m^2] of a component: a variance of 0 has no density
+TAIL = 1e-15  # least distance of F from 0 and 1 [1]: z stays finite in float64
+_BISECTIONS = 24  # a bracket of 20 m shrinks to a micrometre
 
 
 @dataclass(frozen=True)
