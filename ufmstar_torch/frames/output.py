@@ -12,7 +12,6 @@ from torch import Tensor
 
 from ufmstar_torch.frames.arguments import as_tensor, require_number
 from ufmstar_torch.frames.prediction import DepthPrediction
-from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.posterior.distribution import LEAST_VARIANCE, DepthDistribution
 
 _WITHOUT_EVIDENCE = (
@@ -158,7 +157,6 @@ class UncertaintyOutput:
         quantiles: [B, 3] half-widths of the central intervals of 50, 90 and 99 %, in standard deviations of a normal
             distribution (``posterior.conformal``). NaN in a stream without evidence; None without a posterior or a
             ``Recalibration``.
-        current_cam: C_i, the segments of this frame in the camera frame, float64, or None.
         prediction: the network's output, for "full" the predictive mean with mean A and E over the members; None for a
             module without networks.
         member: index of the network that was run; None if all were, or none.
@@ -171,7 +169,6 @@ class UncertaintyOutput:
     maps: Mapping[str, Tensor]
     statistics: FrameStatistics
     quantiles: Tensor | None = None
-    current_cam: GaussianMixture | None = None
     prediction: DepthPrediction | None = None
     member: int | None = None
     corrected: UncertaintyOutput | None = None

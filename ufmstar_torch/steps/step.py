@@ -79,7 +79,6 @@ class Step(Protocol):
         config: UfMStarConfig,
         *,
         pixels: Tensor | None = None,
-        smooth: bool = True,
         observer: StepObserver | None = None,
     ) -> tuple[UfMStarState, UncertaintyOutput]: ...
 
@@ -90,7 +89,6 @@ def step(
     config: UfMStarConfig,
     *,
     pixels: Tensor | None = None,
-    smooth: bool = True,
     observer: StepObserver | None = None,
     kernels: Kernels = REFERENCE,
     grow: bool = True,
@@ -101,8 +99,8 @@ def step(
         state: of the previous image; not modified.
         frame: checked input of B streams.
         config: of UfM*.
-        pixels: [B, n] indices into the flattened image to regress only there; None = every pixel.
-        smooth: apply the exponential moving average.
+        pixels: [B, n] indices into the flattened image to regress only there, without the moving average; None = every
+            pixel.
         observer: called after every stage.
         kernels: implementation of each part.
         grow: whether the mixture may get more slots; False: the caller has provided enough.
@@ -146,10 +144,9 @@ def step(
     stage("regress")
 
     smoothed = state.smoothed
-    if smooth and config.ema_alpha < 1.0:
-        smoothed, maps["disagreement"] = regress.moving_average(
-            smoothed, maps["disagreement"], frame.size, config.ema_alpha, pixels
-        )
+    if pixels is None and config.ema_alpha < 1.0:
+        memory = regress.memory_for(smoothed, frame.size)
+        smoothed, maps["disagreement"] = regress.smooth(memory, maps["disagreement"], config.ema_alpha)
     dropped = gone + without_slot + (current_cam.valid & ~far_enough).sum(1)
     counts = _counts(mixture, current_cam, pairs, maps["measured"], new.sum(1) - without_slot, dropped)
     of_anchors = {} if learnt is None else learnt.tensors()
@@ -157,7 +154,7 @@ def step(
         **mixture.tensors(), **sums, **of_anchors, "T_world_first": first, "started": state.started | fine,
         "frames": state.frames + fine, "skipped": state.skipped + ~fine, "smoothed": smoothed,
     })  # fmt: skip
-    out = step_output(frame, maps, residual, pixels, current_cam, counts, learnt)
+    out = step_output(frame, maps, residual, pixels, counts, learnt)
     stage("average")
     return updated, out
 
@@ -167,7 +164,6 @@ def step_output(
     maps: dict[str, Tensor],
     residual: Tensor | None,
     pixels: Tensor | None,
-    current_cam: GaussianMixture,
     counts: Mapping[str, Tensor],
     learnt: anchors.Learnt | None = None,
 ) -> UncertaintyOutput:
@@ -178,7 +174,6 @@ def step_output(
         maps: "disagreement", "measured" and "features" of every pixel, or at ``pixels``.
         residual: [..., 2] the relative error r and its excess e that anchors let expect; None without anchors.
         pixels: [B, n] indices into the flattened image, or None.
-        current_cam: C_i.
         counts: of the step, by name.
         learnt: from the anchors; None without.
     """
@@ -194,7 +189,7 @@ def step_output(
     of_anchors = {} if learnt is None else anchors.counts(frame.anchors, learnt.used)
     statistics = FrameStatistics({**counts, **checked, **of_anchors})
     valid = regress.at_pixels(frame.valid, pixels)
-    return UncertaintyOutput(depth, variance, valid, maps, statistics, current_cam=current_cam)
+    return UncertaintyOutput(depth, variance, valid, maps, statistics)
 
 
 def unobserved(name: str) -> None:

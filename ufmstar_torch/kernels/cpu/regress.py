@@ -64,7 +64,8 @@ def regress_maps(
         views: with the exact sum, those of :func:`views_of`; None = computed here.
         shift: [B, 2] added to the two features before the last, of three or more; None = zero.
         informative: [B] False for the streams whose image shows nothing; None = all True.
-        smoothed: [B, H, W] the moving average of the frame before, NaN without a value; None = M is not averaged.
+        smoothed: [B, H, W] the moving average of the frame before, NaN without a value; None = M is not averaged, as at
+            ``pixels``.
 
     Returns:
         M [B, H, W] or [B, n]; the features [B, F, ...], every one a contiguous map; the moving average after the frame;
@@ -75,19 +76,12 @@ def regress_maps(
         out_f[:, -1] *= informative.reshape(-1, *[1] * (out.ndim - 1))
     relative = config.unmeasured_relative**2 if config.unmeasured == "relative" else 0
     settings = depth.dtype.type(relative), config.unmeasured == "nan"
-    alpha, z, previous = (1.0, depth, depth) if smoothed is None else (float(config.ema_alpha), depth, smoothed)
-    if pixels is not None:
-        stream = np.arange(len(out))[:, None]
-        z, previous = (value.reshape(len(out), -1)[stream, pixels] for value in (z, previous))
+    z = depth if pixels is None else depth.reshape(len(out), -1)[np.arange(len(out))[:, None], pixels]
+    alpha, previous = (1.0, z) if smoothed is None else (float(config.ema_alpha), smoothed)
     memory = np.empty_like(previous)
     maps = out, out_f[:, -1], z, previous, memory
     counts = each(_finish, [(*[x[b].reshape(-1) for x in maps], *settings, alpha) for b in range(len(out))])
-    if smoothed is None:
-        return out, out_f, None, counts
-    if pixels is not None:
-        mixed, memory = memory, smoothed.copy()
-        memory.reshape(len(out), -1)[stream, pixels] = mixed
-    return out, out_f, memory, counts
+    return out, out_f, None if smoothed is None else memory, counts
 
 
 def regression(

@@ -48,7 +48,6 @@ def step(
     config: UfMStarConfig,
     *,
     pixels: Tensor | None = None,
-    smooth: bool = True,
     observer: StepObserver | None = None,
 ) -> tuple[UfMStarState, UncertaintyOutput]:
     """As :func:`ufmstar_torch.steps.step.step`, for CPU tensors."""
@@ -57,7 +56,6 @@ def step(
     camera, counts = (array(frame.fault), array(frame.T_world_cam), K), np.zeros((len(COUNTS), len(depth)), np.int64)
     informative = None if frame.informative is None else array(frame.informative)
     segments = _segment(frame, depth if informative is None else array(frame.informative_depth), K, config, state)
-    current_cam = GaussianMixture(*map(torch.from_numpy, segments))
     stage("segment")
 
     slots = tuple([array(getattr(state, name)) for name in _MIXTURE])
@@ -80,7 +78,7 @@ def step(
         views = views_of(seen, depth, K, config)
     stage("append")
 
-    smoothed = array(memory_for(state.smoothed, frame.size)) if smooth and config.ema_alpha < 1 else None
+    smoothed = array(memory_for(state.smoothed, frame.size)) if pixels is None and config.ema_alpha < 1 else None
     shown, regressed, memory, counts[UNMEASURED] = regress_maps(
         seen, depth, K, config, None if pixels is None else array(pixels), views=views, shift=shift,
         informative=informative, smoothed=smoothed,
@@ -101,7 +99,7 @@ def step(
     if learnt is not None:
         changed |= learnt.tensors()
     counted = dict(zip(COUNTS, torch.from_numpy(counts).unbind(), strict=True))
-    out = step_output(frame, maps, residual, pixels, current_cam, counted, learnt)
+    out = step_output(frame, maps, residual, pixels, counted, learnt)
     stage("average")
     return state.with_tensors(changed), out
 
