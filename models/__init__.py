@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from ufmstar_torch.models.batch_ensemble import convert as convert
     from ufmstar_torch.models.checkpoints import CheckpointError as CheckpointError
     from ufmstar_torch.models.checkpoints import load_state_dict_file as load_state_dict_file
-    from ufmstar_torch.models.checkpoints import load_weights as load_weights
     from ufmstar_torch.models.checkpoints import save_checkpoint as save_checkpoint
     from ufmstar_torch.models.depth_anything import DepthAnything as DepthAnything
     from ufmstar_torch.models.distribution import EvidentialDepth as EvidentialDepth

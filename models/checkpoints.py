@@ -47,18 +47,6 @@ def load_state_dict_file(path: str | Path, ignore: Collection[str] = ()) -> dict
     return _without_prefixes(_read(Path(path), ignore))
 
 
-@check_kinds
-def load_weights(module: nn.Module, path: str | Path) -> None:
-    """Fill a module from a file, in place; all keys and shapes must match.
-
-    Weights are converted to the module's dtypes (half-precision weights fill a float32 network). Raises
-    FileNotFoundError, CheckpointError, ModuleNotFoundError: as :func:`load_state_dict_file`; also if keys are missing
-    or unexpected, shapes differ, or values are not finite. The module is then unchanged.
-    """
-    # The network may have a submodule called "model".
-    fill(module, _without_prefixes(_read(Path(path)), keep=set(module.state_dict())), str(path))
-
-
 def channels_of(state: Mapping[str, Tensor], keys: Sequence[str], network: str, source: object) -> tuple[int, ...]:
     """The output channels of the weights ``keys``, which determine a network's shape. Raises CheckpointError: a key is
     missing; the message names ``source``."""
@@ -69,8 +57,9 @@ def channels_of(state: Mapping[str, Tensor], keys: Sequence[str], network: str, 
 
 
 def fill(module: nn.Module, state: Mapping[str, Tensor], source: str) -> None:
-    """Fill a module from tensors, in place; all keys and shapes must match. Raises CheckpointError as
-    :func:`load_weights`; the message names their ``source``."""
+    """Fill a module from tensors, in place and in its dtypes (half-precision weights fill a float32 network). Raises
+    CheckpointError: keys are missing or unexpected, shapes differ, or values are not finite; the message names their
+    ``source``, and the module is unchanged."""
     broken = [key for key in sorted(state) if not torch.isfinite(state[key]).all()]
     require_shapes(module, {key: tuple(value.shape) for key, value in state.items()}, source, broken)
     module.load_state_dict(state, strict=True)
@@ -188,12 +177,9 @@ def _weights_in(content: Any, path: Path, ignore: Collection[str]) -> dict[str, 
     return dict(content)
 
 
-def _without_prefixes(state: dict[str, Tensor], keep: set[str] | None = None) -> dict[str, Tensor]:
-    """Remove ``_PREFIXES`` that all keys share, until the keys equal ``keep``."""
-    while state and set(state) != keep:
-        prefix = next((p for p in _PREFIXES if all(key.startswith(p) for key in state)), None)
-        if prefix is None:
-            break
+def _without_prefixes(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Remove ``_PREFIXES`` that all keys share."""
+    while prefix := next((p for p in _PREFIXES if state and all(key.startswith(p) for key in state)), None):
         state = {key.removeprefix(prefix): value for key, value in state.items()}
     return state
 

@@ -138,7 +138,7 @@ class FastDepth(Backbone):
     """Monocular metric depth at 224 x 224 for small computers.
 
     ``preprocess`` gives the centre crop of NYU's validation, RGB in [0, 1]. The weights are initialised for training
-    from scratch; :meth:`from_onnx` and ``checkpoints.load_weights`` load trained ones.
+    from scratch; :meth:`from_onnx` and ``load_network`` load trained ones.
 
     Args:
         widths: channels of every layer.

@@ -97,7 +97,7 @@ class MonodepthResNet(Backbone):
 
     ``preprocess`` gives NYU's crop, 224 x 224, normalised by ImageNet's colour statistics. The weights are initialised
     for training from scratch (depth about :data:`INITIAL_DEPTH` everywhere); :meth:`imagenet`, ``load_monodepth2`` and
-    ``checkpoints.load_weights`` load trained ones.
+    ``load_network`` load trained ones.
 
     Args:
         layers: of the encoder, 18, 34 or 50.

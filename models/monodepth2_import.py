@@ -151,7 +151,7 @@ def load_monodepth_resnet(
     weights: Path, size: tuple[int, int] = (224, 224), dropout: float = 0.0, strides: str = "v1.5", spec: Any = None
 ) -> DepthNetwork:
     """Load a network from a state_dict file, which determines its layers and widths; errors as
-    ``checkpoints.load_weights``. For a folder, :func:`load_published` with ``spec``."""
+    ``checkpoints.fill``. For a folder, :func:`load_published` with ``spec``."""
     if weights.is_dir():
         return load_published(weights, spec)
     state = load_state_dict_file(weights)

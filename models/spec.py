@@ -16,7 +16,7 @@ from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.runtime.checked import Checked, choice, number, section
 from ufmstar_torch.runtime.kinds import check_kinds
 
-MOST_MEMBERS = 1000  # of an ensemble
+MOST_MEMBERS = 1000  # of an ensemble, and the factor of a training's seeds (``train.settings.Job.seed``)
 _SMALLEST = {"fastdepth": 32, "monodepth2": 64}  # [px]
 # Fields of one architecture; the others require their defaults, so that specs of the same network are equal.
 _ONLY = {"widths": "fastdepth", "norm": "fastdepth", "positive": "fastdepth"}

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.engine.files import write_json_atomic
-from ufmstar_torch.eval.engine.record import Record
+from ufmstar_torch.eval.engine.record import FORMAT, Record
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
@@ -141,7 +141,7 @@ def in_memory(
     ]
     rows = dict.fromkeys(row for row, _ in figures)
     listed = [{"method": row.method.name, "setting": row.setting.to_dict()} for row in rows]
-    about = {"format": 1, "suite": suite, "title": "Own suite", "rows": listed}
+    about = {"format": FORMAT, "suite": suite, "title": "Own suite", "rows": listed}
     return Results(out=Path("nowhere"), about=about, records=tuple(records), **more)
 
 
@@ -151,7 +151,7 @@ def write_about(out: Path, suite: str, title: str, rows: Sequence[Row], sequence
     write_json_atomic(
         out / "eval.json",
         {
-            "format": 1,
+            "format": FORMAT,
             "suite": suite,
             "title": title,
             "networks": {row.method.base: {"label": NETWORK} for row in rows},

@@ -421,6 +421,6 @@ def test_the_progress_of_kernels_states_why_they_take_long(capsys, monkeypatch):
             bars.show(Progress("kernels", done, 5))
         bars.show(Progress("kernels", 5, 5))
     first, *between, last = capsys.readouterr().err.splitlines()
-    assert first.startswith("kernels: 0 of 5 (the first run on a computer compiles them")
+    assert first.startswith("kernels: 0 of 5 (loaded, or compiled if this computer has not run them yet")
     assert between == ["kernels: 1 of 5", "kernels: 3 of 5"]
     assert last == "kernels: done, 5 of 5"

@@ -14,8 +14,11 @@ from torch import nn
 
 from ufmstar_torch import AnchorConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch import uncertain_depth as pipeline
+from ufmstar_torch.anchors import Anchors, LandmarkMap
+from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.frames.prediction import combine
 from ufmstar_torch.gaussians.camera import crop_intrinsics, resize_intrinsics
+from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.models import Preprocess, load_network, save_checkpoint, wrap_network
 from ufmstar_torch.posterior.recalibrate import Recalibration
 
@@ -181,6 +184,16 @@ REFUSED = {
     "a pose of half precision": (
         lambda: ufm(DEPTH, far(torch.float16, 20.0), K), ValueError, "its dtype is exact to 1 cm .*expected float64"
     ),
+    "an image size in text": (lambda: SPGFConfig().scaled_to("480", 640), TypeError, "height must be a whole number"),
+    "a rotation of an array": (
+        lambda: GaussianMixture.empty(1, 2, dtype=torch.float32, device="cpu").rigid(np.eye(3), torch.zeros(1, 3)),
+        TypeError, r"R must be a dense torch\.Tensor, got nd",
+    ),
+    "a camera of numbers": (
+        lambda: Anchors(torch.zeros(1, 2, 2), torch.ones(1, 2), torch.ones(1, 2)).moved([1.0], K),
+        TypeError, r"K_from must be a dense torch\.Tensor, got list of float",
+    ),
+    "a map of text": (lambda: LandmarkMap("abc", None), TypeError, "points_world and sigma must be arrays of numbers"),
     "a map without knots": (lambda: Recalibration((), ()), ValueError, "Recalibration needs knots"),
 }  # fmt: skip
 

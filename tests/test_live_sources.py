@@ -81,8 +81,9 @@ def test_a_recording_comes_at_its_pace():
         assert event.image.shape == (64, 96, 3)
     assert all(moment >= n / 15 / 2 for n, moment in enumerate(moments))
     assert [event.stamp for event in replay(sequence, np.inf)] == [n / 15 for n in range(5)]
-    entries = [replace(entry, timestamp=None) for entry in sequence.entries]
-    assert [event.stamp for event in replay(replace(sequence, entries=tuple(entries)), np.inf)][1] == 1 / 30
+    for stamps in ([None] * 5, [0.0, 1.0, 2.0, 3.0, 4.0]):
+        entries = [replace(entry, timestamp=stamp) for entry, stamp in zip(sequence.entries, stamps, strict=True)]
+        assert [event.stamp for event in replay(replace(sequence, entries=tuple(entries)), np.inf)][1] == 1 / 30
 
 
 def test_poses_are_read_as_their_lines_are_completed(tmp_path):

@@ -6,6 +6,7 @@ import csv
 import json
 import re
 
+import numpy as np
 import pytest
 import torch
 from evaluations import (
@@ -200,7 +201,7 @@ class TestLoading:
             ("eval.json", {"format": 99}, r"eval\.json is not the description"),
             ("eval.json", {"rows": [{"method": "Oracle"}]}, "no method is called 'Oracle'"),
             (SECOND, {"sequence": "x", "network": "Other"}, "mixed networks.*FastDepth in .*Other in "),
-            (SECOND, {"format": 2}, r"Ensemble\.json is not a record of format 1"),
+            (SECOND, {"format": 1}, r"Ensemble\.json is not a record of format 2"),
             (SECOND, {"method": "Oracle"}, r"Ensemble\.json: no method is called 'Oracle'"),
             (SECOND, {"setting": {"skip": -1}}, r"Ensemble\.json: Setting\.skip must lie"),
         ],
@@ -220,18 +221,18 @@ class TestLoading:
 
     def test_sums_that_are_gone_or_broken(self, tmp_path):
         write_evaluation(tmp_path, ENSEMBLE[:2], SCENES[:2])
-        sums = tmp_path / "records" / "scannet" / SCENES[1][1] / "Ensemble.pt"
+        sums = tmp_path / "records" / "scannet" / SCENES[1][1] / "Ensemble.npz"
         content = sums.read_bytes()
         sums.unlink()
         result = load_results(tmp_path)
         assert set(result.merged) == {("scannet", UFM)}
         assert len(result.notes) == 1
-        assert "Ensemble.pt is not there" in result.notes[0]
+        assert "Ensemble.npz is not there" in result.notes[0]
         sums.write_bytes(content[:100])
-        with pytest.raises(ResultsError, match=r"Ensemble\.pt does not hold the sums"):
+        with pytest.raises(ResultsError, match=r"Ensemble\.npz does not hold the sums"):
             load_results(tmp_path)
-        torch.save({"metrics": {"metrics.NLL.total": torch.zeros(7)}}, sums)
-        with pytest.raises(ResultsError, match=r"Ensemble\.pt holds sums of other metrics"):
+        np.savez(sums, **{"metrics/metrics.NLL.total": np.zeros(7)})
+        with pytest.raises(ResultsError, match=r"Ensemble\.npz holds sums of other metrics"):
             load_results(tmp_path)
         assert load_results(tmp_path, with_sums=False).merged == {}
 

@@ -15,6 +15,7 @@ import layouts_calibrated as written
 import numpy as np
 import pytest
 from imageio_ffmpeg import get_ffmpeg_exe
+from layouts_more import rigid
 from recordings import LAYOUTS
 
 from ufmstar_torch import cli
@@ -91,6 +92,7 @@ def test_folders_and_files_of_a_generic_recording_may_have_any_case(tmp_path):
     ("file", "remedy"),
     [
         ("keyframes/corrected_cameras/1.json", "ns-process-data polycam"),
+        ("walk_0.mcap.zstd", "decompress it"),
         ("scan.r3d", "export it there as a folder with EXR and JPG"),
         ("rgbd/0.depth", "export it from Record3D with EXR and JPG"),
         ("EXR_RGBD/metadata.json", "ns-process-data record3d"),
@@ -359,6 +361,11 @@ def test_kitti_s_calibration(tmp_path):
     assert open_sequence(path).image_size == (48, 64), "K.txt comes first"
     (path / "K.txt").unlink()
     np.testing.assert_allclose(open_sequence(path).intrinsics, truth.K, rtol=1e-11)
+    for camera, shift in (("image_2", -0.06), ("image_0", 0), ("image_1", 0.54)):  # poses are those of camera 0
+        (path / "image_2").rename(path / camera)
+        T = open_sequence(path)[3].T_world_cam
+        np.testing.assert_allclose(T, truth.T_world_cam[3] @ rigid(np.eye(3), [shift, 0, 0]), atol=1e-10)
+        (path / camera).rename(path / "image_2")
     (path / "calib.txt").rename(tmp_path / "raw.txt")
     text = (tmp_path / "raw.txt").read_text().replace("P", "P_rect_0")
     (tmp_path / "raw.txt").write_text("calib_time: 09-Jan-2012 13:57:47\n" + text)

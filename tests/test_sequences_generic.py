@@ -213,7 +213,7 @@ def test_video_frames_have_the_times_in_the_container(tmp_path):
         open_sequence(tmp_path / "phone.mp4", intrinsics=K)
 
 
-def test_broken_video(tmp_path, capfd):
+def test_broken_and_turned_videos(tmp_path, capfd, caplog):
     rng = np.random.default_rng(0)
     images = [rng.integers(0, 255, (48, 64, 3), dtype=np.uint8) for _ in range(8)]
     write_video(tmp_path / "cut.avi", images)
@@ -224,6 +224,11 @@ def test_broken_video(tmp_path, capfd):
             Video(tmp_path / "noise.mp4")
     with pytest.raises(FileNotFoundError):
         Video(tmp_path / "absent.mp4")
+    command = [get_ffmpeg_exe(), "-v", "error", "-display_rotation", "90", "-i", tmp_path / "cut.avi", "-c", "copy"]
+    subprocess.run([*command, tmp_path / "turned.mov"], check=True, stderr=subprocess.DEVNULL)
+    turned = Video(tmp_path / "turned.mov")
+    assert turned.size == turned.read(0).shape[:2] == (64, 48)
+    assert "turned.mov: its frames are turned by 270 degrees, as it states: K is of turned ones" in caplog.text
     video = Video(tmp_path / "cut.avi")
     assert 2 <= len(video) == len(video.times()) < 8
     np.testing.assert_array_equal(video.read(len(video) - 2), images[len(video) - 2])

@@ -46,7 +46,8 @@ def test_the_scale_of_the_png_text_wins_over_a_default_and_must_be_that_of_the_a
 
 @pytest.mark.parametrize("suffix", ["npy", "npz", "tif"])
 def test_float_maps_are_metres_and_invalid_values_zero(tmp_path, suffix):
-    stored = np.array([[1.5, -1.0, np.nan], [np.inf, 0.0, 70.25]], dtype=np.float32)
+    stored = np.array([[1.5, -1.0, np.nan], [np.inf, 0.0, 70.25]], np.float32 if suffix == "tif" else np.float64)
+    stored[1, 1] = 0 if suffix == "tif" else 1e300
     path = tmp_path / f"d.{suffix}"
     if suffix == "npy":
         np.save(path, stored)
@@ -65,7 +66,7 @@ def test_integer_arrays_are_millimetres_and_one_channel_is_dropped(tmp_path):
     assert (depth == np.float32(1.5)).all()
 
 
-def test_color_is_rgb_whatever_the_file(tmp_path):
+def test_color_is_rgb_whatever_the_file(tmp_path, caplog):
     image = RNG.integers(0, 255, (6, 5, 3), dtype=np.uint8)
     write_image(tmp_path / "a.png", image)
     np.testing.assert_array_equal(read_color(tmp_path / "a.png"), image)
@@ -74,6 +75,11 @@ def test_color_is_rgb_whatever_the_file(tmp_path):
     np.testing.assert_array_equal(read_color(tmp_path / "b.png"), image)
     write_image(tmp_path / "c.png", image[..., 0])
     np.testing.assert_array_equal(read_color(tmp_path / "c.png"), np.repeat(image[..., :1], 3, axis=2))
+    Image.fromarray(image[..., 0]).save(
+        tmp_path / "turned.png", exif=b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    )
+    assert read_color(tmp_path / "turned.png").shape == (6, 5, 3)
+    assert "EXIF turns the images; K and depth must be those of the stored pixels" in caplog.text
 
 
 def test_both_png_decoders_have_the_same_pixels(tmp_path):

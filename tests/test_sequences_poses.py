@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import layouts
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 from layouts_more import rigid
 from scipy.spatial.transform import Rotation, Slerp
 
+from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.poses import associate, numbers, read_pose, read_trajectory
 from ufmstar_torch.gaussians.trajectory import Trajectory, interpolate_pose
 
@@ -58,6 +60,15 @@ def test_every_format_gives_the_same_pose(tmp_path, line, timestamp):
         assert trajectory.timestamps is None
     else:
         assert trajectory.timestamps.tolist() == [timestamp]
+
+
+@pytest.mark.parametrize("factor", [2, 0, [1, -1, 1]], ids=str)
+def test_a_matrix_that_is_no_rotation_is_no_pose(tmp_path, factor):
+    path, truth = layouts.write_generic(tmp_path)
+    truth.T_world_cam[2][:3, :3] *= factor
+    np.savetxt(path / "poses.txt", [T.ravel() for T in truth.T_world_cam])
+    [skipped] = open_sequence(path).skipped
+    assert (skipped.name, skipped.reason[:24]) == ("9", "pose that is no rotation")
 
 
 def test_rounded_quaternions_are_normalised(tmp_path):

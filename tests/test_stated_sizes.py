@@ -203,8 +203,9 @@ def test_a_file_without_an_end(read, tmp_path):
     endless, pipe = tmp_path / f"endless.{suffix}", tmp_path / f"pipe.{suffix}"
     endless.symlink_to("/dev/zero")
     os.mkfifo(pipe)
-    for path in (endless, pipe):
-        with pytest.raises(ValueError, match="must be a file, got a device or a pipe"):
+    (folder := tmp_path / f"folder.{suffix}").mkdir()
+    for path in (endless, pipe, folder):
+        with pytest.raises(ValueError, match=r"must be a file, got a (device|folder)"):
             read(str(path))
 
 

@@ -162,7 +162,7 @@ def test_poses_of_another_program(tmp_path):
     assert json.loads((job.out / "eval.json").read_text())["settings"]["trajectory"] == "slam.txt"
     with pytest.raises(FolderError, match="settings"):
         go(job_from(read(words)))
-    for wrong, message in (("--poses sideways", "--poses"), ("--fps 0", "fps must be positive")):
+    for wrong, message in (("--poses sideways", "--poses"), ("--fps 0", "fps must lie in")):
         with pytest.raises(ValueError, match=message):
             job_from(read([*words, *wrong.split()]))
 
@@ -192,7 +192,7 @@ def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, who
     monkeypatch.undo()
     assert len(stored_results(job.out)) == 6
     folder = job.folder.sequence_folder(job.items[1])
-    begun, mine = folder / ".A.pt.0123456789ab.tmp", folder / ".mine.tmp"
+    begun, mine = folder / ".A.npz.0123456789ab.tmp", folder / ".mine.tmp"
     for file in (begun, mine):
         file.write_text("x")
     stub = Stub()

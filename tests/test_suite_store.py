@@ -9,13 +9,11 @@ import os
 import random
 
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from layouts import write_seven_scenes
 from tiny_suite import NAMES, go, job_on, write_rooms
 
-from ufmstar_torch.eval.engine.record import pack, unpack
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.run.folder import FolderError, hold, output_folder
@@ -144,8 +142,8 @@ def test_a_row_without_its_sums_or_with_half_a_record_is_missing(tmp_path):
     folder, item, rows = job.folder, job.items[0], job.suite.rows
     assert folder.missing(item, rows) == []
     assert folder.missing(item, [Row(rows[3].method, Setting(skip=1))]) == [Row(rows[3].method, Setting(skip=1))]
-    (folder.sequence_folder(item) / "DepthOnly.pt").unlink()
-    (folder.sequence_folder(item) / "UfM-DepthOnly.json").write_text('{"format": 1')
+    (folder.sequence_folder(item) / "DepthOnly.npz").unlink()
+    (folder.sequence_folder(item) / "UfM-DepthOnly.json").write_text('{"format": 2')
     assert [row.method.name for row in folder.missing(item, rows)] == ["DepthOnly", "UfM-DepthOnly"]
     go(job)
     assert folder.missing(item, rows) == []
@@ -162,13 +160,3 @@ def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch, code):
     monkeypatch.setattr(fcntl, "flock", refuse)
     with pytest.raises(OSError, match="the file system does not support locks"):
         hold(tmp_path / "lock")
-
-
-@given(st.integers(1, 90), st.sampled_from([torch.int64, torch.float64]), st.integers(0, 2**31))
-def test_packed_sums_are_the_same_to_the_last_bit(size, kind, seed):
-    generator = torch.Generator().manual_seed(seed)
-    value = torch.randn(size, size, generator=generator, dtype=torch.float64)
-    value = torch.where(torch.rand(size, size, generator=generator) < 0.1, value * 100, 0.0).to(kind)
-    again = unpack(pack(value))
-    assert again.dtype == kind
-    assert again.equal(value)

@@ -217,14 +217,6 @@ def stored_results(out):
     for path in sorted((out / "records").rglob("*.json")):
         values = json.loads(path.read_text())
         if path.name != "failed.json":
-            sums = torch.load(path.with_suffix(".pt"), weights_only=True)
             plain = {name: values[name] for name in ("frames", "figures", "curves", "state")}
-            result[str(path.relative_to(out))] = (plain, _bytes(sums))
+            result[str(path.relative_to(out))] = plain, path.with_suffix(".npz").read_bytes()
     return result
-
-
-def _bytes(value):
-    """Tensors as their type, shape and bytes, at any depth."""
-    if isinstance(value, torch.Tensor):
-        return str(value.dtype), tuple(value.shape), value.numpy().tobytes()
-    return {key: _bytes(item) for key, item in value.items()} if isinstance(value, dict) else value

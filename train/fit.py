@@ -13,6 +13,7 @@ import lightning.pytorch as pl
 import torch
 
 from ufmstar_torch.eval.engine.files import write_json_atomic
+from ufmstar_torch.eval.report.table import aligned
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.machine import hardware, versions
 from ufmstar_torch.frames.warnings import LOGGER
@@ -29,7 +30,6 @@ from ufmstar_torch.train.member import (
     trained_network,
 )
 from ufmstar_torch.train.module import FIGURES
-from ufmstar_torch.train.presets import text_table
 from ufmstar_torch.train.settings import Job
 
 
@@ -81,9 +81,9 @@ def plan(job: Job) -> str:
     frames, validated = tours if d.kind == "tour" else [len(part) for part in sources(d)]
     values = identity(job)
     by_name = flat({**values.pop("recipe"), "session.precision": values.pop("precision"), **values})
-    rows = [(name.replace("data.augmentation.", "augment."), str(value)) for name, value in by_name.items()]
+    lines = [f"{name.replace('data.augmentation.', 'augment.'):32} {value}" for name, value in by_name.items()]
     steps = f"{r.max_steps or r.epochs * (frames // r.batch_size)} steps for each of {r.members} trained networks"
-    return f"{text_table(rows)}\n{frames} frames to train on, {validated} to validate on; at most {steps}"
+    return "\n".join([*lines, f"{frames} frames to train on, {validated} to validate on; at most {steps}"])
 
 
 def _meet(trainer: pl.Trainer, out: Path) -> None:
@@ -157,4 +157,4 @@ def report(summary: dict[str, Any]) -> str:
     for result in summary["members"]:
         figures = [f"{result['figures'][name]:.4g}" if name in result["figures"] else "-" for name in FIGURES]
         rows.append((str(result["member"]), str(result["steps"]), f"{result['seconds']:g}", *figures))
-    return text_table(rows, str.rjust)
+    return "\n".join(aligned(rows))

@@ -10,11 +10,11 @@ Other choices are ours.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from ufmstar_torch.models.spec import NetworkSpec
+from ufmstar_torch.eval.report.table import aligned
+from ufmstar_torch.models.spec import MOST_MEMBERS, NetworkSpec
 from ufmstar_torch.runtime.checked import Checked, choice, number
 from ufmstar_torch.runtime.kinds import check_kinds
 
@@ -28,8 +28,6 @@ _SCALES = {"monodepth2": 4, "fastdepth": 1}
 # For a new head on a frozen network, and for a whole pretrained network, which large steps would destroy.
 OF_HEAD: dict[str, Any] = {"learning_rate": 1e-3, "batch_size": 8, "epochs": 10, "clip": 10.0}
 OF_MODULE: dict[str, Any] = {**OF_HEAD, "learning_rate": 1e-5}
-# Largest ensemble, and factor of the seeds (``train.settings.Job.seed``).
-MOST_MEMBERS = 1000
 
 
 @dataclass(frozen=True)
@@ -186,11 +184,4 @@ def table() -> str:
         widths = str(n.widths) if n.architecture == "fastdepth" else f"ResNet{n.layers}"
         training = (f"{r.epochs}", f"{r.batch_size}", f"{r.learning_rate:g} {r.schedule}", f"{r.weight_decay:g}")
         rows.append((name, n.method, f"{members}", widths, size, *training, f"{n.dropout:g}" if n.dropout else "-"))
-    return f"{text_table(rows)}\n\n{_SOURCES}"
-
-
-def text_table(rows: Sequence[Sequence[str]], justify: Callable[[str, int], str] = str.ljust) -> str:
-    """Rows of equal length as lines with aligned columns."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ("  ".join(map(justify, row, widths)).rstrip() for row in rows)
-    return "\n".join(lines)
+    return "\n".join([*aligned(rows), "", _SOURCES])

@@ -7,10 +7,11 @@ from pathlib import Path
 
 from torch import nn
 
+from ufmstar_torch.models.spec import MOST_MEMBERS
 from ufmstar_torch.runtime.checked import Checked, number
 from ufmstar_torch.runtime.kinds import check_fields
 from ufmstar_torch.train.data_config import DataConfig
-from ufmstar_torch.train.presets import MOST_MEMBERS, Recipe
+from ufmstar_torch.train.presets import Recipe
 
 
 @dataclass(frozen=True, kw_only=True)

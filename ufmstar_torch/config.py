@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 from ufmstar_torch.files.limits import require_bytes
 from ufmstar_torch.posterior.config import PosteriorConfig as PosteriorConfig
 from ufmstar_torch.runtime.checked import Checked, choice, number, section
+from ufmstar_torch.runtime.kinds import check_kinds
 
 _SLOT = 84  # [bytes] of a component's state without features
 # Implementations of SPGF iterate over the depth bins; more than this indicate a mistake in the units.
@@ -161,6 +162,7 @@ class SPGFConfig(Checked):
 
 
 @functools.lru_cache(maxsize=16)  # constructing a config repeats its checks in every frame
+@check_kinds
 def _scaled(config: SPGFConfig, height: int, width: int) -> SPGFConfig:
     across, down = width / config.reference_width, height / config.reference_height
     resized = max(across, down) if config.slope_focal == "camera" else 1.0

@@ -132,8 +132,8 @@ def _remedies(check: SequenceCheck, sequence: FrameSequence, path: str | Path, o
         remedies.append(f"--intrinsics: those of images of this size, about {reading.factor:.2g} times what is given")
     elif any("disagree" in problem or "no two frames overlap" in problem for problem in check.problems):
         remedies.append(
-            "the trajectory may be another recording's, or shifted in time: --trajectory, --time-offset; or the "
-            "intrinsics belong to other images: --intrinsics"
+            "the trajectory may be another recording's, or shifted in time: --trajectory, --time-offset; or its "
+            "quaternions begin with w: name its columns in a header; or the intrinsics are others: --intrinsics"
         )
     if any("depth looks too" in problem for problem in check.problems):
         remedies.append(_scale_remedy(check.scale, sequence, path, options))

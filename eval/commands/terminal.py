@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ufmstar_torch.eval.engine.progress import Progress
 
 _EVERY = 30.0  # [s] between two lines of a stage
-_FIRST_RUN = "the first run on a computer compiles them, which takes about a minute"
+_FIRST_RUN = "loaded, or compiled if this computer has not run them yet, which takes about a minute"
 
 
 class UsageError(Exception):

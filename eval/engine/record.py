@@ -8,20 +8,21 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.engine.files import write_atomic, write_json_atomic
 from ufmstar_torch.eval.methods.row import Row, row_from
 from ufmstar_torch.files.limits import read_json
-from ufmstar_torch.files.read import read_tensors
+from ufmstar_torch.files.read import read_npz_whole
 
-FORMAT = 1
+FORMAT = 2
+SUMS = ".npz"  # suffix of a record's sums
 METRICS = "metrics"  # name of the sums of ``SequenceMetrics``
 # States of metrics on the CPU by name, to be added over sequences: "metrics" (``SequenceMetrics``) and
 # "nll_by_error:REFERENCE" (``NLLByError``); and "confidence", samples of pixels for a recalibration.
 Sums = Mapping[str, Mapping[str, Tensor]]
-_DENSE_ENTRIES = 4096  # largest sum that is stored with its zeros; Spearman's 514 x 514 counts are mostly 0
 _NOT_STORED = ("path", "sums")
 
 
@@ -53,7 +54,7 @@ class Record:
     network: str = ""  # label, "FastDepth" or "ResNet50-Monodepth2"
     # "versions", "machine", "device", "runtime" of the networks, digests of networks and sequence.
     provenance: Mapping[str, Any] = field(default_factory=dict)
-    path: Path = field(default=Path(), compare=False)  # of ROW.json; ROW.pt in the same folder has the sums
+    path: Path = field(default=Path(), compare=False)  # of ROW.json; ROW.npz in the same folder has the sums
     sums: Sums = field(default_factory=dict, compare=False, repr=False)  # of a new record; see :meth:`load_sums`
 
     @cached_property
@@ -70,22 +71,22 @@ class Record:
     def save(self, path: Path) -> None:
         """Write the sums, then the record as JSON, each atomically: if the record exists, both are complete."""
         path.unlink(missing_ok=True)  # an unreadable record
-        packed = {name: {key: pack(value) for key, value in states.items()} for name, states in self.sums.items()}
-        write_atomic(path.with_suffix(".pt"), lambda file: torch.save(packed, file), durable=True)
+        sums = {f"{name}/{key}": value.numpy() for name, states in self.sums.items() for key, value in states.items()}
+        # Compressed, since Spearman's 514 x 514 counts are mostly 0.
+        write_atomic(path.with_suffix(SUMS), lambda file: np.savez_compressed(file, **sums), durable=True)
         names = [f.name for f in fields(self) if f.name not in _NOT_STORED]
         write_json_atomic(path, {"format": FORMAT, **{name: getattr(self, name) for name in names}})
 
     def load_sums(self) -> Sums:
         """The sums of a stored record. Raises ResultsError: the file has none."""
-        path = self.path.with_suffix(".pt")
+        path, sums = self.path.with_suffix(SUMS), {METRICS: dict[str, Tensor]()}
         try:
-            with path.open("rb") as file:
-                stored = read_tensors(file, path)
-            packed = {METRICS: stored[METRICS], **stored}
-            return {name: {key: unpack(v) for key, v in states.items()} for name, states in packed.items()}
-        except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:
-            reason = " ".join(str(error).split())[:200]
-            raise ResultsError(f"{path} does not hold the sums of metrics: {reason}") from error
+            for key, value in read_npz_whole(path).items():
+                name, _, state = key.partition("/")
+                sums.setdefault(name, {})[state] = torch.from_numpy(value)
+        except (OSError, TypeError, ValueError) as error:
+            raise ResultsError(f"{path} does not hold the sums of metrics: {error}") from error
+        return sums
 
     @classmethod
     def load(cls, path: Path) -> Record:
@@ -110,22 +111,3 @@ class Record:
         except (ValueError, TypeError, LookupError, AttributeError) as error:
             raise ResultsError(f"{path}: {error}") from error
         return record
-
-
-def pack(value: Tensor) -> Tensor | dict[str, Any]:
-    """Tensors and plain values for ``torch.save``, equal to ``value`` after :func:`unpack`; large ones by their
-    non-zero entries."""
-    if value.numel() <= _DENSE_ENTRIES:
-        # A view would be saved with its whole storage.
-        return value.clone()
-    flat = value.flatten()
-    index = flat.nonzero()[:, 0]
-    return {"shape": list(value.shape), "index": index.to(torch.int32), "values": flat[index]}
-
-
-def unpack(stored: Tensor | dict[str, Any]) -> Tensor:
-    """The packed tensor, bit for bit; tensors are returned unchanged."""
-    if isinstance(stored, Tensor):
-        return stored
-    flat = stored["values"].new_zeros(stored["shape"]).flatten()
-    return flat.index_put((stored["index"].long(),), stored["values"]).reshape(stored["shape"])

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.engine.judge import CONFIDENCE
-from ufmstar_torch.eval.engine.record import FORMAT, METRICS, Record, ResultsError, Sums
+from ufmstar_torch.eval.engine.record import FORMAT, METRICS, SUMS, Record, ResultsError, Sums
 from ufmstar_torch.eval.methods.row import Row, plain_rows, row_from
 from ufmstar_torch.eval.suite.folder import FAILED, EvalFolder
 from ufmstar_torch.files.limits import read_json
@@ -184,7 +184,7 @@ def _merged(records: Sequence[Record]) -> tuple[dict[tuple[str, Row], Curves], l
         groups.setdefault((record.dataset, record.row), []).append(record)
     merged, notes = {}, []
     for (dataset, row), of_row in groups.items():
-        if gone := [path for record in of_row if not (path := record.path.with_suffix(".pt")).is_file()]:
+        if gone := [path for record in of_row if not (path := record.path.with_suffix(SUMS)).is_file()]:
             notes.append(f"{dataset}, {row.label}: no curve over all sequences, {gone[0]} is not there")
             continue
         total: Sums = {}
@@ -194,7 +194,7 @@ def _merged(records: Sequence[Record]) -> tuple[dict[tuple[str, Row], Curves], l
             merged[dataset, row] = _curves(total)
         except RuntimeError as error:
             text = " ".join(str(error).split())[:200]
-            raise ResultsError(f"{record.path.with_suffix('.pt')} holds sums of other metrics: {text}") from error
+            raise ResultsError(f"{record.path.with_suffix(SUMS)} holds sums of other metrics: {text}") from error
     return merged, notes
 
 

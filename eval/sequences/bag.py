@@ -33,6 +33,11 @@ from ufmstar_torch.runtime.optional import optional
 
 LOOKED_FOR = "a .bag, .db3 or .mcap file, or a folder that holds one, or the numbered files of one (walk_0.db3, ...)"
 _SUFFIXES = (".bag", ".db3", ".mcap")
+_REPAIRS = {
+    ".bag": "rosbag reindex",
+    ".mcap": "mcap recover",
+    ".db3": "sqlite3 FILE .recover",
+}  # if a recorder was killed
 _METADATA = "metadata.yaml"
 # Name of one of the files that a recorder starts after a size or time; ROS 1 also writes the time at which it started.
 _PART = re.compile(r"(.*?)(?:_?\d{4}(?:-\d\d){5})?_(\d+)")
@@ -127,7 +132,10 @@ class Bag:
             *_BROKEN,
         ) as error:
             reason = " ".join(str(error).split())[:200] or type(error).__name__
-            raise FrameError(self.path, f"the bag cannot be read: {reason}") from error
+            how = _REPAIRS.get(next(iter(_bag_files(self.path)), self.path).suffix, "recording it again")
+            raise FrameError(
+                self.path, f"the bag cannot be read: {reason}; an unfinished one may need {how}"
+            ) from error
 
     def _open(self) -> None:
         stores = _module("rosbags.typesys")

@@ -18,7 +18,7 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_image
-from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped, is_rotation
 from ufmstar_torch.eval.sequences.images import first_image_size
 from ufmstar_torch.eval.sequences.lens import FISHEYE, Lens
 from ufmstar_torch.eval.sequences.options import Options
@@ -86,7 +86,7 @@ def _extrinsics(file: Path) -> np.ndarray:
     value = _yaml(file).get("T_BS", np.eye(4).tolist())
     value, error = value.get("data") if isinstance(value, Mapping) else value, f"{file}: T_BS must be 4x4 numbers"
     T = numbers(value, (4, 4), f"{error}, got {value!r:.80}")
-    if np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3:
+    if not is_rotation(T[:3, :3], 1e-3):
         raise ValueError(f"{error}, a rotation and a position, got {T.tolist()}")
     return T
 

@@ -174,7 +174,8 @@ def make_sequence(
     """Divide frames into usable and skipped ones, and check that the intrinsics fit the sizes (H, W). ``posed`` and
     ``metric``: see :class:`FrameSequence`. Raises ValueError: no frame is usable (the message counts the reasons); two
     frames share a name; the intrinsics are malformed or belong to another image size."""
-    from ufmstar_torch.frames.frame import FARTHEST  # here, since that file imports torch
+    from ufmstar_torch.config import UfMStarConfig  # here, since these files import torch
+    from ufmstar_torch.frames.frame import FARTHEST
 
     names, entries, skipped = list[str](), list[Entry](), list[Skipped]()
     for frame in frames:
@@ -185,6 +186,8 @@ def make_sequence(
             skipped.append(Skipped(frame.name, "non-finite pose"))
         elif np.abs(frame.T_world_cam).max() > FARTHEST:
             skipped.append(Skipped(frame.name, f"pose farther than {FARTHEST:g} m from the origin"))
+        elif not is_rotation(frame.T_world_cam[:3, :3], UfMStarConfig.rotation_tolerance):
+            skipped.append(Skipped(frame.name, "pose that is no rotation, but has a scale, shear or reflection"))
         else:
             entries.append(frame)
     if not entries:
@@ -203,6 +206,11 @@ def make_sequence(
             check_intrinsics(f"intrinsics of {entry.name}", entry.intrinsics, entry.image_size or image_size)
     cameras = (intrinsics, image_size, depth_intrinsics, depth_size)
     return FrameSequence(name, layout, tuple(entries), *cameras, tuple(skipped), tuple(names), posed, metric=metric)
+
+
+def is_rotation(R: np.ndarray, tolerance: float) -> bool:
+    """True if max |R R^T - I| of R [3, 3] is at most the tolerance, and R is no reflection."""
+    return bool(np.abs(R @ R.T - np.eye(3)).max() <= tolerance and np.linalg.det(R) > 0)
 
 
 def in_memory(sequence: FrameSequence, progress: Callable[[int], object] = lambda _: None) -> FrameSequence:

@@ -7,6 +7,7 @@ in the folder itself, or one video file; a trajectory ``poses.txt trajectory.txt
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,7 @@ from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import UNKNOWN, pair_depth, stem_times
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped
 from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size, read_color
-from ufmstar_torch.eval.sequences.intrinsics import FILES, camera_file, read_intrinsics
+from ufmstar_torch.eval.sequences.intrinsics import FILES, camera_file, projections, read_intrinsics
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.paths import DEPTH_SUFFIXES, IMAGE_SUFFIXES, list_files, on_disk
@@ -25,6 +26,8 @@ from ufmstar_torch.eval.sequences.poses import associate, read_trajectory
 from ufmstar_torch.eval.sequences.tum import SCALE as TUM_SCALE
 from ufmstar_torch.eval.sequences.tum import read_file_list
 from ufmstar_torch.eval.sequences.video import VIDEO_SUFFIXES, Video
+from ufmstar_torch.frames.warnings import LOGGER
+from ufmstar_torch.gaussians.conventions import OURS
 
 IMAGES = ("images", "image", "rgb", "color", "frames", *(f"image_{camera}" for camera in range(4)))  # KITTI's last
 DEPTHS = ("depth", "depths")
@@ -32,6 +35,7 @@ TRAJECTORIES = (
     *("poses.txt", "pose.txt", "trajectory.txt", "traj.txt", "groundtruth.txt"),
     *("CameraTrajectory.txt", "KeyFrameTrajectory.txt", "cam0_to_world.txt", "poses.csv", "trajectory.csv"),
 )
+_CAMERA = re.compile(r"image_0?([1-3])")
 _KITTI = "calib.txt"  # of KITTI's odometry benchmark; read if there is none of the others
 INTRINSICS = (*FILES, _KITTI)
 LOOKED_FOR = (
@@ -65,7 +69,25 @@ def read(path: Path, options: Options) -> FrameSequence:
     frames = _with_depth(images, root, options, options.truth_scale)
     # In a generic sequence, ``fps`` counts images, not numbers in their names.
     counted = replace(options, trajectory=None)
-    return assemble("generic", path, frames, _lens(root, options, size), counted, size=size, read_poses=read_poses)
+    lens = _lens(root, options, size)
+    sequence = assemble("generic", path, frames, lens, counted, size=size, read_poses=read_poses)
+    if (baseline := _baseline(root, options)) is None or options.poses != OURS:
+        return sequence
+    return sequence.changed(lambda entry: replace(entry, T_world_cam=entry.T_world_cam @ baseline))
+
+
+def _baseline(root: Path, options: Options) -> np.ndarray | None:
+    """[4, 4] the pose of KITTI's camera N in camera 0, whose poses the benchmark publishes, for images ``image_N``
+    beside a file of projections P = K [I | t]: the camera lies at -t; None for other images."""
+    images = Path(options.images) if options.images is not None else (_image_sources(root) or [root])[0]
+    number = _CAMERA.fullmatch(images.name)
+    file = Path(options.intrinsics) if isinstance(options.intrinsics, str | Path) else on_disk(root / _KITTI)
+    if number is None or not file.is_file() or not {0, int(number[1])} <= (found := projections(file)).keys():
+        return None
+    T = np.eye(4)
+    T[:3, 3] = -np.linalg.solve(found[0][:, :3], found[int(number[1])][:, 3] - found[0][:, 3])
+    LOGGER.warning("%s: poses are those of image_0, moved by %.3f m (%s)", images, np.linalg.norm(T[:3, 3]), file.name)
+    return T
 
 
 def has_images_and_depth(path: Path) -> bool:

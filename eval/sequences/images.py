@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import ExifTags, Image
 
 from ufmstar_torch.eval.sequences.frame import Entry, Frame, FrameError, Loader, Size, Skipped
 from ufmstar_torch.eval.sequences.paths import list_files
@@ -56,6 +56,8 @@ def read_color(path: str | Path, content: bytes | None = None) -> np.ndarray:
                 return np.ascontiguousarray(np.broadcast_to(grey_bytes(values, full), (*values.shape[:2], 3)))
             if image.has_transparency_data:
                 return _opaque(np.array(image.convert("RGBA")), Path(path).parent)
+            if image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
+                _log_once(Path(path).parent, "EXIF turns the images; K and depth must be those of the stored pixels")
             return np.array(image.convert("RGB"))
     except _BROKEN_IMAGE as error:
         raise FrameError(path, f"cannot be decoded: {error}") from error
@@ -101,7 +103,8 @@ def read_depth(
         values = np.where(values == invalid, np.zeros((), values.dtype), values)
     if scale is None and np.issubdtype(values.dtype, np.integer):
         scale = named_scale or default_scale
-    return positive(values.astype(np.float32) if scale is None else (values * np.float64(scale)).astype(np.float32))
+    with np.errstate(over="ignore", invalid="ignore"):
+        return positive(np.asarray(values if scale is None else values * np.float64(scale), np.float32))
 
 
 def require_scale(path: str | Path, scale: float | None, stated: float | None) -> None:
@@ -249,13 +252,13 @@ def _opaque(rgba: np.ndarray, folder: Path) -> np.ndarray:
     alpha = rgba[..., 3:]
     if (alpha == alpha[:1, :1]).all():
         return np.ascontiguousarray(rgba[..., :3])
-    _log_transparency(folder)
+    _log_once(folder, "images with transparent pixels, which are read as black")
     return np.asarray(np.rint(rgba[..., :3] * (alpha / np.float32(255))), np.uint8)
 
 
 @lru_cache(maxsize=64)
-def _log_transparency(folder: Path) -> None:
-    LOGGER.warning("%s: images with transparent pixels, which are read as black", folder)
+def _log_once(folder: Path, text: str) -> None:
+    LOGGER.warning("%s: %s", folder, text)
 
 
 def _from_image(path: Path) -> tuple[np.ndarray, float | None]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from ufmstar_torch.eval.sequences.frame import Size
 from ufmstar_torch.eval.sequences.paths import on_disk
 
 # A file's path, a matrix [3, 3] (or ScanNet's [4, 4]), or the numbers fx, fy, cx, cy [px].
-IntrinsicsLike = str | Path | np.ndarray | Sequence[float]
+IntrinsicsLike = str | Path | np.ndarray | Sequence[Any]
 
 # Names of files with the camera of the images, and of the depth maps.
 FILES = (
@@ -23,7 +24,7 @@ DEPTH_FILES = ("K_depth.txt", "depth_K.txt", "intrinsics_depth.txt", "depth_intr
 
 # Sizes whose aspect ratios differ by more than this were cropped, not resized.
 _ASPECT_TOLERANCE = 0.02
-_PROJECTION = re.compile(r"P(?:_rect_0)?\d\s*:(.*)")
+_PROJECTION = re.compile(r"P(?:_rect_0)?(\d)\s*:(.*)")
 
 
 def read_intrinsics(source: IntrinsicsLike) -> np.ndarray:
@@ -32,8 +33,10 @@ def read_intrinsics(source: IntrinsicsLike) -> np.ndarray:
     from ufmstar_torch.eval.sequences.poses import read_matrix
 
     if isinstance(source, str | Path):
-        kitti = _projections(Path(source))
-        values, source_name = read_matrix(source) if kitti is None else kitti, f"intrinsics file {source}"
+        kitti = [P[:, :3] for P in projections(Path(source)).values()]
+        if any(not np.array_equal(K, kitti[0]) for K in kitti):
+            raise ValueError(f"{source}: the intrinsics of its cameras differ: pass intrinsics as fx fy cx cy")
+        values, source_name = kitti[0] if kitti else read_matrix(source), f"intrinsics file {source}"
     else:
         values, source_name = np.array(source, dtype=np.float64), "intrinsics"
     if values.shape in ((4,), (1, 4), (4, 1)):
@@ -45,21 +48,19 @@ def read_intrinsics(source: IntrinsicsLike) -> np.ndarray:
     return np.ascontiguousarray(values[:3, :3])
 
 
-def _projections(path: Path) -> np.ndarray | None:
-    """[3, 3] of the projections ``P0:`` (or ``P_rect_00:``) ... of KITTI's rectified cameras, which have equal
-    intrinsics; None if the file has no such line. Raises ValueError: a line has no 12 numbers, or they differ."""
+def projections(path: Path) -> dict[int, np.ndarray]:
+    """[3, 4] by number, of the projections ``P0:`` (or ``P_rect_00:``) ... of KITTI's rectified cameras; {} if the file
+    has no such line. Raises ValueError: a line has no 12 numbers."""
     from ufmstar_torch.eval.sequences.poses import numbered_lines
 
-    found = []
+    found = {}
     for number, text in numbered_lines(path):
         if line := _PROJECTION.fullmatch(text.strip()):
             try:
-                found.append(np.array(line[1].split(), dtype=np.float64).reshape(3, 4)[:, :3])
+                found[int(line[1])] = np.array(line[2].split(), dtype=np.float64).reshape(3, 4)
             except ValueError:
                 raise ValueError(f"{path}:{number}: expected 12 numbers after ':', got {text.strip()[:60]!r}") from None
-    if found and not all(np.array_equal(K, found[0]) for K in found):
-        raise ValueError(f"{path}: the intrinsics of its cameras differ: pass intrinsics as fx fy cx cy")
-    return found[0] if found else None
+    return found
 
 
 def camera_file(folder: Path, names: Sequence[str]) -> Path | None:

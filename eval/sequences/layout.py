@@ -22,6 +22,7 @@ _NERFSTUDIO = "convert it with nerfstudio, `ns-process-data {} --data DIR --outp
 # Files of exports that no reader opens, and what makes them readable.
 _CONVERTED = (
     ("keyframes/*cameras", f"it is a raw export of Polycam; {_NERFSTUDIO.format('polycam')}"),
+    ("*.zst*", "decompress it with `zstd -d`"),
     ("*.r3d", "it is a file of Record3D; export it there as a folder with EXR and JPG"),
     ("rgbd/*.depth", "its depth has Apple's compression; export it from Record3D with EXR and JPG"),
     ("EXR_RGBD", f"it is an export of Record3D; {_NERFSTUDIO.format('record3d')}"),

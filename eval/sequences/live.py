@@ -32,6 +32,7 @@ from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.gaussians.conventions import CONVENTIONS, OURS
 
 _FPS = 30.0  # of a recording without timestamps
+_MOST_FRAMES = 10**6  # whole numbers below are no times of images, but their numbers
 _POLL = 0.01  # [s] interval of polling a folder
 _KEPT = 256  # [bytes] of each end of a file of poses, by which a file that was written anew is recognised
 LONGEST_LINE = 2**28  # characters of JSON; an image of 12 megapixels has 2**26 at most
@@ -106,6 +107,8 @@ def replay(sequence: FrameSequence, speed: float = 1.0) -> Iterator[LiveEvent]:
     timed_stamps = [stamp for stamp in stamps if stamp is not None]
     timed = len(timed_stamps) == len(stamps) and all(a < b for a, b in pairwise(timed_stamps))
     times = np.array(timed_stamps) if timed else np.arange(len(sequence)) / _FPS
+    if timed and (times % 1 == 0).all() and times.max() < _MOST_FRAMES:  # numbers of frames, as of names 3, 4, 5, ...
+        times = times / _FPS
     started: float | None = None
     first = 0.0
     for n, stamp in enumerate(times.tolist()):

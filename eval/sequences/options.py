@@ -4,28 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from numbers import Integral, Real
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ufmstar_torch.eval.sequences.intrinsics import DEPTH_FILES, FILES, IntrinsicsLike, camera_file, parse_intrinsics
-from ufmstar_torch.gaussians.conventions import CONVENTIONS, OURS
-
-# Names of options, the types of their values, and these in words.
-_KINDS: tuple[tuple[tuple[str, ...], Any, str], ...] = (
-    (("truth_scale", "max_truth", "pose_scale", "fps", "time_offset"), Real, "a number"),
-    (("max_pose_gap", "max_time_difference"), Real, "a number"),
-    (("model_index", "scans"), Integral, "a whole number"),
-    (("trajectory", "images", "truth"), (str, PathLike), "a path"),
-    (("drive",), (str, Integral), "a name or a number"),
-)
+from ufmstar_torch.gaussians.conventions import CONVENTIONS
+from ufmstar_torch.runtime.checked import Checked, choice, number
+from ufmstar_torch.runtime.kinds import check_fields
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Options:
+class Options(Checked):
     """Opening of sequences.
 
     Attributes:
@@ -61,51 +52,31 @@ class Options:
     distortion: str | Sequence[str | float] | None = None
     depth_intrinsics: IntrinsicsLike | None = None
     truth_scale: float | None = None
-    max_truth: float | None = None
+    max_truth: float | None = number(None, "", "m", 0.0, open_low=True, open_high=True)
     trajectory: str | Path | None = None  # with our axes, camera-to-world
-    poses: str = OURS
-    pose_scale: float | None = None
-    fps: float | None = None  # multiplies the numbers of images if the layout has such numbers
-    time_offset: float = 0.0
+    poses: str = choice(*CONVENTIONS)
+    pose_scale: float | None = number(None, "", "m", 0.0, open_low=True, open_high=True)
+    fps: float | None = number(None, "", "1/s", 0.0, open_low=True)  # of the numbers of images, if a layout has them
+    time_offset: float = number(0.0, "", "s", -np.inf, open_low=True, open_high=True)
     # At 0.1 s a hand that accelerates at 2 m/s^2 departs 2.5 mm from the straight line.
-    max_pose_gap: float = 0.1
-    max_time_difference: float = 0.02
+    max_pose_gap: float = number(0.1, "", "s", 0.0)
+    max_time_difference: float = number(0.02, "", "s", 0.0)
     images: str | Path | None = None
     truth: str | Path | None = None
     T_color_depth: np.ndarray | str | Path | None = None
     topics: tuple[str, ...] = ()
     model_index: int | None = None
     drive: str | int | None = None
-    scans: int | None = None  # moving things smear
+    scans: int | None = number(None, "", "", 0)  # moving things smear
     plugin: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for names, kinds, expected in _KINDS:
-            for name in names:
-                value = getattr(self, name)
-                if value is not None and (isinstance(value, bool) or not isinstance(value, kinds) or value != value):
-                    raise ValueError(f"{name} must be {expected}, got {value!r:.80}")
         for name, option in (("intrinsics", "--intrinsics"), ("depth_intrinsics", "--reader depth_intrinsics")):
             if isinstance(words := getattr(self, name), tuple) and all(isinstance(word, str) for word in words):
                 object.__setattr__(self, name, parse_intrinsics(words, option))
-        if self.poses not in CONVENTIONS:
-            raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {self.poses!r}")
+        check_fields(self)
         check_scale("truth_scale", self.truth_scale)
-        for name in ("max_time_difference", "max_pose_gap"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must be a time of at least 0 s, got {getattr(self, name)}")
-        if self.fps is not None and not self.fps > 0:
-            raise ValueError(f"fps must be positive frames per second, got {self.fps}")
-        for name, unit in (("pose_scale", "metres per unit of the poses"), ("max_truth", "metres")):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < np.inf:
-                raise ValueError(f"{name} must be a positive number of {unit}, got {value}")
-        if isinstance(self.topics, str) or not all(isinstance(topic, str) for topic in self.topics):
-            raise ValueError(f"topics must be names, got {self.topics!r:.80}")
-        if not isinstance(self.T_color_depth, (str, PathLike, np.ndarray, type(None))):
-            raise ValueError(f"T_color_depth must be a file or an array [4, 4], got {self.T_color_depth!r:.80}")
-        if self.scans is not None and self.scans < 0:
-            raise ValueError(f"scans must be a number of laser scans on either side, at least 0, got {self.scans}")
+        super().__post_init__()
 
     def changed(self) -> dict[str, Any]:
         """The options that are not the default, as arguments of ``open_sequence``."""

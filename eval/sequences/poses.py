@@ -198,7 +198,7 @@ def numbered_lines(path: str | Path) -> list[tuple[int, str]]:
     try:
         return list(enumerate(read_text(path).splitlines(), start=1))
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: expected a text file, got bytes that are none: {error.reason}") from error
+        raise ValueError(f"{path}: expected a text file in UTF-8 or UTF-16: {error.reason}") from error
 
 
 def csv_rows(path: str | Path) -> list[tuple[list[str], str]]:

@@ -134,8 +134,6 @@ def _pose(frame: Mapping[str, Any], offset: np.ndarray, file: Path) -> np.ndarra
     T = np.vstack([T[:3], [0.0, 0.0, 0.0, 1.0]])
     if not np.isfinite(T).all():
         return UNKNOWN
-    if np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3:
-        raise ValueError(f"{file}: {frame['file_path']}: transform_matrix must be a rotation and a position, got {T}")
     T[:3, 3] -= offset
     return CONVENTIONS["opengl"].convert(T)
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.frame import FrameError, Size
 from ufmstar_torch.files.limits import require_pixels
+from ufmstar_torch.frames.warnings import LOGGER
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 
@@ -40,6 +41,8 @@ class Video:
         height, width = capture.get(cv2.CAP_PROP_FRAME_HEIGHT), capture.get(cv2.CAP_PROP_FRAME_WIDTH)
         self.size: Size = int(height), int(width)
         require_pixels(f"{self.path}: a frame", self.size)
+        if turned := round(capture.get(cv2.CAP_PROP_ORIENTATION_META)):
+            LOGGER.warning("%s: its frames are turned by %d degrees, as it states: K is of turned ones", path, turned)
         self._times = self._decoded_times()
         if self._times.size == 0 or 0 in self.size:
             raise ValueError(f"{self.path}: the video has no frame that can be decoded")

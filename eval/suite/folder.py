@@ -4,7 +4,7 @@
 OUT/eval.json                          suite, rows, networks, sequences, settings
 OUT/eval.lock                          locked during an evaluation
 OUT/eval.stop                          exists while tasks in other processes must end
-OUT/records/DATASET/SEQUENCE/ROW.json  a record, written after ROW.pt: if it exists, both are complete
+OUT/records/DATASET/SEQUENCE/ROW.json  a record, written after ROW.npz: if it exists, both are complete
 OUT/records/DATASET/SEQUENCE/failed.json
 ```
 """
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.engine.files import remove_temporaries, write_json_atomic
-from ufmstar_torch.eval.engine.record import FORMAT, Record, ResultsError
+from ufmstar_torch.eval.engine.record import FORMAT, SUMS, Record, ResultsError
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.run.folder import FolderError, FolderKind
 from ufmstar_torch.eval.suite.work_items import WorkItem
@@ -27,7 +27,7 @@ from ufmstar_torch.files.limits import read_json
 FAILED, CACHE, STOP = "failed.json", "cache", "eval.stop"
 # Files of a report; --overwrite removes them.
 _REPORT = ("efficiency.json", "results.csv", "report.html", "tables/*.tex", "figures/*.png", "figures/*.svg")
-_OF_SEQUENCE = ("*.json", "*.pt", "examples/*.npz")
+_OF_SEQUENCE = ("*.json", f"*{SUMS}", "examples/*.npz")
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class EvalFolder:
         """The finished rows of a sequence, by slug."""
         records = {}
         for path in sorted(self.sequence_folder(item).glob("*.json")):
-            if path.name != FAILED and path.with_suffix(".pt").is_file():
+            if path.name != FAILED and path.with_suffix(SUMS).is_file():
                 with suppress(ResultsError):
                     records[path.stem] = Record.load(path)
         return records

@@ -117,6 +117,7 @@ class Anchors:
         """[B, N] ``valid``, all True for None."""
         return torch.ones_like(self.depth, dtype=torch.bool) if self.valid is None else self.valid
 
+    @check_kinds
     def moved(self, K_from: Tensor, K_to: Tensor) -> Anchors:
         """Map the anchors to the pixels of a resized or cropped image of the same camera.
 

@@ -63,7 +63,7 @@ class LandmarkMap:
         sigma: [P] standard deviation of a landmark's position, the same in every direction [m].
 
     Raises:
-        ValueError: wrong shapes, or no landmark with finite values.
+        TypeError, ValueError: no numbers, wrong shapes, or no landmark with finite values.
     """
 
     points_world: NDArray[np.float64]
@@ -71,7 +71,10 @@ class LandmarkMap:
     needs_image = False
 
     def __post_init__(self) -> None:
-        points, sigma = np.array(self.points_world, dtype=np.float64), np.array(self.sigma, dtype=np.float64)
+        try:
+            points, sigma = (np.array(value, dtype=np.float64) for value in (self.points_world, self.sigma))
+        except (TypeError, ValueError, OverflowError) as error:
+            raise TypeError(f"points_world and sigma must be arrays of numbers: {error}") from error
         if points.ndim != 2 or points.shape[1] != 3 or sigma.shape != points.shape[:1]:
             raise ValueError(f"points_world must be [P, 3] and sigma [P], got {points.shape} and {sigma.shape}")
         if not (np.isfinite(points).all(axis=1) & np.isfinite(sigma) & (sigma >= 0)).any():

@@ -38,10 +38,10 @@ def read_text(path: str | Path) -> str:
 
 
 def _no_device(path: str | Path) -> Path:
-    """The path. Raises ValueError: it is a device or a pipe."""
+    """The path. Raises ValueError: it is a folder, a device or a pipe."""
     path = Path(path)
-    if path.exists() and not (path.is_file() or path.is_dir()):
-        raise ValueError(f"{path} must be a file, got a device or a pipe")
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path} must be a file, got a {'folder' if path.is_dir() else 'device or a pipe'}")
     return path
 
 

@@ -86,6 +86,7 @@ class GaussianMixture:
         """``Tensor.to`` on every field."""
         return GaussianMixture(**{name: value.to(*args, **kwargs) for name, value in self.tensors().items()})
 
+    @check_kinds
     def rigid(self, R: Tensor, t: Tensor) -> GaussianMixture:
         """The mixture in another frame (section "Projection to the Image Plane", step 1).
 
