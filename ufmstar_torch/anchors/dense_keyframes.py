@@ -14,7 +14,7 @@ from torch import Tensor
 from ufmstar_torch.anchors.kernels.dense import Views
 from ufmstar_torch.anchors.kernels.keyframes import compare
 from ufmstar_torch.anchors.landmarks import opencv
-from ufmstar_torch.anchors.saved_state import SavedState, saved_images
+from ufmstar_torch.anchors.saved_state import SavedState, saved_image
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
 
 # A frame becomes a keyframe if the camera has moved by this share of the median depth, or turned by this angle [rad].
@@ -111,7 +111,7 @@ class Keyframes(SavedState):
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Restore a result of :meth:`state`; ValueError: another number of keyframes."""
-        images = saved_images(state, "images", self._count + 1)
+        images = saved_image(state, "images", self._count + 1)
         super().load_state(state)
         self._image = images.copy()
         self._half = np.zeros((len(images), images.shape[1] // 2, images.shape[2] // 2), np.uint8)

@@ -15,21 +15,14 @@ from ufmstar_torch.frames.frame import LARGEST
 POSITIVE = (1e-12, LARGEST)  # range of lengths and variances that divide others
 
 
-def saved_image(state: Mapping[str, Tensor], name: str) -> NDArray[np.uint8]:
-    """Read a grey image [H, W] from a saved state; ValueError: another shape or dtype, or no such image."""
+def saved_image(state: Mapping[str, Tensor], name: str, *count: int) -> NDArray[np.uint8]:
+    """Read a grey image [H, W], or ``count`` of them [count, H, W], from a saved state; ValueError: anything else."""
     image = _array(state, name)
-    if image.dtype != np.uint8 or image.ndim != 2:
-        raise ValueError(f"state[{name!r}] must have shape (H, W) and dtype uint8, got {image.shape} and {image.dtype}")
-    return image
-
-
-def saved_images(state: Mapping[str, Tensor], name: str, count: int) -> NDArray[np.uint8]:
-    """Read grey images [count, H, W] from a saved state; ValueError as :func:`saved_image`."""
-    images = _array(state, name)
-    if images.dtype != np.uint8 or images.ndim != 3 or len(images) != count:
-        text = f"must have shape ({count}, H, W) and dtype uint8, got {images.shape} and {images.dtype}"
+    if image.dtype != np.uint8 or image.ndim != len(count) + 2 or image.shape[:-2] != count:
+        shape = ", ".join(map(str, (*count, "H", "W")))
+        text = f"must have shape ({shape}) and dtype uint8, got {image.shape} and {image.dtype}"
         raise ValueError(f"state[{name!r}] {text}")
-    return images
+    return image
 
 
 def _array(state: Mapping[str, Tensor], name: str) -> NDArray[Any]:
