@@ -43,7 +43,7 @@ def check_values(
     pixels = use.reshape(shape)
     for values in (aleatoric, epistemic):
         if values is not None:
-            _restrict(pixels, array(values).reshape(b, 1, shape[1]), 0.0, LARGEST)
+            _restrict(pixels, array(values).reshape(shape))
     limits = DEPTH_RANGE[0], min(max_depth, DEPTH_RANGE[1]), max_depth
     wanted = wanted.reshape(shape)
     usable = _count(z.reshape(shape), pixels, wanted, mask is not None, safe.reshape(shape), cameras[3], limits, counts)
@@ -164,11 +164,10 @@ def _intrinsics_fault(K, height, width):
 
 
 @kernel
-def _restrict(use, values, least, most):
-    """Clear ``use`` [B, P] where a channel of values [B, C, P] is outside [least, most] or NaN."""
-    for b in range(values.shape[0]):
-        for channel in range(values.shape[1]):
-            _within(values[b, channel], values.dtype.type(least), values.dtype.type(most), use[b])
+def _restrict(use, variances):
+    """Clear ``use`` [B, P] where a variance [B, P] is negative, above ``LARGEST`` or NaN."""
+    for b in range(len(variances)):
+        _within(variances[b], variances.dtype.type(0.0), variances.dtype.type(LARGEST), use[b])
 
 
 @kernel
