@@ -161,12 +161,7 @@ class AlignedNetwork(DepthNetwork):
 
 @check_kinds
 def fit_inverse_depth(
-    prediction: Tensor,
-    depth: Tensor,
-    valid: Tensor | None = None,
-    *,
-    shift: float | None = None,
-    **options: Any,
+    prediction: Tensor, depth: Tensor, valid: Tensor | None = None, *, shift: float | None = None, **options: Any
 ) -> AlignmentFit:
     """Scale and shift with 1/depth = scale prediction + shift, by least squares in inverse depth.
 
@@ -193,12 +188,7 @@ def fit_inverse_depth(
 
 @check_kinds
 def fit_affine_depth(
-    prediction: Tensor,
-    depth: Tensor,
-    valid: Tensor | None = None,
-    *,
-    shift: float | None = 0.0,
-    **options: Any,
+    prediction: Tensor, depth: Tensor, valid: Tensor | None = None, *, shift: float | None = 0.0, **options: Any
 ) -> AlignmentFit:
     """Scale (and shift) with depth = scale prediction + shift [m], by least squares in depth.
 

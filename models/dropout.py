@@ -80,13 +80,7 @@ class MonteCarloDropout(DepthNetwork):
     stochastic = True
 
     @check_kinds
-    def __init__(
-        self,
-        network: DepthNetwork,
-        samples: int = 1,
-        *,
-        generator: torch.Generator | None = None,
-    ) -> None:
+    def __init__(self, network: DepthNetwork, samples: int = 1, *, generator: torch.Generator | None = None) -> None:
         super().__init__()
         if samples < 1:
             raise ValueError(f"samples must be at least 1, got {samples}")

@@ -237,9 +237,7 @@ def _in_memory(network: Any, processor: Any) -> tuple[nn.Module, Checkpoint]:
 
 
 def load_hugging_face(
-    weights: Path,
-    spec: HuggingFaceSpec | PlainSpec | None = None,
-    kind: type[HuggingFaceDepth] = HuggingFaceDepth,
+    weights: Path, spec: HuggingFaceSpec | PlainSpec | None = None, kind: type[HuggingFaceDepth] = HuggingFaceDepth
 ) -> DepthNetwork:
     """Load the metric network of a directory or hub name; ``spec``: :class:`HuggingFaceSpec`, its plain values or a
     JSON file. Raises ValueError: an unknown option, or a relative network without an alignment; others as

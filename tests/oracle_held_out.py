@@ -1,4 +1,4 @@
-"""Held-out anchors of the posterior's oracle: those in discs, predicted from the others."""
+"""Held-out anchors of the posterior's oracle: those in discs or a half of the image, predicted from the others."""
 
 from __future__ import annotations
 
@@ -12,10 +12,12 @@ from oracle_field import FEATURES, REACH, condition, distances, links, ratio
 APART = 0.5
 
 
-def discs(state, logs, Q, mean0, H, y, weight, noise, z2, node, u, v, measured, everywhere):
-    held = np.zeros(len(y), bool)
-    for k in range(3):
-        number = state["frames"] * 3 + k + 1
+def held_out(state, logs, Q, mean0, H, y, weight, noise, z2, node, u, v, measured, everywhere):
+    held, frames = np.zeros(len(y), bool), state["frames"]
+    if frames % 4 == 3:
+        angle = 2 * math.pi * 0.7548776662466927 * (frames + 1) / 4
+        held = (u - 0.5) * math.cos(angle) + (v - 0.5) * math.sin(angle) > 0
+    for number in range(frames * 3 + 1, frames * 3 + 4) if frames % 4 < 3 else ():
         cu, cv = (number * 0.7548776662466927) % 1, (number * 0.5698402909980532) % 1
         held |= (u - cu) ** 2 + (v - cv) ** 2 < spread.RADIUS**2
     rest = ~held

@@ -10,7 +10,7 @@ import oracle_field as field
 import oracle_interval as interval
 import oracle_overlap as overlap
 import oracle_spread as spreads
-from oracle_held_out import discs
+from oracle_held_out import held_out
 from oracle_motion import moving, plausible, surfaces
 
 CLIP = 9.0
@@ -82,7 +82,7 @@ def learnt(state, logs, mean0, Q, seen, fit):
         weights = (part / fit.total) ** 2 / count
         unit = field.ratio(state, name) / np.maximum(part, 1e-12)
         new[name] = (weights * (part + square - fit.total) * unit).sum(), weights.sum()
-    new |= discs(state, logs, Q, mean0, seen.H, seen.y, fit.weight, seen.noise, fit.z2, node, seen.u, seen.v,
+    new |= held_out(state, logs, Q, mean0, seen.H, seen.y, fit.weight, seen.noise, fit.z2, node, seen.u, seen.v,
                  seen.stated - 1 / N, fit.away)  # fmt: skip
     c, new["centre"], new["between"] = surfaces(state, node, seen.y - seen.H[:, 2:4] @ fit.mean[2:4], seen.noise)
     weights = 3 + sum(field.MEMORY**k for k in range(state["frames"] + 1))

@@ -10,10 +10,11 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.anchors.dense_keyframes import Keyframes, halved
-from ufmstar_torch.anchors.kernels import dense as dense_cpu
-from ufmstar_torch.anchors.kernels.dense import ACROSS, Search, Views, free_pixels, measure
+from ufmstar_torch.anchors.kernels.dense import ACROSS, WHOLE, Search, Views, _search, free_pixels, measure
 from ufmstar_torch.anchors.kernels.landmarks import Columns, Sighted, settle, sight
 from ufmstar_torch.anchors.kernels.reduce import reduce
+from ufmstar_torch.kernels.compile_cpu import reordered
+from ufmstar_torch.kernels.cpu.vectors import LANES
 
 K = np.array([[90.0, 0, 47.5], [0, 90.0, 35.5], [0, 0, 1]])
 SEARCH = Search(start=0.5, low=-0.01, high=2.0, sigmas=3.5, least_score=0.85, rival=1.2)
@@ -143,7 +144,7 @@ def test_a_view_that_might_show_the_match_outside_of_it_is_no_first_one(scene):
     first = views([plane(0, moved)], [moved], np.eye(4))
     pixel = np.array([[u, 30.0] for u in range(12, 84, 4)])
     found = measure(image, pixel, first, SEARCH).agreed > 0
-    far, near = pixel[:, 0], pixel[:, 0] + 90 * 0.5 * dense_cpu.WHOLE * SEARCH.start
+    far, near = pixel[:, 0], pixel[:, 0] + 90 * 0.5 * WHOLE * SEARCH.start
     whole = (np.minimum(far, near) >= 3.5) & (np.maximum(far, near) <= 95 - 3.5)
     assert 0 < whole.sum() < len(whole)
     assert not found[~whole].any()
@@ -158,14 +159,6 @@ def test_a_reduced_image_is_that_of_opencv_to_the_bit(size):
     small = np.empty((max(round(size[0] * 0.6), 1), 160 if size[1] > 320 else 319), np.uint8)
     reduce(image, small)
     np.testing.assert_array_equal(small, cv2.resize(image, small.shape[::-1], interpolation=cv2.INTER_AREA))
-
-
-def test_no_contrast_no_depth():
-    flat = np.full((72, 96), 90, np.uint8)
-    pixel = np.array([[40.0, 30.0]])
-    result = measure(flat, pixel, views([flat] * 3, MOVED, np.eye(4)), SEARCH)
-    assert result.agreed.tolist() == [0]
-    assert len(free_pixels(flat, 8, np.zeros((0, 2)))) == 0
 
 
 def test_the_pixel_of_a_cell_has_the_largest_gradient():
@@ -256,16 +249,18 @@ def test_a_cell_keeps_the_landmark_that_is_known_best(scene, better):
     assert landmarks.used.tolist() == [False, True, False]
 
 
-def test_a_search_along_the_last_row_reads_nothing_beyond_the_image():
-    """Python checks bounds; compiled code would read memory behind the image."""
+def test_a_search_along_the_last_rows_finds_the_window_there():
+    @reordered
+    def searched(patch, pixels, line, windows, sums, scores, match):
+        return _search(patch, pixels, 1, width, height, *line, windows, sums, scores, match)
+
     height, width = 12, 24
-    key = np.random.default_rng(0).integers(0, 256, (height, width), dtype=np.uint8)
-    windows, scores, match = np.empty((9, 8), np.uint64), np.empty(9, np.float32), np.empty(4)
-    patch = key[-8:, 7:15].astype(np.float32).ravel()
-    patch -= patch.mean()
-    patch /= np.linalg.norm(patch)
+    images = np.random.default_rng(0).integers(0, 256, (2, height, width), dtype=np.uint8)
+    sums, scores, match = np.empty((9, 3, LANES), np.float32), np.empty(9, np.float32), np.empty(4)
+    patch = images[1, -8:, 7:15].astype(np.float32).ravel()
+    patch = (patch - patch.mean()) / np.linalg.norm(patch - patch.mean())
     line = (6.5, height - 4.5, 1.0, np.array([8.0, 0.0, 0.0]), 0.0, 1.0)
-    assert dense_cpu._search(patch, dense_cpu.eights(key[None])[0], width, height, *line, windows, scores, match)
+    assert searched(patch, images.ravel(), line, np.empty((2, 9), np.int64), sums, scores, match)
     assert match[:2].tolist() == [10.5, height - 4.5]
     assert match[2] == pytest.approx(1, abs=1e-5)
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from ufmstar_torch.anchors.dense_poses import PoseErrors
 from ufmstar_torch.anchors.kernels.check import check_anchors, confirmed, farther
 from ufmstar_torch.anchors.kernels.dense import Measured, Views
-from ufmstar_torch.anchors.kernels.poses import linearised, rotated, solve
+from ufmstar_torch.anchors.kernels.pose_equations import linearised, rotated, solve
 
 K = np.array([[250.0, 0, 159.5], [0, 252.0, 119.5], [0, 0, 1]])
 

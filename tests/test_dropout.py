@@ -10,14 +10,7 @@ from test_monodepth2 import seeded
 from tiny_networks import Linear
 from torch import Tensor, nn
 
-from ufmstar_torch.models import (
-    Backbone,
-    DecoderDropout,
-    FastDepth,
-    MonteCarloDropout,
-    set_sampling,
-    with_head,
-)
+from ufmstar_torch.models import Backbone, DecoderDropout, FastDepth, MonteCarloDropout, set_sampling, with_head
 from ufmstar_torch.models.dropout import SAMPLES
 
 P = 0.2

@@ -13,11 +13,7 @@ from scipy import stats
 from tiny_networks import Linear, constant_head
 from torch import Tensor, nn
 
-from ufmstar_torch.models import (
-    EvidentialDepth,
-    MonodepthResNet,
-    with_head,
-)
+from ufmstar_torch.models import EvidentialDepth, MonodepthResNet, with_head
 from ufmstar_torch.models.heads import BETA_FLOOR, EVIDENCE_FLOOR, HEADS, LOG_VARIANCE_RANGE, soft_range
 from ufmstar_torch.models.module_backbone import ModuleBackbone, ModuleSpec
 from ufmstar_torch.models.preprocess import Preprocess
@@ -30,12 +26,7 @@ def pixel(value: float) -> Tensor:
     return torch.full((1, 1, 1), value, dtype=torch.float64)
 
 
-@given(
-    gamma=st.floats(0.1, 100),
-    nu=st.floats(0.01, 100),
-    alpha=st.floats(1.05, 50),
-    beta=st.floats(1e-4, 1e3),
-)
+@given(gamma=st.floats(0.1, 100), nu=st.floats(0.01, 100), alpha=st.floats(1.05, 50), beta=st.floats(1e-4, 1e3))
 def test_evidential_variance_is_the_students_t(gamma: float, nu: float, alpha: float, beta: float) -> None:
     """Marginally depth is Student-t with 2 alpha degrees of freedom (Amini et al., Eq. 7), whose variance is A + E."""
     prediction = EvidentialDepth(pixel(gamma), pixel(nu), pixel(alpha), pixel(beta)).prediction()

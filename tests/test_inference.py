@@ -84,10 +84,7 @@ def test_without_onnx_runtime_torch_runs_and_says_so(weights: Path, monkeypatch:
         depth, about = predicted("fastdepth", weights, Inference())
     assert about["name"] == "torch"
     assert torch.equal(depth, expected)
-    with (
-        pytest.warns(UserWarning, match="without"),
-        pytest.raises(ModuleNotFoundError, match="onnxruntime"),
-    ):
+    with pytest.warns(UserWarning, match="without"), pytest.raises(ModuleNotFoundError, match="onnxruntime"):
         predicted("fastdepth", weights, Inference("onnx"))
 
 

@@ -218,10 +218,7 @@ def test_an_unfinished_last_line_and_names_that_no_file_has_are_left_out(tmp_pat
         ('{"stamp": 1, "pose": [1, 2, 3, 0, 0, 0, 2]}', "line 1: pose: the quaternion's norm is 2"),
         ('{"stamp": 1, "pose": [[1, 2], [3]]}', "line 1: a pose has 7"),
         ('{"stamp": 1, "pose": {"x": 1}}', "line 1: a pose has 7"),
-        (
-            '{"stamp": 1, "image": "none.png"}',
-            "line 1: an image needs intrinsics, in its line, an earlier",
-        ),
+        ('{"stamp": 1, "image": "none.png"}', "line 1: an image needs intrinsics, in its line, an earlier"),
         ('{"intrinsics": [1, 2]}', "line 1: intrinsics are fx, fy, cx, cy"),
         ('{"intrinsics": "9 9 4 4"}', "line 1: intrinsics are fx, fy, cx, cy"),
         ('{"intrinsics": [0, 9, 4, 4]}', "line 1: intrinsics must be a finite 3x3 matrix with positive focal lengths"),

@@ -14,13 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ufmstar_torch.eval.engine.load import NetworkChoice
-from ufmstar_torch.models import (
-    CheckpointError,
-    MonodepthResNet,
-    load_monodepth2,
-    load_network,
-    save_checkpoint,
-)
+from ufmstar_torch.models import CheckpointError, MonodepthResNet, load_monodepth2, load_network, save_checkpoint
 from ufmstar_torch.models.monodepth2 import DECODER_WIDTHS, IMAGENET_MEAN, IMAGENET_STD
 
 SMALL = (4, 8, 8, 8, 16)

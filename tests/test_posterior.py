@@ -126,7 +126,7 @@ def of_stream(frame, anchors, claimed, i):
 def test_streams_of_one_batch_equal_the_oracle_s(dtype, rtol):
     """Some anchors are invalid, and V is NaN at a valid pixel."""
     packed, states = torch.zeros(3, SIZE, dtype=torch.float64), [oracle_field.start() for _ in range(3)]
-    for seeds in ((0, 1, 2), (3, 0, 1)):
+    for seeds in ((0, 1, 2), (3, 0, 1), (1, 2, 0), (2, 3, 1)):  # in the fourth frame a half of the image is held out
         frame, anchors, claimed = streams_of(seeds, dtype, (12, 16))
         packed, out = update(packed, frame, anchors, claimed, MODEL)
         for i in range(2):  # the last stream has no anchors
@@ -296,6 +296,23 @@ def test_the_variance_grows_in_proportion_to_the_distance_from_evidence():
     _, out = updated(depth, (pixel, np.full(28, 2.2), np.full(28, 1e-4)))
     by_column = relative(out).mean(0)
     assert float(by_column[50] - by_column[30]) > 0.9 * float(out.unseen) * 20 / 56
+
+
+def test_errors_that_grow_over_more_than_a_disc_are_learnt_and_cover_a_side_without_anchors():
+    """The network's scale is a wave across the image, which moves from frame to frame. Discs are smaller than it: the
+    anchors around them show their scale."""
+    shape, (v, u) = (36, 48), np.mgrid[1:36:3, 1:48:3].reshape(2, -1)
+    depth, claimed = np.full(shape, 2.0), torch.full((1, *shape), 0.04, dtype=torch.float64)
+    packed, z = torch.zeros(1, SIZE, dtype=torch.float64), []
+    for k in range(32):
+        factor = np.exp(0.3 * np.sin(2 * np.pi * (np.arange(48) / 48 + 0.3 * k)))
+        used = u < (48 if k < 24 else 16)
+        g = (depth * factor)[v[used], u[used]]
+        learnt, out = update(packed, *checked(depth, np.stack([u, v], -1)[used].astype(float), g, (0.01 * g) ** 2),
+                             claimed, MODEL)  # fmt: skip
+        packed = learnt if k < 24 else packed
+        z.append(((depth * factor - out.depth[0].numpy()) / out.variance[0].sqrt().numpy())[:, 32:])
+    assert np.sqrt(np.mean(np.square(z[24:]))) < 2  # 3.1 with discs alone
 
 
 def test_an_error_that_held_out_anchors_show_makes_what_is_unseen_less_certain():

@@ -76,20 +76,24 @@ def test_anchors_of_another_camera_are_at_the_pixels_of_the_image():
 
 
 def test_landmarks_of_the_images_complete_it():
-    """Only the landmark in the hole is added: one is on a pixel that the sensor measured, one is next to such a pixel.
+    """Three of six are added. One is on a pixel that the sensor measured, one is next to such a pixel, and one is
+    uncertain and nearer than the surface beside the hole.
 
     Where landmarks and sensor agree, depths stay. The stated common errors stay."""
     depth = plane()
     depth[:, 200:] = 0
-    pixel = np.array([[50.0, 50], [201, 60], [250, 70]])
-    others = Landmarks(pixel, np.array([2.0, 4, 4]), np.full(3, 0.1), 3, shared=1e-4, scale=1e-5)
+    pixel = np.array([[50.0, 50], [201, 60], [250, 70], [250, 100], [250, 130], [250, 160]])
+    others = Landmarks(
+        pixel, np.array([2.0, 4, 4, 1.5, 1.5, 1.7]), np.array([0.1, 0.1, 0.1, 0.1, 0.005, 0.1]), 6, shared=1e-4,
+        scale=1e-5,
+    )  # fmt: skip
     sensor = sensor_landmarks(depth, K, K)
     found = completed(sensor, others, depth)
     n = len(sensor.depth)
-    np.testing.assert_array_equal(found.pixel[n:], [[250, 70]])
-    np.testing.assert_allclose(found.depth[n:], 4)
-    assert (found.variance[n:] <= 0.1 * (1 + 1e-9)).all()
-    assert (found.shared, found.scale, found.tracked) == (1e-4, 1e-5, n + 3)
+    np.testing.assert_array_equal(found.pixel[n:], [[250, 70], [250, 130], [250, 160]])
+    np.testing.assert_allclose(found.depth[n:], [4, 1.5, 1.7])
+    assert (found.variance[n:] <= others.variance[[2, 4, 5]] * (1 + 1e-9)).all()
+    assert (found.shared, found.scale, found.tracked) == (1e-4, 1e-5, n + 6)
     none = replace(others, pixel=np.zeros((0, 2)), depth=np.zeros(0), variance=np.zeros(0), shared=np.inf)
     alone = completed(sensor, none, depth)
     np.testing.assert_array_equal(alone.depth, sensor.depth)

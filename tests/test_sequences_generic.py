@@ -185,34 +185,6 @@ def test_video_with_kitti_rows(tmp_path):
     np.testing.assert_array_equal(sequence[3].image, truth.images[3])
 
 
-def test_video_frames_have_the_times_in_the_container(tmp_path):
-    """A phone's variable frame rate, with frames that are stored out of order (H.264)."""
-    truth = layouts.truth(K, 8)
-    times = np.cumsum([0, 0.033, 0.1, 0.033, 0.25, 0.04, 0.033, 0.07])
-    for i, image in enumerate(truth.images):
-        write_image(tmp_path / "frames" / f"{i}.png", image)
-    shown = "".join(f"if(eq(N,{i}),{time:.3f}/TB," for i, time in enumerate(times)) + "0" + ")" * len(times)
-    command = [
-        get_ffmpeg_exe(),
-        "-v",
-        "error",
-        "-i",
-        str(tmp_path / "frames" / "%d.png"),
-        "-vf",
-        f"settb=1/9000,setpts='{shown}'",
-    ]
-    command += ["-fps_mode", "passthrough", "-enc_time_base", "1/9000", "-pix_fmt", "yuv420p", "-qp", "0"]
-    subprocess.run([*command, str(tmp_path / "phone.mp4")], check=True)
-    tum_trajectory(tmp_path / "slam.txt", truth.T_world_cam, times)
-    sequence = open_sequence(tmp_path / "phone.mp4", intrinsics=K, trajectory="slam.txt")
-    np.testing.assert_allclose([entry.timestamp for entry in sequence.entries], times, atol=2e-3)
-    for i, frame in enumerate(sequence):
-        np.testing.assert_allclose(frame.T_world_cam, truth.T_world_cam[i], atol=5e-3)
-        assert np.abs(frame.image.astype(int) - truth.images[i]).mean() < 8  # half the colour resolution
-    with pytest.raises(ValueError, match=r"pass trajectory.*`ufmstar poses` computes poses from images alone"):
-        open_sequence(tmp_path / "phone.mp4", intrinsics=K)
-
-
 def test_broken_and_turned_videos(tmp_path, capfd, caplog):
     rng = np.random.default_rng(0)
     images = [rng.integers(0, 255, (48, 64, 3), dtype=np.uint8) for _ in range(8)]

@@ -284,8 +284,7 @@ def test_unknown_and_ambiguous_layouts(tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     with pytest.raises(
-        ValueError,
-        match=r"no known layout: expected images .*, K\.txt; or the files of tum, .*kitti360.* \(docs/data",
+        ValueError, match=r"no known layout: expected images .*, K\.txt; or the files of tum, .*kitti360.* \(docs/data"
     ):
         open_sequence(empty)
     with pytest.raises(ValueError, match=r"has not the layout 'tartanair': looked for pose_left\.txt"):

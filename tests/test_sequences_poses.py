@@ -186,11 +186,7 @@ def brute_force_association(first, second, limit):
     return pairs
 
 
-@given(
-    st.lists(st.integers(0, 60), max_size=12),
-    st.lists(st.integers(0, 60), max_size=12),
-    st.integers(0, 9),
-)
+@given(st.lists(st.integers(0, 60), max_size=12), st.lists(st.integers(0, 60), max_size=12), st.integers(0, 9))
 def test_association_equals_brute_force(first, second, limit):
     # integers: no difference lies within rounding of the limit
     a, b = np.array(first, dtype=float), np.array(second, dtype=float)

@@ -143,13 +143,13 @@ def test_depth_that_expands_without_limit(tmp_path):
         open_sequence(path)
 
 
-@pytest.mark.parametrize(("frames", "message"), [(2**62, f"{2**62} frames"), (10**7, r"10000000 frames cannot be in")])
-def test_a_broken_header_is_refused(file, frames, message):
+@pytest.mark.parametrize("frames", [2**62, 10**7])
+def test_a_broken_header_is_refused(file, frames):
     """The number of frames in the header is bounded by the file's size, because each frame needs an entry."""
     data = bytearray(file.read_bytes())
     struct.pack_into("<Q", data, HEADER - 8, frames)
     file.write_bytes(data)
-    with pytest.raises(ValueError, match=rf"scene\.sens: broken header: {message}"):
+    with pytest.raises(ValueError, match=rf"scene\.sens: broken header: {frames} frames cannot be in"):
         open_sequence(file)
 
 

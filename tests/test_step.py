@@ -150,8 +150,7 @@ def assert_same(one, other, rows=slice(None)) -> None:
     """Assert equality bit for bit."""
     a, b = tensors(one), tensors(other)
     for name, value in a.items():
-        present = b[name][rows]
-        assert torch.equal(value.double().nan_to_num(-1), present.double().nan_to_num(-1)), name
+        assert torch.equal(value.double().nan_to_num(-1), b[name][rows].double().nan_to_num(-1)), name
 
 
 @pytest.mark.parametrize("name", CONFIGS)

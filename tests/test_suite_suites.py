@@ -226,7 +226,6 @@ ROW = "[[rows]]\nmethods = ['UfM*-MCD']\n"
         (f"{ROW}each = {{seed = {[*range(40)]}, skip = {[*range(40)]}}}", "the suite has more than 1000 rows"),
         (f"{ROW}setting = {{anchors = '/etc/hosts.txt'}}", "anchors must be a file in the folder of each sequence"),
         (f"{ROW}each = {{anchors = ['../hosts.txt']}}", "anchors must be a file in the folder of each sequence"),
-        (f"{ROW}setting = {{recalibration = '/etc/hosts'}}", "recalibration is no setting of a suite's file"),
         (f"title = '{1_000_000 * 'x'}'", "larger than 1,000,000 bytes"),
         ("title = 'x'", "needs at least one row"),
         ("name = ", "Invalid value"),

@@ -81,15 +81,6 @@ def test_the_compiled_twin_agrees(seed):
     np.testing.assert_array_equal(fast.ahead, slow.ahead)
 
 
-def test_the_variance_is_what_noise_makes_of_it():
-    T, points = views(6, 3, spread=0.2), np.repeat(world_points(1, 3), 4000, axis=0)
-    rng, sigma = np.random.default_rng(0), 0.3
-    pixel = seen_from(points, T) + sigma * rng.standard_normal((4000, 6, 2))
-    result = triangulate(pixel, np.ones((4000, 6), dtype=bool), T, K)
-    spread = np.cov((result.point - points).T)
-    np.testing.assert_allclose(sigma**2 * result.covariance.mean(0), spread, atol=0.08 * np.trace(spread))
-
-
 def test_two_views_side_by_side_in_closed_form():
     T = np.tile(np.eye(4), (2, 1, 1))
     T[1, 0, 3] = 0.1

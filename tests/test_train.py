@@ -24,13 +24,7 @@ from ufmstar_torch.models import (
     save_trained,
 )
 from ufmstar_torch.models.batch_layer import BatchLayer
-from ufmstar_torch.train import (
-    DepthDataModule,
-    NonFiniteLossError,
-    Recipe,
-    TrainingModule,
-    starting_network,
-)
+from ufmstar_torch.train import DepthDataModule, NonFiniteLossError, Recipe, TrainingModule, starting_network
 from ufmstar_torch.train.command import _WITHOUT, _fields_of
 from ufmstar_torch.train.fit import fit
 from ufmstar_torch.train.folder import WEIGHTS

@@ -17,13 +17,7 @@ from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.tour.sequence import open_tour
 from ufmstar_torch.models import GaussianDepth
-from ufmstar_torch.train import (
-    DataConfig,
-    DepthDataModule,
-    Job,
-    Recipe,
-    SequenceFrames,
-)
+from ufmstar_torch.train import DataConfig, DepthDataModule, Job, Recipe, SequenceFrames
 from ufmstar_torch.train.distil import Teacher, distillation_sums
 from ufmstar_torch.train.member import make_data, new_network, train_member
 from ufmstar_torch.train.samples import SampleDataset, clips, joined

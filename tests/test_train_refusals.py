@@ -10,15 +10,7 @@ import pytest
 import torch
 
 from ufmstar_torch.models import PointDepth, Preprocess
-from ufmstar_torch.train import (
-    AugmentationConfig,
-    DataConfig,
-    DepthDataModule,
-    FitSettings,
-    Recipe,
-    loss_of,
-    preset,
-)
+from ufmstar_torch.train import AugmentationConfig, DataConfig, DepthDataModule, FitSettings, Recipe, loss_of, preset
 from ufmstar_torch.train.data_config import Part
 
 INF, NAN = float("inf"), float("nan")

@@ -22,41 +22,35 @@ class Part:
     at random.
     """
 
-    start: float  # a number of frames, or a percentage of them if ``start_share`` / ``stop_share``
-    stop: float
-    start_share: bool
-    stop_share: bool
+    start: tuple[float, str]  # a number of frames, or of percent of them with the unit "%"
+    stop: tuple[float, str]
 
     @classmethod
     def parse(cls, text: str) -> Part:
         """Parse ``START:STOP``, each a frame number or a percentage of the frames; default: the first, the end. Raises
         ValueError: another form, a share above 100 %, or an empty part."""
         start, colon, stop = text.partition(":")
-        result = _PART.fullmatch(f"{start.strip() or '0'}:{stop.strip() or '100%'}") if colon else None
-        if result is None or _impossible(result[1], result[2]) or _impossible(result[3], result[4]):
+        found = _PART.fullmatch(f"{start.strip() or '0'}:{stop.strip() or '100%'}") if colon else None
+        edges = [] if found is None else [(float(found[1]), found[2]), (float(found[3]), found[4])]
+        if not edges or any(value > 100 if unit else value % 1 for value, unit in edges):
             raise ValueError(f"a part must be START:STOP in frames or percent (0:70%, 100:400), got {text!r}")
-        part = cls(float(result[1]), float(result[3]), bool(result[2]), bool(result[4]))
-        if part.start_share == part.stop_share and part.start >= part.stop:
+        if edges[0][1] == edges[1][1] and edges[0] >= edges[1]:
             raise ValueError(f"a part must end after its start, got {text!r}")
-        return part
+        return cls(*edges)
 
     def frames(self, length: int) -> range:
         """The frame numbers of a sequence of that length. Raises ValueError: the part has no frame."""
-        edges = [(self.start, self.start_share), (self.stop, self.stop_share)]
         # Rounded to 1e-6 first, so that 70 % of 10 is 7 despite rounding errors.
-        numbers = [int(round(value * length / 100, 6)) if share else int(value) for value, share in edges]
-        part = range(min(length, numbers[0]), min(length, numbers[1]))
+        first, end = (
+            int(round(value * length / 100, 6)) if unit else int(value) for value, unit in (self.start, self.stop)
+        )
+        part = range(min(length, first), min(length, end))
         if not part:
             raise ValueError(f"the part {self} of {length} frames is empty")
         return part
 
     def __str__(self) -> str:
-        return f"{self.start:g}{'%' * self.start_share}:{self.stop:g}{'%' * self.stop_share}"
-
-
-def _impossible(value: str, unit: str) -> bool:
-    """True for a share above 100 %, or a fraction of a frame."""
-    return float(value) > 100 if unit else "." in value
+        return ":".join(f"{value:g}{unit}" for value, unit in (self.start, self.stop))
 
 
 @dataclass(frozen=True)

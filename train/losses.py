@@ -29,11 +29,7 @@ _SERIES_FROM = 8.0
 
 
 def loss_of(
-    distribution: DepthDistribution,
-    target: Tensor,
-    valid: Tensor,
-    *,
-    evidence_weight: float = EVIDENCE_WEIGHT,
+    distribution: DepthDistribution, target: Tensor, valid: Tensor, *, evidence_weight: float = EVIDENCE_WEIGHT
 ) -> Tensor:
     """The distribution's loss, averaged over the pixels with ground truth.
 
@@ -59,11 +55,7 @@ def loss_of(
 
 @check_kinds
 def loss_sums(
-    distribution: DepthDistribution,
-    target: Tensor,
-    valid: Tensor,
-    *,
-    evidence_weight: float = EVIDENCE_WEIGHT,
+    distribution: DepthDistribution, target: Tensor, valid: Tensor, *, evidence_weight: float = EVIDENCE_WEIGHT
 ) -> tuple[Tensor, Tensor]:
     """The sum of the loss over valid pixels and their number (int64); arguments as :func:`loss_of`.
 

@@ -22,11 +22,7 @@ _VALIDATION_EVERY = 4
 
 @check_kinds
 def convert_labelled(
-    mat: str | Path,
-    out: str | Path,
-    splits: str | Path | None = None,
-    *,
-    raw: bool = False,
+    mat: str | Path, out: str | Path, splits: str | Path | None = None, *, raw: bool = False
 ) -> dict[str, int]:
     """Convert ``nyu_depth_v2_labeled.mat`` (MATLAB 7.3, which is HDF5) to FastDepth's layout.
 

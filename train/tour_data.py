@@ -40,10 +40,7 @@ _FARTHEST = np.iinfo(np.uint16).max
 
 
 @check_kinds
-def tour_frames(
-    seeds: Iterable[int],
-    config: DataConfig,
-) -> SequenceFrames:
+def tour_frames(seeds: Iterable[int], config: DataConfig) -> SequenceFrames:
     """The frames of some tours, which are rendered if the cache does not have them.
 
     After an interruption it goes on with the missing tours. Several processes may call it at the same time (those of a

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ from ufmstar_torch.gaussians.state import ALWAYS_FLOAT64, NAMES, UfMStarState
 from ufmstar_torch.kernels.select import FrameKernels, select_frame, select_step
 from ufmstar_torch.posterior.recalibrate import CONFIDENCE, Recalibration
 from ufmstar_torch.runtime.kinds import require
-from ufmstar_torch.runtime.stateful import StatefulModule, full_precision, one_caller, outliving
+from ufmstar_torch.runtime.stateful import StatefulModule, one_caller, undisturbed
 from ufmstar_torch.runtime.warm_up import warm_up
 from ufmstar_torch.steps import variance
 from ufmstar_torch.steps.regress import Regression, query
@@ -163,7 +163,7 @@ class UfMStar(StatefulModule):
             depth, pose, intrinsics, aleatoric, epistemic, valid, member=member, informative=informative,
             anchors=anchors, confidence=confidence,
         )  # fmt: skip
-        kernels = self._kernels(depth.device.type)[1].sample
+        kernels = self._kernels(depth)[1].sample
         index, used = kernels.pixels(frame.valid, *sample_size(frame.size, pixels, fraction, seed))
         out = self._observe(frame, index)
         return mean_uncertainty(out, used, kernels.summary)
@@ -195,8 +195,7 @@ class UfMStar(StatefulModule):
         Raises:
             ValueError: wrong shape, or there was no frame yet.
         """
-        with torch.no_grad():
-            return query(self.state, as_tensor("points", points), self.config)
+        return query(self.state, as_tensor("points", points), self.config)
 
     @property
     def mixture(self) -> GaussianMixture:
@@ -221,7 +220,7 @@ class UfMStar(StatefulModule):
         """
         if require("keep_evidence", keep_evidence, bool) and not self._empty.by_stream:
             raise ValueError("keep_evidence needs UfMStarConfig(anchors=AnchorConfig()), got one without anchors")
-        with outliving(), torch.no_grad():  # buffers must outlive the caller's inference mode
+        with undisturbed(self.mean):
             old, b = self.state, self.mean.shape[0]
             if streams is None:
                 self._warnings.reset()
@@ -251,14 +250,14 @@ class UfMStar(StatefulModule):
         frame = check_frame(
             depth, T, K, *maps, **view, variances_in_h=self.config.variances_in_h,
             rotation_tolerance=self.config.rotation_tolerance, max_depth=self.config.segment.depth_limit,
-            kernel=self._kernels(depth.device.type)[1].check,
+            kernel=self._kernels(depth)[1].check,
         )  # fmt: skip
         if confidence is not None:
             frame = replace(frame, confidence=as_confidence(confidence, frame))
         if anchors is None:
             return frame
         variances = [v for v in (frame.aleatoric, frame.epistemic) if v is not None]
-        checked = check_anchors(anchors, frame, variances, self._kernels(depth.device.type)[1].check_anchors)
+        checked = check_anchors(anchors, frame, variances, self._kernels(depth)[1].check_anchors)
         self._doubts.judge(anchors, checked, frame.size)
         return replace(frame, anchors=checked)
 
@@ -268,14 +267,13 @@ class UfMStar(StatefulModule):
     ) -> UncertaintyOutput:  # fmt: skip
         """Run the step and the corrections by anchors, and store the new state. The maps are [B, n] at ``pixels``,
         indices into the flattened image; without these, ``network`` has the caller's maps, whose shape they get."""
-        # Outside the caller's inference mode, since the state must outlive it.
-        with outliving(), torch.set_grad_enabled(False), full_precision(frame.depth.device):
+        with undisturbed(frame.depth):
             state = self._stored().for_frame(frame, self.config)
             if self.config.on_bad_frame == "raise":
                 raise_faults(frame)
             if self.observer is not None:
                 self.observer.stage("check")
-            step, kernels = self._kernels(frame.depth.device.type)
+            step, kernels = self._kernels(frame.depth)
             state, out = step(state, frame, self.config, pixels=pixels, observer=self.observer)
             merging = kernels.merge
             state, out, factor = variance.corrected(state, frame, out, self.config, self.recalibration, pixels, merging)
@@ -287,7 +285,7 @@ class UfMStar(StatefulModule):
         if network is not None:
             maps = self._shaped(maps, network, frame.confidence)
         depth, V, valid = maps.pop("depth"), maps.pop("variance"), maps.pop("valid")
-        out = replace(out, depth=depth, variance=V, valid=valid, maps=maps)
+        out = UncertaintyOutput(depth, V, valid, maps, out.statistics, out.quantiles)
         self._store(state.tensors())  # last, so that an earlier error changes nothing
         self._warnings.after_frame(frame, out.statistics, state.frames, self.config)
         return out
@@ -306,11 +304,11 @@ class UfMStar(StatefulModule):
         return {name: value.reshape(depth.shape) for name, value in maps.items()} if depth.dim() == 4 else maps
 
     def _stored(self) -> UfMStarState:
-        return self._empty.with_tensors(cast("dict[str, Tensor]", self._buffers))  # avoids ``__getattr__``
+        return self._empty.with_tensors(self._buffers)  # type: ignore[arg-type]  # avoids ``__getattr__``
 
-    def _kernels(self, device_type: str) -> tuple[Step, FrameKernels]:
-        """The step and the check for a device. The step is cached, since a GPU's counts components."""
-        key = (self.config.backend, device_type)
+    def _kernels(self, like: Tensor) -> tuple[Step, FrameKernels]:
+        """The step and the check for a tensor's device. The step is cached, since a GPU's counts components."""
+        key = (self.config.backend, "cpu" if like.is_cpu else like.device.type)
         if self._cached_step is None or self._cached_step[0] != key:
             self._cached_step = key, select_step(*key), select_frame(*key)
         return self._cached_step[1:]

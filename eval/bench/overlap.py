@@ -39,7 +39,7 @@ def time_overlap(
     whole, alone = list[float](), list[float]()
     with pinned_threads(plan.threads or 1):
         model = UncertainDepth(network.members, preprocess=network.preprocess, check_poses=0)
-        images = ((image_tensor(f).to(device), *map(torch.from_numpy, (f.T_world_cam, f.intrinsics))) for f in frames)
+        images = ((image_tensor(frame).to(device), frame.T_world_cam, frame.intrinsics) for frame in frames)
         with closing(model.stream(images)) as results:
             for frame in frames[:-1]:
                 started = time.perf_counter()

@@ -125,7 +125,7 @@ def _rank_correlation(x: np.ndarray, y: np.ndarray) -> float:
     for values in (x, y):
         _, index, count = np.unique(values, return_inverse=True, return_counts=True)
         ranks.append((np.cumsum(count) - count / 2)[index])
-    return float(np.corrcoef(*ranks)[0, 1])
+    return float(np.corrcoef(ranks[0], ranks[1])[0, 1])
 
 
 def _digits(factor: float) -> str:

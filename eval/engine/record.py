@@ -71,7 +71,8 @@ class Record:
     def save(self, path: Path) -> None:
         """Write the sums, then the record as JSON, each atomically: if the record exists, both are complete."""
         path.unlink(missing_ok=True)  # an unreadable record
-        sums = {f"{name}/{key}": value.numpy() for name, states in self.sums.items() for key, value in states.items()}
+        states = ((name, state.items()) for name, state in self.sums.items())
+        sums: dict[str, Any] = {f"{name}/{key}": value.numpy() for name, of_name in states for key, value in of_name}
         # Compressed, since Spearman's 514 x 514 counts are mostly 0.
         write_atomic(path.with_suffix(SUMS), lambda file: np.savez_compressed(file, **sums), durable=True)
         names = [f.name for f in fields(self) if f.name not in _NOT_STORED]

@@ -191,8 +191,6 @@ def _expanded(part: Any, base: str | None, preset: str | None) -> Iterator[Row]:
         raise ValueError(f"label {label!r} names one row: of several methods, write {{method}} in it; not with each")
     for point in itertools.product(*ranges.values()):
         setting = {**part.get("setting", {}), **dict(zip(ranges, point, strict=True))}
-        if "recalibration" in setting:
-            raise ValueError("recalibration is no setting of a suite's file: --recalibration FILE adds its rows")
         if ".." in (path := PurePath(str(setting.get("anchors", "")))).parts or path.is_absolute():
             raise ValueError(f"anchors must be a file in the folder of each sequence, got {str(path)!r}")
         for method in map(Method.parse, methods):

@@ -19,7 +19,7 @@ from ufmstar_torch.eval.methods.ufm_cloud import Cloud, View, take_in
 from ufmstar_torch.frames.frame import check_frame, raise_faults
 from ufmstar_torch.frames.output import EVERY_FRAME, FrameStatistics, UncertaintyOutput
 from ufmstar_torch.gaussians.camera import relative_pose
-from ufmstar_torch.runtime.stateful import full_precision, outliving
+from ufmstar_torch.runtime.stateful import undisturbed
 
 
 def output_of(depth: Tensor, variance: Tensor | None, valid: Tensor, **maps: Tensor | None) -> UncertaintyOutput:
@@ -92,7 +92,7 @@ class UfM:
         if self.clouds and len(frame.depth) != len(self.clouds):
             raise ValueError(f"depth must be of {len(self.clouds)} streams as before, got {tuple(depth.shape)}")
         raise_faults(frame)
-        with outliving(), torch.no_grad(), full_precision(frame.depth.device):
+        with undisturbed(frame.depth):
             first = self.T_world_first if self.clouds else frame.T_world_cam
             clouds = self.clouds or [Cloud.empty(self._dtype, frame.depth.device)] * len(frame.depth)
             stated = [value.detach() for value in (frame.aleatoric, frame.epistemic) if value is not None]

@@ -86,10 +86,9 @@ def read(path: Path, options: Options) -> FrameSequence:
     times = _times(folder / "timestamps.txt", numbers)
     poses = _poses(root, drive, camera) if options.trajectory is None else dict.fromkeys(numbers, UNKNOWN)
     maps = {} if options.truth is None else pair_depth([i.stem for i in images], resolve(folder, options.truth))
+    loaders = {image.stem: depth_loader(maps.get(image.stem), options.truth_scale, _SCALE) for image in images}
     frames = [
-        frame_of_image(
-            image.stem, image, depth_loader(maps.get(image.stem), options.truth_scale, _SCALE), poses[number], time
-        )
+        frame_of_image(image.stem, image, loaders[image.stem], poses[number], time)
         if number in poses
         else Skipped(image.stem, "no pose for this frame number")
         for image, number, time in zip(images, numbers, times, strict=True)

@@ -114,8 +114,7 @@ class Found(NamedTuple):
 def find_sequences(root: str | Path, layout: str = "auto", plugin: Sequence[str] = ()) -> list[Found]:
     """All sequences at most four folders below ``root``, sorted by name.
 
-    A folder that is a sequence is not searched, so that its folders of images are no sequences. Each folder on disk
-    counts once, independent of links to it (a folder before its links), so circular links are no problem. Hidden and
+    A folder that is a sequence is not searched. Each folder on disk counts once, before its links. Hidden and
     unreadable folders are ignored.
 
     Args:

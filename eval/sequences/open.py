@@ -39,9 +39,7 @@ def open_sequence(path: str | Path, layout: str = "auto", **options: Any) -> Fra
 
     Args:
         path: the sequence's folder, a video file, or ``tour:SEED`` with the options of a rendered tour in its name.
-        layout: ``auto``, ``tum``, ``7scenes``, ``scannet``, ``sens``, ``tartanair``, ``kitti360``, ``nyu``, ``colmap``,
-            ``transforms``, ``euroc``, ``bag``, ``stray``, ``arkitscenes``,
-            ``generic``, or one of a plug-in.
+        layout: ``auto``, a name of ``READERS`` (docs/data.md), or one of a plug-in.
         **options: by the names of :class:`~ufmstar_torch.eval.sequences.options.Options`, which explains them;
             intrinsics may also be a matrix [3, 3] [px].
 

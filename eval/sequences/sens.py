@@ -43,7 +43,6 @@ _HEADER = np.dtype(
 _FRAME = np.dtype([("T_world_cam", *_MATRIX), ("times", "<u8", 2), ("bytes", "<u8", 2)])
 _BYTES_PER_DEPTH = 2
 _MAX_NAME = 10_000  # [bytes] largest sensor name; a file with a longer one is no .sens file
-_MAX_FRAMES = 10_000_000  # 92 hours at 30 Hz: more is a broken header
 _FEW_FRAMES = 10_000  # accepted in a file of any size, which may be truncated
 _MICROSECOND = 1e-6
 
@@ -72,17 +71,8 @@ def read(path: Path, options: Options) -> FrameSequence:
         frames.append(Skipped(str(number), "beyond the end of the truncated file"))
     K_color, K_depth = (header[key][:3, :3].astype(np.float64) for key in ("K_color", "K_depth"))
     lens = Lens.of(K_color, color_size) if options.intrinsics is None else None
-    return assemble(
-        "sens",
-        path,
-        frames,
-        lens,
-        options,
-        name=file.resolve().stem,
-        size=color_size,
-        K_depth=K_depth,
-        depth_size=depth_size,
-    )
+    cameras = {"size": color_size, "K_depth": K_depth, "depth_size": depth_size}
+    return assemble("sens", path, frames, lens, options, name=file.resolve().stem, **cameras)
 
 
 def _read_header(file: BinaryIO, path: Path) -> np.void:
@@ -99,7 +89,7 @@ def _read_header(file: BinaryIO, path: Path) -> np.void:
     (color_w, color_h), (depth_w, depth_h) = header["color_size"], header["depth_size"]
     frames, units = header["frames"], header["units_per_metre"]
     sizes_fit = 0 < int(depth_w) * int(depth_h) <= MOST_PIXELS and min(color_w, color_h) > 0
-    if not (sizes_fit and 1 <= units < np.inf and frames <= _MAX_FRAMES):
+    if not (sizes_fit and 1 <= units < np.inf):
         found = f"images of {color_w}x{color_h}, depth of {depth_w}x{depth_h}, {units:g} units per metre"
         raise ValueError(f"{path}: broken header: {frames} frames, {found}")
     kinds = _COLOR.get(int(header["color"]), "unknown"), _DEPTH.get(int(header["depth"]), "unknown")
@@ -157,9 +147,7 @@ def _read_depth(path: Path, offset: int, size: int, shape: Size, scale: float) -
         data = stream.decompress(_bytes(path, offset, size), most + 1)
     except zlib.error as error:
         raise FrameError(path, f"the depth map at byte {offset} cannot be decoded: {error}") from error
-    if not stream.eof and len(data) <= most:
-        raise FrameError(path, f"the depth map at byte {offset} cannot be decoded: it is cut off")
-    if len(data) != most:
+    if len(data) != most or not stream.eof:
         has = f"more than {most}" if len(data) > most else f"{len(data)}"
         expected = f"{shape[1]}x{shape[0]} of {_BYTES_PER_DEPTH}"
         raise FrameError(path, f"the depth map at byte {offset} has {has} bytes, expected {expected}")

@@ -71,13 +71,11 @@ def read(path: Path, options: Options) -> FrameSequence:
     T_color_depth = _T_COLOR_DEPTH if options.T_color_depth is None else options.T_color_depth
     if not isinstance(T_color_depth, np.ndarray):
         T_color_depth = read_pose(resolve(path, T_color_depth))
+    cameras = (K_depth, K_color, T_color_depth, color_size)
     for i, frame in enumerate(frames):
         if isinstance(frame, Entry):
-            load = frame.load_depth and partial(
-                _registered, frame.load_depth, K_depth, K_color, T_color_depth, color_size
-            )
-            T_world_color = frame.T_world_cam @ np.linalg.inv(T_color_depth)
-            frames[i] = replace(frame, T_world_cam=T_world_color, load_depth=load)
+            load = frame.load_depth and partial(_registered, frame.load_depth, *cameras)
+            frames[i] = replace(frame, T_world_cam=frame.T_world_cam @ np.linalg.inv(T_color_depth), load_depth=load)
     options = replace(options, depth_intrinsics=None)
     return assemble("7scenes", path, frames, Lens.of(K_color, color_size), options, depth_size=color_size)
 

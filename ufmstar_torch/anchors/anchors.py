@@ -71,13 +71,7 @@ class Anchors:
 
     @classmethod
     @check_kinds
-    def from_points(
-        cls,
-        points_cam: Tensor,
-        variance: Tensor,
-        intrinsics: Tensor,
-        size: tuple[int, int],
-    ) -> Anchors:
+    def from_points(cls, points_cam: Tensor, variance: Tensor, intrinsics: Tensor, size: tuple[int, int]) -> Anchors:
         """Convert points in the camera frame, such as landmarks of a map or returns of a range sensor, to anchors.
 
         A point is invalid if it lies behind the camera or outside the image, or if a value is not finite. Rows of

@@ -17,12 +17,10 @@ the group refines them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from ufmstar_torch.anchors.kernels.bundle import Learnt, refine
 from ufmstar_torch.anchors.saved_state import POSITIVE, SavedState
@@ -75,15 +73,6 @@ class PoseRefinement(SavedState):
         self._recent_score = _SCORE
         self._offset_variance = 0.0  # variance of a position by the time offset [px^2]
         self.offset.reset()
-
-    def state(self) -> dict[str, Tensor]:
-        """Copy the state, for :meth:`load_state`."""
-        return super().state() | self.offset.state()
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Restore a result of :meth:`state`; ValueError: an impossible value."""
-        super().load_state(state)
-        self.offset.load_state(state)
 
     @property
     def pose_variance(self) -> float:

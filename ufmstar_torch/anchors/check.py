@@ -74,11 +74,9 @@ def check_anchor_values(
 
 
 def check_anchors(
-    anchors: Anchors,
-    frame: FrameInput,
-    network_variances: Sequence[Tensor] = (),
+    anchors: Anchors, frame: FrameInput, network_variances: Sequence[Tensor] = (),
     kernel: CheckAnchors = check_anchor_values,
-) -> Anchors:
+) -> Anchors:  # fmt: skip
     """Check the anchors of one frame and convert them to float64 on the depth's device.
 
     An anchor is invalid if a value is impossible, if it lies outside the image or on a pixel without depth, if its

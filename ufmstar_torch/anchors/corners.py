@@ -34,12 +34,9 @@ _LOG_RATIO, _ROUNDS, _SHARE = 0.03, 3, 0.15
 
 
 def follow(
-    before: NDArray[np.uint8],
-    after: NDArray[np.uint8],
-    position: NDArray[np.float64],
-    back_tolerance: float,
+    before: NDArray[np.uint8], after: NDArray[np.uint8], position: NDArray[np.float64], back_tolerance: float,
     expected: NDArray[np.float64] | None = None,
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:  # fmt: skip
     """Track corners from one gray image to the next, and check that tracking them back returns to the start.
 
     If the second image is brighter or darker, the brightness of the first is adapted.

@@ -14,13 +14,11 @@ and some numbers.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from ufmstar_torch.anchors.dense_keyframes import Keyframes, halved
 from ufmstar_torch.anchors.dense_memory import Memory
@@ -47,7 +45,6 @@ _ENOUGH = 10
 _JUMPED = 3
 # Variance of a match of the wide windows over that computed from its residual; 2 to 4 on tours.
 _COARSE_NOISE = 4.0
-_CORNERS = "corners_"  # prefix of the names of the tracker's state
 
 
 @dataclass(frozen=True)
@@ -127,6 +124,7 @@ class DenseEvidence(SavedState):
         "_baseline": "baseline",
     }
     RANGES: ClassVar = {"_depth": POSITIVE}
+    PREFIXES: ClassVar = {"_tracker": "corners_"}
 
     @check_kinds
     def __init__(self, config: DenseConfig | None = None) -> None:
@@ -153,20 +151,6 @@ class DenseEvidence(SavedState):
         self._tracker.reset()
         self._size, self._K = np.zeros(2, np.int64), np.eye(3)  # of the images; no size before the first
         self._depth, self._contradicted, self._baseline = self.config.start_depth, 0, 0.0
-
-    def state(self) -> dict[str, Tensor]:
-        """The state, for :meth:`load_state`. Images are shared and must not be written to."""
-        corners = {_CORNERS + name: value for name, value in self._tracker.state().items()}
-        parts = self._keyframes, self._memory, self._errors, self._motion
-        return super().state() | {name: value for part in parts for name, value in part.state().items()} | corners
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Restore a result of :meth:`state`; ValueError: another number of keyframes or landmarks."""
-        super().load_state(state)
-        for part in (self._keyframes, self._memory, self._errors, self._motion):
-            part.load_state(state)
-        corners = {name: value for name, value in state.items() if name.startswith(_CORNERS)}
-        self._tracker.load_state({name.removeprefix(_CORNERS): value for name, value in corners.items()})
 
     def update(
         self, image: NDArray[np.uint8] | None, T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
@@ -215,14 +199,9 @@ class DenseEvidence(SavedState):
         self._memory.forget()
 
     def _measured(
-        self,
-        small: NDArray[np.uint8],
-        half: NDArray[np.uint8],
-        scale: NDArray,
-        T: NDArray,
-        K: NDArray,
+        self, small: NDArray[np.uint8], half: NDArray[np.uint8], scale: NDArray, T: NDArray, K: NDArray,
         corners: Landmarks,
-    ) -> Landmarks:
+    ) -> Landmarks:  # fmt: skip
         """Measure the depths in a reduced image, and add corners where there are none. ``half`` is the image at half
         the size."""
         cell, K = _cell(small.shape[1]), self._errors.camera(K)
@@ -254,14 +233,9 @@ class DenseEvidence(SavedState):
         return Landmarks(position, depth, variance, searched, none, *judged, motion=motion, moving=withheld)
 
     def _in_cells(
-        self,
-        small: NDArray[np.uint8],
-        T: NDArray,
-        K: NDArray,
-        cell: int,
-        compared: tuple[Views, Views] | None,
+        self, small: NDArray[np.uint8], T: NDArray, K: NDArray, cell: int, compared: tuple[Views, Views] | None,
         trusted: bool,
-    ) -> tuple[Depths, int, bool, list[MotionTest], int]:
+    ) -> tuple[Depths, int, bool, list[MotionTest], int]:  # fmt: skip
         """Measure visible landmarks again where the camera has moved, and new pixels in the cells without a landmark.
 
         Also updates the running estimates.
@@ -291,13 +265,9 @@ class DenseEvidence(SavedState):
         return depths, count + searched, trusted, tests, disagree + refuted
 
     def _coarse(
-        self,
-        small: NDArray[np.uint8],
-        half: NDArray[np.uint8],
-        occupied: NDArray[np.float64],
-        views: Views,
+        self, small: NDArray[np.uint8], half: NDArray[np.uint8], occupied: NDArray[np.float64], views: Views,
         cell: int,
-    ) -> Depths:
+    ) -> Depths:  # fmt: skip
         """Search the cells without a pixel of ``occupied`` [N, 2] with windows of twice the width, in images of half
         the size.
 

@@ -7,14 +7,13 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.anchors.kernels.dense import Views
 from ufmstar_torch.anchors.kernels.keyframes import compare
 from ufmstar_torch.anchors.landmarks import opencv
-from ufmstar_torch.anchors.saved_state import SavedState, saved_image
+from ufmstar_torch.anchors.saved_state import SavedState
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
 
 # A frame becomes a keyframe if the camera has moved by this share of the median depth, or turned by this angle [rad].
@@ -27,7 +26,7 @@ class Keyframes(SavedState):
     The ring has one place more: a new keyframe leaves those before it unchanged, so that they can be restored.
     """
 
-    HELD: ClassVar = {"_pose": "pose", "_number": "number", "_added": "added"}
+    HELD: ClassVar = {"_image": "images", "_pose": "pose", "_number": "number", "_added": "added"}
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -41,13 +40,9 @@ class Keyframes(SavedState):
         self._added = 0
 
     def add(
-        self,
-        image: NDArray[np.uint8],
-        half: NDArray[np.uint8],
-        T_world_cam: NDArray[np.float64],
-        depth: float,
+        self, image: NDArray[np.uint8], half: NDArray[np.uint8], T_world_cam: NDArray[np.float64], depth: float,
         number: int,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Store a frame if the camera has moved or turned since the last keyframe.
 
         Args:
@@ -74,12 +69,8 @@ class Keyframes(SavedState):
         self._pose[slot] = T_world_cam[view]
 
     def compared(
-        self,
-        T_world_cam: NDArray[np.float64],
-        K: NDArray[np.float64],
-        depth: float,
-        baselines: NDArray[np.float64],
-    ) -> tuple[Views, Views, float]:
+        self, T_world_cam: NDArray[np.float64], K: NDArray[np.float64], depth: float, baselines: NDArray[np.float64],
+    ) -> tuple[Views, Views, float]:  # fmt: skip
         """Choose the keyframes to compare with a view, at most one for each baseline, the shortest first; noise 0.
 
         Args:
@@ -105,18 +96,17 @@ class Keyframes(SavedState):
 
     def state(self) -> dict[str, Tensor]:
         """The state, for :meth:`load_state`."""
-        images = self._image.copy()
-        images[self._added % len(images)] = 0  # the free place may hold a keyframe that was undone
-        return {"images": torch.from_numpy(images)} | super().state()
+        state = super().state()
+        state["images"][self._added % (self._count + 1)] = 0  # the free place may hold a keyframe that was undone
+        return state
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Restore a result of :meth:`state`; ValueError: another number of keyframes."""
-        images = saved_image(state, "images", self._count + 1)
         super().load_state(state)
-        self._image = images.copy()
-        self._half = np.zeros((len(images), images.shape[1] // 2, images.shape[2] // 2), np.uint8)
-        for slot in range(min(self._added, len(images)) if images.size else 0):
-            self._half[slot] = halved(images[slot])
+        count, height, width = self._image.shape
+        self._half = np.zeros((count, height // 2, width // 2), np.uint8)
+        for slot in range(min(self._added, count) if self._image.size else 0):
+            self._half[slot] = halved(self._image[slot])
 
 
 def halved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -76,15 +76,10 @@ class Memory(SavedState):
         self._used[:] = False
 
     def settle(
-        self,
-        sighted: Sighted,
-        image: NDArray[np.uint8],
-        T_world_cam: NDArray[np.float64],
-        K: NDArray[np.float64],
-        depth: float,
-        measured: tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]],
+        self, sighted: Sighted, image: NDArray[np.uint8], T_world_cam: NDArray[np.float64], K: NDArray[np.float64],
+        depth: float, measured: tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]],
         trusted: bool,
-    ) -> tuple[int, int, float]:
+    ) -> tuple[int, int, float]:  # fmt: skip
         """Confirm or refute landmarks by new measurements, and store these.
 
         Args:

@@ -3,7 +3,7 @@
 An error (w, s) of a keyframe's relative pose shifts all pixels of its image consistently, and so do errors of the focal
 length, the centre or the distortion. A shift across the epipolar lines is measured directly. A shift along them is
 measured where keyframes of other baselines, or other pixels, contradict it. To first order, with the errors d and the
-Jacobians of ``anchors.kernels.poses``,
+Jacobians of ``anchors.kernels.pose_equations``,
 
     value_k = rho + c_k d + noise,      across_k = a_k d + noise,
 
@@ -79,15 +79,9 @@ class PoseErrors(SavedState):
         return np.array([[K[0, 0] * (1 + focal), 0, K[0, 2] + u], [0, K[1, 1] * (1 + focal), K[1, 2] + v], [0, 0, 1]])
 
     def corrected(
-        self,
-        pixel: NDArray[np.float64],
-        accepted: NDArray[np.bool_],
-        measured: Measured,
-        views: Views,
-        K: NDArray[np.float64],
-        depth: float,
-        trusted: bool = True,
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        self, pixel: NDArray[np.float64], accepted: NDArray[np.bool_], measured: Measured, views: Views,
+        K: NDArray[np.float64], depth: float, trusted: bool = True,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
         """Correct depths for errors of the poses and the camera, and update the estimates of these errors.
 
         Args:

@@ -109,12 +109,9 @@ def _take(value: Tensor, index: Tensor) -> Tensor:
 
 
 def observe(
-    evidence: Evidence,
-    anchors: Anchors,
-    distribute: Callable[[Tensor], Tensor],
-    memory: float,
+    evidence: Evidence, anchors: Anchors, distribute: Callable[[Tensor], Tensor], memory: float,
     supported_by_neighbours: Callable[[Anchors], Tensor] = inliers,
-) -> tuple[Evidence, Tensor]:
+) -> tuple[Evidence, Tensor]:  # fmt: skip
     """Fade the old evidence and add that of a frame.
 
     Args:

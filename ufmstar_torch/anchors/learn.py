@@ -51,13 +51,9 @@ class Learnt:
 
 
 def learn(
-    tensors: Mapping[str, Tensor],
-    mixture_cam: GaussianMixture,
-    frame: FrameInput,
-    config: UfMStarConfig,
-    distribute: Distribute,
-    supported: Callable[[Anchors], Tensor] = inliers,
-) -> Learnt:
+    tensors: Mapping[str, Tensor], mixture_cam: GaussianMixture, frame: FrameInput, config: UfMStarConfig,
+    distribute: Distribute, supported: Callable[[Anchors], Tensor] = inliers,
+) -> Learnt:  # fmt: skip
     """Add a frame's anchors to the evidence.
 
     Args:

@@ -15,16 +15,6 @@ from ufmstar_torch.frames.frame import LARGEST
 POSITIVE = (1e-12, LARGEST)  # range of lengths and variances that divide others
 
 
-def saved_image(state: Mapping[str, Tensor], name: str, *count: int) -> NDArray[np.uint8]:
-    """Read a grey image [H, W], or ``count`` of them [count, H, W], from a saved state; ValueError: anything else."""
-    image = _array(state, name)
-    if image.dtype != np.uint8 or image.ndim != len(count) + 2 or image.shape[:-2] != count:
-        shape = ", ".join(map(str, (*count, "H", "W")))
-        text = f"must have shape ({shape}) and dtype uint8, got {image.shape} and {image.dtype}"
-        raise ValueError(f"state[{name!r}] {text}")
-    return image
-
-
 def _array(state: Mapping[str, Tensor], name: str) -> NDArray[Any]:
     """A tensor of a saved state as an array; ValueError: there is none on the CPU."""
     value: object = state.get(name)
@@ -35,20 +25,28 @@ def _array(state: Mapping[str, Tensor], name: str) -> NDArray[Any]:
 
 
 class SavedState:
-    """Attributes that :meth:`state` copies and :meth:`load_state` restores to the last bit.
+    """Attributes that :meth:`state` copies and :meth:`load_state` restores to the last bit, with those of attributes
+    that are of this class themselves.
 
     Attributes:
-        HELD: name in the state by attribute. Each attribute is an array of fixed shape, or a number; ``_K`` are
-            intrinsics.
+        HELD: name in the state by attribute. Each attribute is an array of fixed shape, a number, or a gray image
+            [..., H, W] of bytes and any size; ``_K`` are intrinsics.
+        PREFIXES: prefix of an attribute's names in the state.
         RANGES: least and largest value by attribute; within +-``LARGEST`` where none is stated.
     """
 
     HELD: ClassVar[Mapping[str, str]]
+    PREFIXES: ClassVar[Mapping[str, str]] = {}
     RANGES: ClassVar[Mapping[str, tuple[float, float]]] = {}
 
     def state(self) -> dict[str, Tensor]:
         """Copy the state, for :meth:`load_state`."""
-        return {name: torch.from_numpy(np.array(getattr(self, attribute))) for attribute, name in self.HELD.items()}
+        held = {name: torch.from_numpy(np.array(getattr(self, attribute))) for attribute, name in self.HELD.items()}
+        return held | {prefix + name: value for part, prefix in self._parts() for name, value in part.state().items()}
+
+    def _parts(self) -> list[tuple[SavedState, str]]:
+        parts = [(name, value) for name, value in vars(self).items() if isinstance(value, SavedState)]
+        return [(part, self.PREFIXES.get(name, "")) for name, part in parts]
 
     def snapshot(self) -> dict[str, Any]:
         """A copy of the attributes, for :meth:`restore`. Images are shared, as no method writes to them."""
@@ -72,7 +70,9 @@ class SavedState:
         values: dict[str, Any] = {}
         for attribute, name in self.HELD.items():
             value, current = np.array(_array(state, name)), np.asarray(getattr(self, attribute))
-            if value.shape != current.shape or value.dtype != current.dtype:
+            fixed = slice(current.ndim if current.dtype != np.uint8 else current.ndim - 2)
+            same = value.ndim == current.ndim and value.shape[fixed] == current.shape[fixed]
+            if not same or value.dtype != current.dtype:
                 text = f"must have shape {current.shape} and dtype {current.dtype}, got {value.shape} and {value.dtype}"
                 raise ValueError(f"state[{name!r}] {text}")
             low, high = self.RANGES.get(attribute, (-LARGEST, LARGEST))
@@ -84,6 +84,8 @@ class SavedState:
             values[attribute] = value if value.ndim else value.item()
         for attribute, value in values.items():
             setattr(self, attribute, value)
+        for part, prefix in self._parts():
+            part.load_state({name.removeprefix(prefix): v for name, v in state.items() if name.startswith(prefix)})
 
 
 def _copied(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -35,6 +35,10 @@ _SIDE, _SHARE, _SIGMAS = 5, 0.02, 3.0
 _FREEDOM, _ITERATIONS, _LEAST = 2.0, 8, 1e-10
 # Least share of a landmark's variance that is independent; least inverse depth, as a share of that measured.
 _INDEPENDENT, _NEAREST_ZERO = 0.1, 0.1
+# A landmark of the images nearer than this share of the sensor's depth beside it is left out if its standard deviation
+# exceeds this share of its depth. Most of these are wrong: weak matches, and patches at depth edges, which match the
+# nearer surface. Most of the more certain ones are right: a sensor does not see black things.
+_SHARE_BESIDE, _UNCERTAIN = 0.8, 0.05
 # Number of stored points; width to which depth maps are reduced to store and show points [px]; share of the depth that
 # wrong poses add to its standard deviation.
 _STORED, _WIDTH, _POSES = 4096, 320, 0.01
@@ -94,8 +98,8 @@ def sensor_landmarks(
 
 
 def completed(sensor: Landmarks, others: Landmarks, depth: NDArray[np.float32], kind: str = "stereo") -> Landmarks:
-    """The sensor's landmarks, and those of the images on pixels without the sensor's depth, less the common errors that
-    the sensor shows.
+    """The sensor's landmarks, and plausible ones of the images on pixels without the sensor's depth, less the common
+    errors that the sensor shows.
 
     Args:
         sensor: in the pixels of the image.
@@ -121,6 +125,7 @@ def completed(sensor: Landmarks, others: Landmarks, depth: NDArray[np.float32], 
     apart = ~(_spread((depth > 0).astype(np.float32)) > 0)[row, column]
     z = np.where(_away_from_edges(depth, kind), depth, np.float32(0))[row, column].astype(np.float64)
     corrected = _without_common_errors(others, z, (height, width), kind)
+    apart &= ~_too_near(corrected, sensor)
     return replace(
         corrected,
         pixel=np.concatenate([sensor.pixel, corrected.pixel[apart]]),
@@ -216,6 +221,15 @@ class SensorMemory:
         point = (sensor.depth[whole, None] * ray) @ T[:3, :3].T + T[:3, 3]
         self._point = np.concatenate([self._point[retained], point])[-_STORED:]
         self._sigma = np.concatenate([self._sigma[retained], np.sqrt(sensor.variance[whole])])[-_STORED:]
+
+
+def _too_near(others: Landmarks, sensor: Landmarks) -> NDArray[np.bool_]:
+    """[N] True for uncertain landmarks of the images that are much nearer than the sensor's depth beside them."""
+    if not len(sensor.depth):
+        return np.zeros(len(others.depth), np.bool_)
+    beside = np.square(others.pixel[:, None] - sensor.pixel).sum(axis=-1).argmin(axis=1)
+    uncertain = others.variance > np.square(_UNCERTAIN * others.depth)
+    return uncertain & (others.depth < _SHARE_BESIDE * sensor.depth[beside])
 
 
 def _without_common_errors(others: Landmarks, z: NDArray[np.float64], size: tuple[int, int], kind: str) -> Landmarks:

@@ -81,14 +81,9 @@ class StreamLandmarks:
         self._follow([landmark_source(self._each) for _ in range(streams)])
 
     def update(
-        self,
-        image: Tensor | None,
-        pose: Tensor,
-        intrinsics: Tensor,
-        rotation_tolerance: float | None = None,
-        *,
+        self, image: Tensor | None, pose: Tensor, intrinsics: Tensor, rotation_tolerance: float | None = None, *,
         skip: bool = True,
-    ) -> Anchors:
+    ) -> Anchors:  # fmt: skip
         """Compute the anchors of the next image of every stream, in its pixels. An error leaves all sources unchanged.
         An image of another size or camera than before restarts its stream's source.
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -20,7 +19,7 @@ from ufmstar_torch.anchors.corners import find, follow
 from ufmstar_torch.anchors.kernels.tracks import Limits, accept, compare, predict
 from ufmstar_torch.anchors.kernels.triangulate import Triangulated, triangulate
 from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, OtherCameraError, checked
-from ufmstar_torch.anchors.saved_state import POSITIVE, SavedState, saved_image
+from ufmstar_torch.anchors.saved_state import POSITIVE, SavedState
 from ufmstar_torch.gaussians.camera import inverse_intrinsics
 from ufmstar_torch.runtime.checked import Checked, number
 from ufmstar_torch.runtime.kinds import check_kinds
@@ -96,6 +95,7 @@ class LandmarkTracker(SavedState):
 
     needs_image = True
     HELD: ClassVar = {
+        "_gray": "gray",
         "_K": "K",
         "_pixel": "pixel",
         "_seen": "seen",
@@ -139,16 +139,9 @@ class LandmarkTracker(SavedState):
         self._depth_count = 0  # images from which the scene's depth was estimated
         self._point = np.full((n, 3), np.nan)  # of the newest image's corners [m]; derived from the window
 
-    def state(self) -> dict[str, Tensor]:
-        """The state, for :meth:`load_state`. The last gray image is shared and must not be written to."""
-        return {"gray": torch.from_numpy(self._gray)} | super().state() | self._refinement.state()
-
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Restore a result of :meth:`state`; ValueError: another ``max_points`` or ``window``."""
-        gray = saved_image(state, "gray")
         super().load_state(state)
-        self._refinement.load_state(state)
-        self._gray = gray
         self._triangulated()
 
     def update(

@@ -186,7 +186,9 @@ def _numbers(name: str, value: object) -> Tensor:
         except (TypeError, ValueError) as error:
             raise TypeError(f"{name} must hold numbers, got {value!r:.60}") from error
     numbers = as_tensor(name, value)
-    whole = not numbers.is_floating_point() and not numbers.is_complex() and numbers.dtype != torch.bool
+    if numbers.is_floating_point():
+        return numbers
+    whole = not numbers.is_complex() and numbers.dtype != torch.bool
     return require_float(name, numbers.double() if whole else numbers)
 
 

@@ -152,7 +152,7 @@ CheckKernel = Callable[..., FrameInput]  # as ``check_values``
 
 
 def check_frame(
-    depth: Array,
+    depth: Tensor,
     pose: CameraLike,
     intrinsics: CameraLike,
     aleatoric: Array | None,
@@ -181,8 +181,7 @@ def check_frame(
         ValueError: an argument has the wrong shape or lies on another device than ``depth``, or ``variances_in_h``
             without ``aleatoric``.
     """
-    depth = require_float("depth", as_tensor("depth", depth))
-    shape = tuple(depth.shape)
+    shape = tuple(require_float("depth", depth).shape)
     if not (len(shape) == 3 or (len(shape) == 4 and shape[1] == 1)) or 0 in shape:
         one = "; a single map is depth[None]" if len(shape) == 2 else ""
         raise ValueError(f"depth must be [B, H, W] or [B, 1, H, W] with no empty dimension, got {shape}{one}")
@@ -235,12 +234,10 @@ def raise_faults(frame: FrameInput) -> None:
         ValueError: a stream is faulty, or the frame has no values.
     """
     fault = frame.fault if frame.host_fault is None else frame.host_fault
-    if fault.device.type == "meta":
+    if fault.is_meta:
         raise ValueError("depth lies on device meta, without values: set on_bad_frame='skip'")
-    faults = fault.tolist()
-    bad = [f"stream {b}: {FRAME_FAULTS[code]}" for b, code in enumerate(faults) if code]
-    if bad:
-        raise ValueError("; ".join(bad))
+    if any(faults := fault.tolist()):
+        raise ValueError("; ".join(f"stream {b}: {FRAME_FAULTS[code]}" for b, code in enumerate(faults) if code))
 
 
 def _variances(aleatoric: Tensor | None, epistemic: Tensor | None, plain: Tensor) -> Tensor:
@@ -255,7 +252,7 @@ def _of_depth(name: str, value: Tensor, plain: Tensor) -> Tensor:
     """A checked camera on its original device (the check of a pose on the CPU does not wait for an accelerator)."""
     if value.dim() == 3 and value.shape[0] not in (1, plain.shape[0]):
         raise ValueError(f"{name} must have depth's {plain.shape[0]} streams, got {value.shape[0]}")
-    if value.device.type == "meta" and plain.device.type != "meta":
+    if value.is_meta and not plain.is_meta:
         raise ValueError(f"{name} must hold values, got a tensor on device meta")
     return _constant(value)
 

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, pairwise
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -53,7 +54,9 @@ _ROWS = 8
 EVERY = 64
 # Counts of a frame that are read for these checks, and their type.
 _READ = ("segments", "valid_pixels", "beyond", "out_of_range", "components", "fault", "single_view")
+_READ_FROM = itemgetter(*_READ)
 _Counts = dict[str, list[int]]
+_Camera = tuple[list[list[float]], tuple[int, int]]  # intrinsics [px], and image height and width
 LOGGER = logging.getLogger("ufmstar_torch")
 _ONE_VIDEO = (
     "the {} streams of a batch look like successive frames of one video{}. Views are compared within a stream only: "
@@ -80,7 +83,7 @@ class _Track:
 
     first: list[list[float]]  # first pose
     T: list[list[float]]  # last pose
-    focal: tuple[float, float]  # last fx / W and fy / H
+    camera: _Camera  # last intrinsics and image size
     total: float  # sum of the last depth map's rows
     anchored_at: tuple[float, float, float]  # camera position in the last of the ``moving`` frames
     moving: int = 0  # frames with anchors in which the camera had moved
@@ -99,15 +102,13 @@ class _Track:
     waiting: bool = False  # whether its next prediction is to be compared
 
     def follow(
-        self, T: list[list[float]], focal: tuple[float, float], depth: Depth, total: float, mean: float, member: float
+        self, T: list[list[float]], camera: _Camera, depth: Depth, total: float, mean: float, member: float
     ) -> Iterator[tuple[str, str]]:
         """Update the statistics with a frame of a ``mean`` depth [m]; yields kinds and texts of warnings."""
         position, last = _position(T), _position(self.T)
-        step, (fx, fy), (old_fx, old_fy) = math.dist(position, last), focal, self.focal
-        if max(fx / old_fx, old_fx / fx, fy / old_fy, old_fy / fy) > _ZOOM:
-            each = " and ".join(f"{fx:.2f} of the width, {fy:.2f} of the height" for fx, fy in (self.focal, focal))
-            text = f"the focal length changed from frame to frame ({each}): every camera is a stream of its own, and "
-            yield "camera", text + "another recording begins with reset()"
+        step = math.dist(position, last)
+        if camera != self.camera:
+            yield from self._zoom(camera)
         if T == self.T:
             yield from self._stay(depth, member)
         else:
@@ -119,7 +120,7 @@ class _Track:
             if self.alternating == _ALTERNATING:
                 text = "the poses go back and forth between two places: every camera is a stream of its own (a batch)"
                 yield "alternating", text
-            largest = float(depth.max())
+            largest = float(np.maximum.reduce(depth, None))
             self.saturated = self.saturated + 1 if largest == self.farthest > 0 else 0
             self.farthest = largest
             if self.saturated == _FRAMES:
@@ -134,7 +135,15 @@ class _Track:
             self.steps, self.largest = self.steps + 1, max(self.largest, step)
             self.travelled += step / mean
         self.before = last
-        self.T, self.focal, self.total = T, focal, total
+        self.T, self.camera, self.total = T, camera, total
+
+    def _zoom(self, camera: _Camera) -> Iterator[tuple[str, str]]:
+        cameras = self.camera, camera
+        (old_x, old_y), (x, y) = focals = [(K[0][0] / width, K[1][1] / height) for K, (height, width) in cameras]
+        if max(x / old_x, old_x / x, y / old_y, old_y / y) > _ZOOM:
+            each = " and ".join(f"{fx:.2f} of the width, {fy:.2f} of the height" for fx, fy in focals)
+            text = f"the focal length changed from frame to frame ({each}): every camera is a stream of its own, and "
+            yield "camera", text + "another recording begins with reset()"
 
     def _saturate(self, depth: Depth) -> Iterator[tuple[str, str]]:
         share = np.count_nonzero(depth == self.farthest) / np.count_nonzero(depth)
@@ -217,11 +226,11 @@ class StreamWarnings:
     ) -> None:
         """Warn of unused pixels, of components that only one view sees, and of inconsistent cameras, poses, depth and
         anchors; ``frames`` [B] is the number of frames used."""
-        device = frame.depth.device.type
+        depth = frame.depth
         self._calls += 1
-        if device == "meta" or (device != "cpu" and (self._calls % EVERY or torch.cuda.is_current_stream_capturing())):
+        if depth.is_meta or (not depth.is_cpu and (self._calls % EVERY or torch.cuda.is_current_stream_capturing())):
             return
-        counts = {name: statistics.counts[name].tolist() for name in _READ}
+        counts = dict(zip(_READ, map(Tensor.tolist, _READ_FROM(statistics.counts)), strict=True))
         used = statistics.counts.get("anchors_used")
         seen = frames.tolist()
         findings = (
@@ -233,11 +242,11 @@ class StreamWarnings:
         log_once(self._logged, chain.from_iterable(findings))
 
     def _tracked(self, frame: FrameInput, counts: _Counts, used: list[int] | None) -> Iterator[tuple[int, str, str]]:
-        rows = frame.depth[:, ::_ROWS].numpy(force=True)
-        totals, pixels, faults = rows.sum((1, 2)).tolist(), counts["valid_pixels"], counts["fault"]
+        rows = frame.depth.numpy(force=True)[:, ::_ROWS]
+        totals, pixels, faults = np.add.reduce(rows, (1, 2)).tolist(), counts["valid_pixels"], counts["fault"]
         poses, cameras = frame.T_world_cam.tolist(), frame.intrinsics.tolist()
         members = [0.0] * len(poses) if frame.member is None else frame.member.tolist()
-        height, width = frame.size
+        size = frame.size
         if len(poses) >= _BATCH:
             yield from self._one_video(poses)
         first = not self._tracks and len(poses) >= _CLIP and not any(faults)
@@ -246,15 +255,15 @@ class StreamWarnings:
         for b, fault in enumerate(faults):
             if fault or not pixels[b]:
                 continue
-            T, focal = poses[b], (cameras[b][0][0] / width, cameras[b][1][1] / height)
-            every = pixels[b] == height * width
+            T, camera, track = poses[b], (cameras[b], size), self._tracks.get(b)
+            every = pixels[b] == size[0] * size[1]
             mean = totals[b] / rows[b].size if every else _mean(rows[b], totals[b])
-            if text := doubtful_centre(cameras[b], (height, width)):
+            if (track is None or camera != track.camera) and (text := doubtful_centre(*camera)):
                 yield b, "centre", text
-            if (track := self._tracks.get(b)) is None:
-                self._tracks[b] = track = _Track(T, T, focal, totals[b], _position(T))
+            if track is None:
+                self._tracks[b] = track = _Track(T, T, camera, totals[b], _position(T))
             else:
-                for kind, text in track.follow(T, focal, rows[b], totals[b], mean, members[b]):
+                for kind, text in track.follow(T, camera, rows[b], totals[b], mean, members[b]):
                     yield b, kind, text
             if used is not None and (text := track.anchored(used[b], mean)):
                 yield b, "anchors", text
@@ -282,27 +291,29 @@ class StreamWarnings:
 def _left_out(
     frame: FrameInput, counts: _Counts, frames: list[int], config: UfMStarConfig
 ) -> Iterator[tuple[int, str, str]]:
+    area = frame.size[0] * frame.size[1]
     for b, each in enumerate(zip(*counts.values(), frames, strict=True)):
         segments, valid, beyond, outside, components, fault, _, seen = each
         positive = valid + beyond + outside
         unstated = 0 if config.segment.max_depth is not None else beyond
-        parted = f"of {positive} pixels {beyond} lie beyond segment.max_depth = {config.segment.depth_limit} m and "
-        parted += f"{outside} outside the accepted ranges. "
-        shows = frame.informative is None or bool(frame.informative[b])
-        if positive and not segments and not fault and shows:
+        if positive and not segments and not fault and (frame.informative is None or bool(frame.informative[b])):
+            parted = _parted(valid, beyond, outside, config)
             text = f"a frame has no segment, so nothing is compared between views: {parted}"
             yield b, "segments", text + "Is the depth in metres, smooth, and the intrinsics the depth map's?"
         elif max(outside, unstated) > _OUTSIDE * positive:
-            text = (
-                f"pixels are left out: {parted}Are A and E variances [m^2], not logarithms, which may be negative, and "
-            )
-            yield b, "range", text + "does the network state its largest depth (segment.max_depth)?"
-        elif seen >= _FRAMES and 0 < valid < _SPARSE * frame.size[0] * frame.size[1]:
-            share = valid / (frame.size[0] * frame.size[1])
-            yield b, "sparse", f"only {share:.1%} of the pixels are used: is valid inverted? True = use"
+            text = f"pixels are left out: {_parted(valid, beyond, outside, config)}Are A and E variances [m^2], not "
+            text += "logarithms, which may be negative, and does the network state its largest depth "
+            yield b, "range", text + "(segment.max_depth)?"
+        elif seen >= _FRAMES and 0 < valid < _SPARSE * area:
+            yield b, "sparse", f"only {valid / area:.1%} of the pixels are used: is valid inverted? True = use"
         elif not positive and not components and seen >= _FRAMES:
             text = f"none of {seen} frames has a pixel with a positive and finite depth where valid is True"
             yield b, "empty", text + ": nothing is compared between views"
+
+
+def _parted(valid: int, beyond: int, outside: int, config: UfMStarConfig) -> str:
+    limit, every = f"segment.max_depth = {config.segment.depth_limit} m", valid + beyond + outside
+    return f"of {every} pixels {beyond} lie beyond {limit} and {outside} outside the accepted ranges. "
 
 
 def _spreads(frame: FrameInput) -> Iterator[tuple[int, str, str]]:

@@ -1,10 +1,11 @@
-"""Sums for ``running`` by cross-validation (numba): one anchor of a frame, or a disc of anchors, is held out.
+"""Sums for ``running`` by cross-validation (numba): one anchor of a frame, a disc, or a half of the image is held out.
 
 Leave-one-out residuals give roughness and noise. For the other ratios, discs that move over the image are held out, and
-the field of the other anchors predicts those in them. Products of errors in neighbouring cells give the amplitude, and
-their increase with the distance from evidence gives ``unseen``. ``wrong`` is the mean probability that an anchor lies
-on another surface, weighted by area because corners cluster on textured surfaces. ``inlier`` is the mean z^2 of the
-other anchors: outliers have widened the field's variance, and ``wrong`` accounts for them.
+the field of the other anchors predicts those in them. In every fourth frame a half of the image is held out instead: it
+shows how errors grow farther from evidence than a disc reaches. Products of errors in neighbouring cells give the
+amplitude, and their increase with the distance from evidence gives ``unseen``. ``wrong`` is the mean probability that
+an anchor lies on another surface, weighted by area because corners cluster on textured surfaces. ``inlier`` is the mean
+z^2 of the other anchors: outliers have widened the field's variance, and ``wrong`` accounts for them.
 """
 
 from __future__ import annotations
@@ -33,9 +34,11 @@ from ufmstar_torch.posterior.scene import (
 # Variance of the difference between neighbouring nodes over the link's variance: on a square lattice, all other paths
 # between the two nodes conduct as much as the link.
 APART = 0.5
-# With fewer anchors outside the discs none is held out: the field would be close to its prior.
+# With fewer other anchors none is held out: the field would be close to its prior.
 LEAST_REST = 5
-# Disc centres follow this low-discrepancy sequence over the frames (R2, Roberts).
+# Frames with anchors from one with a held-out half of the image to the next.
+HALVES = 4
+# Disc centres and the halves' directions follow this low-discrepancy sequence over the frames (R2, Roberts).
 STEPS = (0.7548776662466927, 0.5698402909980532)
 
 
@@ -59,7 +62,7 @@ def sums_of(scene, weight, left_out, ratios, frames, config):
     for i in range(RATIOS):
         sums[0, i] = sums[1, i] = 0.0
     _add_neighbours(scene, left_out, ratios, config, sums)
-    rest, held_out = empty(weight.size, np.bool_), _discs(scene, frames, config)
+    rest, held_out = empty(weight.size, np.bool_), _held_out(scene, frames, config)
     count = 0
     for k in range(weight.size):
         rest[k] = not held_out[k]
@@ -67,7 +70,7 @@ def sums_of(scene, weight, left_out, ratios, frames, config):
     if count < LEAST_REST:
         for k in range(weight.size):
             held_out[k] = False
-    scores = _add_discs(scene, weight, left_out, ratios, rest, held_out, config, sums)
+    scores = _add_held_out(scene, weight, left_out, ratios, rest, held_out, config, sums)
     return sums, scores
 
 
@@ -93,8 +96,8 @@ def _add_neighbours(scene, left_out, ratios, config, sums):
 
 
 @part
-def _add_discs(scene, weight, left_out, ratios, rest, held_out, config, sums):
-    """Add the sums for the other ratios, from anchors in held-out discs; returns the scores of these anchors."""
+def _add_held_out(scene, weight, left_out, ratios, rest, held_out, config, sums):
+    """Add the sums for the other ratios, from held-out anchors; returns their scores."""
     grid, observed, M = scene.grid, scene.observed, 0
     of_rest, area = empty(weight.size, np.float64), empty(grid.log_depth.size, np.float64)
     for i in range(area.size):
@@ -198,14 +201,15 @@ def _add_product(product, expected, variance, noise, away, share, ratios, sums):
 
 
 @part
-def _discs(scene, frames, config):
-    """[N] whether an anchor lies in one of the frame's discs."""
-    x, discs = scene.observed.features, config.discs
-    inside = empty(x.shape[0], np.bool_)
+def _held_out(scene, frames, config):
+    """[N] whether an anchor is held out: in every ``HALVES``-th frame by a half of the image, else by discs."""
+    x, discs, number = scene.observed.features, int(config.discs), (frames + 1) / HALVES
+    halved, angle = discs > 0 and number % 1 == 0, 2 * math.pi * STEPS[0] * number
+    held_out = empty(x.shape[0], np.bool_)
     for k in range(x.shape[0]):
-        inside[k] = False
-        for disc in range(int(discs)):
+        held_out[k] = halved and math.cos(angle) * x[k, 2] + math.sin(angle) * x[k, 3] > 0
+        for disc in range(0 if halved else discs):
             u = (frames * discs + disc + 1) * STEPS[0] % 1 - (x[k, 2] + 1) / 2
             v = (frames * discs + disc + 1) * STEPS[1] % 1 - (x[k, 3] + 1) / 2
-            inside[k] |= u * u + v * v < config.radius**2
-    return inside
+            held_out[k] |= u * u + v * v < config.radius**2
+    return held_out

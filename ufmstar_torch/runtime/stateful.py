@@ -7,7 +7,7 @@ import json
 import threading
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, ExitStack
 from functools import lru_cache, wraps
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
@@ -119,7 +119,8 @@ class StatefulModule(nn.Module):
 
     def _store(self, state: Mapping[str, Tensor]) -> None:
         """Replace all buffers."""
-        self._buffers.update({name: state[name] for name in self.STATE})
+        for name in self.STATE:
+            self._buffers[name] = state[name]
 
     def _chosen(self, streams: Sequence[int] | Tensor, count: int) -> Tensor:
         """Convert stream indices or a mask to a bool mask [count] on the state's device. Raises IndexError: an index is
@@ -245,14 +246,18 @@ def plain(config: Checked) -> dict[str, Any]:
     return _config_of(_bytes_of(config))
 
 
-def full_precision(device: torch.device) -> AbstractContextManager[object]:
-    """Disable autocast, which would compute products in half precision."""
-    kind = device.type
-    if kind == "meta" or not torch.amp.is_autocast_available(kind) or not torch.is_autocast_enabled(kind):
-        return nullcontext()
-    return torch.autocast(kind, enabled=False)
-
-
-def outliving() -> AbstractContextManager[object]:
-    """Disable the caller's inference mode, since tensors of the state must outlive it."""
-    return torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext()
+def undisturbed(like: Tensor) -> AbstractContextManager[object]:
+    """Disable gradients, the caller's inference mode, since tensors of the state must outlive it, and autocast, which
+    would compute products in half precision, for work on a tensor's device."""
+    kind, inferring = "cpu" if like.is_cpu else like.device.type, torch.is_inference_mode_enabled()
+    may_cast = kind == "cpu" or (kind != "meta" and torch.amp.is_autocast_available(kind))
+    casting = may_cast and torch.is_autocast_enabled(kind)
+    if not (inferring or casting):
+        return torch.set_grad_enabled(False)
+    contexts = ExitStack()
+    if inferring:
+        contexts.enter_context(torch.inference_mode(False))
+    contexts.enter_context(torch.no_grad())
+    if casting:
+        contexts.enter_context(torch.autocast(kind, enabled=False))
+    return contexts

@@ -27,7 +27,7 @@ from ufmstar_torch.gaussians.fixed_order import apply, total
 from ufmstar_torch.gaussians.gaussian import cholesky3, inverse_lower3
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.gaussians.state import UfMStarState
-from ufmstar_torch.runtime.stateful import full_precision
+from ufmstar_torch.runtime.stateful import undisturbed
 from ufmstar_torch.steps.fuse import measured_share
 
 # Most points x components evaluated at a time: bounds the temporary memory to some 100 MB in float32. On CUDA it may
@@ -264,7 +264,7 @@ def query(state: UfMStarState, points: Tensor, config: UfMStarConfig) -> Regress
         raise ValueError("query needs a mixture: call the module on a frame first")
     if points.dim() != 3 or points.shape[0] != streams or points.shape[2] != 3:
         raise ValueError(f"points must be [{streams}, N, 3], got {tuple(points.shape)}")
-    with full_precision(points.device):
+    with undisturbed(points):
         T = invert_rigid(state.T_world_first)
         local = apply(T[:, None, :3, :3], points.detach().double()) + T[:, None, :3, 3]
         dtype = torch.float64 if points.dtype == torch.float64 else torch.float32

@@ -154,7 +154,8 @@ def step(
         **mixture.tensors(), **sums, **of_anchors, "T_world_first": first, "started": state.started | fine,
         "frames": state.frames + fine, "skipped": state.skipped + ~fine, "smoothed": smoothed,
     })  # fmt: skip
-    out = step_output(frame, maps, residual, pixels, counts, learnt)
+    maps |= {"depth": regress.at_pixels(frame.depth, pixels), "valid": regress.at_pixels(frame.valid, pixels)}
+    out = step_output(frame, maps, residual, counts, learnt)
     stage("average")
     return updated, out
 
@@ -163,7 +164,6 @@ def step_output(
     frame: FrameInput,
     maps: dict[str, Tensor],
     residual: Tensor | None,
-    pixels: Tensor | None,
     counts: Mapping[str, Tensor],
     learnt: anchors.Learnt | None = None,
 ) -> UncertaintyOutput:
@@ -171,13 +171,12 @@ def step_output(
 
     Args:
         frame: of B streams.
-        maps: "disagreement", "measured" and "features" of every pixel, or at ``pixels``.
+        maps: "depth", "valid", "disagreement", "measured" and "features" of every pixel, or [B, n] at some; changed.
         residual: [..., 2] the relative error r and its excess e that anchors let expect; None without anchors.
-        pixels: [B, n] indices into the flattened image, or None.
         counts: of the step, by name.
         learnt: from the anchors; None without.
     """
-    depth, variance = regress.at_pixels(frame.depth, pixels), maps["disagreement"]
+    depth, valid, variance = maps.pop("depth"), maps.pop("valid"), maps["disagreement"]
     if residual is not None:
         maps["bias"], excess = residual.unbind(-1)
         contradiction = None if frame.anchors is None else frame.anchors.contradiction
@@ -188,7 +187,6 @@ def step_output(
     }  # fmt: skip
     of_anchors = {} if learnt is None else anchors.counts(frame.anchors, learnt.used)
     statistics = FrameStatistics({**counts, **checked, **of_anchors})
-    valid = regress.at_pixels(frame.valid, pixels)
     return UncertaintyOutput(depth, variance, valid, maps, statistics)
 
 

@@ -49,6 +49,8 @@ def network_maps(
     With ``config.variances_in_h`` the last three features are the mixture's A, E and weight share s; each of A and E is
     then its mean over the mixture plus (1 - s) times the pixel's own.
     """
+    if frame.aleatoric is None and frame.epistemic is None:
+        return {}
     pairs = ("aleatoric", frame.aleatoric), ("epistemic", frame.epistemic)
     maps = {name: at_pixels(value, pixels) for name, value in pairs if value is not None}
     if config.variances_in_h:
@@ -95,7 +97,8 @@ def corrected(
         at the pixels (``anchors.confidence``), None = 1.
     """
     M, factor, quantiles = out.maps["disagreement"], None, None
-    maps, counts = dict[str, Tensor](), dict[str, Tensor]()
+    maps: dict[str, Tensor] = {}
+    counts: dict[str, Tensor] = {}
     if config.confidence and frame.confidence is not None:
         V = None
         if pixels is None:

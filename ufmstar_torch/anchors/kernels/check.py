@@ -28,12 +28,9 @@ _HALF, _CELLS = 2, 2
 
 
 def check_anchors(
-    image: NDArray[np.uint8],
-    pixel: NDArray[np.float64],
-    rho: NDArray[np.float64],
-    variance: NDArray[np.float64],
+    image: NDArray[np.uint8], pixel: NDArray[np.float64], rho: NDArray[np.float64], variance: NDArray[np.float64],
     cell: int,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
     """Move anchors onto their surfaces, and estimate the errors of outliers.
 
     Args:

@@ -20,14 +20,14 @@ from ufmstar_torch.anchors.kernels.windows import (
     MARGIN,
     SIDE,
     WIDE,
-    copy_rows,
+    correlate,
     eights,
     normalised,
     refined,
     sampled,
-    zncc,
 )
 from ufmstar_torch.kernels.compile_cpu import empty, reordered, reordered_leaf
+from ufmstar_torch.kernels.cpu.vectors import LANES
 
 # Most steps of a search; a rival is more than APART steps away.
 LONGEST, APART = 192, 2
@@ -185,8 +185,9 @@ def _measure(image, pixel, keys, views, search, rho, variance, agreed, contradic
     template, patch = empty(WIDE * WIDE, np.float32), empty(COUNT, np.float32)
     along_u, along_v = empty(COUNT, np.float32), empty(COUNT, np.float32)
     warp = empty(4, np.float64)
-    rows, windows = empty((2, SIDE + 1), np.uint64), empty((LONGEST + 1, SIDE), np.uint64)
-    scores, best, out = empty(LONGEST + 1, np.float32), empty(4, np.float64), empty(8, np.float64)
+    rows, best, out = empty((2, SIDE + 1), np.uint64), empty(4, np.float64), empty(8, np.float64)
+    pixels, windows = views.image.reshape(views.image.size), empty((2, LONGEST + 1), np.int64)
+    sums, scores = empty((LONGEST + 1, 3, LANES), np.float32), empty(LONGEST + 1, np.float32)
     for n in range(len(pixel)):
         u, v, weight = pixel[n, 0], pixel[n, 1], 0.0
         for k in range(len(H)):
@@ -207,7 +208,9 @@ def _measure(image, pixel, keys, views, search, rho, variance, agreed, contradic
             if not (
                 _warped(flat, width, height, u, v, H[k], b[k], at, corner, share, template, warp)
                 and normalised(template, patch, along_u, along_v)
-                and _search(patch, key, width, height, x, y, z, b[k], low, high, windows, scores, best)
+                and _search(
+                    patch, pixels, views.slot[k], width, height, x, y, z, b[k], low, high, windows, sums, scores, best
+                )
             ):
                 continue
             if best[2] < least_score or (first and 1 - best[3] < least_rival * (1 - best[2])):
@@ -287,9 +290,10 @@ def _warped(flat, width, height, u, v, H, b, rho, corner, share, template, warp)
 
 
 @reordered_leaf
-def _search(patch, key, width, height, x, y, z, b, low, high, windows, scores, found):
+def _search(patch, pixels, slot, width, height, x, y, z, b, low, high, windows, sums, scores, found):
     """Write the best window between two inverse depths to ``found``: its centre on the line (u, v), its ZNCC, and the
-    ZNCC of its rival, the best window more than APART steps away. False where no window is inside the image."""
+    ZNCC of its rival, the best window more than APART steps away. False where no window is inside the image. The view's
+    image is that of the ``slot`` in ``pixels``; the three arguments before ``found`` are buffers."""
     z_low, z_high = z + low * b[2], z + high * b[2]
     if z_low <= 1e-3 or z_high <= 1e-3:
         return False
@@ -300,24 +304,22 @@ def _search(patch, key, width, height, x, y, z, b, low, high, windows, scores, f
         return False
     steps = max(int(np.ceil(longest)), 1)
     du, dv = du / steps, dv / steps
-    best, at = np.float32(-2), -1
+    starts, step, count = windows[0], windows[1], 0
     for s in range(steps + 1):
         left, top = int(np.floor(u_low + s * du + FIRST + 0.5)), int(np.floor(v_low + s * dv + FIRST + 0.5))
-        scores[s] = -2
         if left >= 0 and top >= 0 and left + SIDE <= width and top + SIDE <= height:
-            copy_rows(key, top * width + left, width, SIDE, windows[s])
-            scores[s] = 0
-    # A separate loop: reading a vector of 16 bytes waits until the two numbers just written there are in the cache.
-    for s in range(steps + 1):
-        if scores[s] == 0:
-            scores[s] = zncc(patch, windows[s].view(np.uint8))
-            if scores[s] > best:
-                best, at = scores[s], s
+            starts[count], step[count] = (slot * height + top) * width + left, s
+            count += 1
+    correlate(patch, pixels, starts, count, width, sums, scores)
+    best, at = np.float32(-2), -1
+    for w in range(count):
+        if scores[w] > best:
+            best, at = scores[w], step[w]
     if at < 0:
         return False
     rival = np.float32(-1)
-    for s in range(steps + 1):
-        if abs(s - at) > APART and scores[s] > rival:
-            rival = scores[s]
+    for w in range(count):
+        if abs(step[w] - at) > APART and scores[w] > rival:
+            rival = scores[w]
     found[0], found[1], found[2], found[3] = u_low + at * du, v_low + at * dv, best, rival
     return True

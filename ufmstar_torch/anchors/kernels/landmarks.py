@@ -88,13 +88,9 @@ class Sighted(NamedTuple):
 
 
 def sight(
-    landmarks: Columns,
-    frame: int,
-    image: NDArray[np.uint8],
-    T_world_cam: NDArray[np.float64],
-    K: NDArray[np.float64],
+    landmarks: Columns, frame: int, image: NDArray[np.uint8], T_world_cam: NDArray[np.float64], K: NDArray[np.float64],
     cell: int,
-) -> Sighted:
+) -> Sighted:  # fmt: skip
     """Find the landmarks that an image shows, at most one in a cell, count failures of those it should show, and choose
     a pixel in every cell without a landmark.
 

@@ -99,13 +99,9 @@ def _inliers(pixel, predicted, depth, variance, valid, out):
 
 
 def learn_in_view(
-    tensors: Mapping[str, Tensor],
-    capacity: int,
-    seen: Sequence[Seen],
-    views: Sequence[View],
-    frame: FrameInput,
+    tensors: Mapping[str, Tensor], capacity: int, seen: Sequence[Seen], views: Sequence[View], frame: FrameInput,
     config: UfMStarConfig,
-) -> Learnt:
+) -> Learnt:  # fmt: skip
     """As :func:`ufmstar_torch.anchors.learn.learn` with the exact sum over the components in view
     (``kernels.cpu.regress.views_of``); the error of the shares is at most twice the regression's.
 
@@ -207,7 +203,7 @@ def _distribute(index, predicted, chosen, rows, K, width, view, sums):
 
     Components are culled for a cell of anchors as the regression culls them for a tile.
     """
-    visible, fields, packed, _, settings = view
+    visible, fields, packed, _, among, settings = view
     points, pixel = empty((chosen.size, 3), np.float64), empty((chosen.size, 2), np.float64)
     for i in range(chosen.size):
         u, v, z = np.float64(index[i] % width), np.float64(index[i] // width), predicted[i]
@@ -224,7 +220,7 @@ def _distribute(index, predicted, chosen, rows, K, width, view, sums):
         if start[cell] == start[cell + 1]:
             continue
         box = _box(points, order, start[cell], start[cell + 1])
-        count = cull(packed, visible.size, limit(settings.epsilon, settings.among), box, settings, work, retained)
+        count = cull(packed, visible.size, limit(settings.epsilon, among), box, settings, work, retained)
         n = padded(count)
         for i in range(count):
             for field in range(FIELDS):

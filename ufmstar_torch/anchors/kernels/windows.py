@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.kernels.compile_cpu import reordered_leaf
+from ufmstar_torch.kernels.cpu.vectors import LANES, Lanes, vectors
 
 # [px] Side of the compared windows, and offset of their first pixel from the centre.
 SIDE, FIRST = 8, -3.5
@@ -108,14 +109,46 @@ def zncc(patch, window):
     """The correlation of a normalised patch and a window; -1 where the window has no contrast."""
     total = squares = cross = np.float32(0)
     for k in range(COUNT):
-        value = np.float32(window[k])
-        total += value
-        squares += value * value
-        cross += patch[k] * value
+        total += window[k]
+        squares += window[k] * window[k]
+        cross += patch[k] * window[k]
+    return _zncc(total, squares, cross)
+
+
+@reordered_leaf
+def _zncc(total, squares, cross):
     deviation = squares - total * total / np.float32(COUNT)
     if deviation <= COUNT * LEAST_CONTRAST * LEAST_CONTRAST:
         return np.float32(-1)
     return cross / np.sqrt(deviation)
+
+
+@vectors
+def _sum(code, patch, pixels, starts, count, width, sums):
+    """Write the sums of values, squares, and products with a patch for ``count`` windows, in ``LANES`` parts each."""
+    patches = [patch.load(0, LANES * pair) for pair in range(SIDE // 2)]
+    with code.loop(count) as w:
+        row, values = starts.whole(w), list[Lanes]()
+        for _ in patches:
+            values.append(pixels.load_rows((row, code.plus(row, width)), SIDE).floats())
+            row = code.plus(row, code.times(width, 2))
+        for at, (a, b, c, d) in enumerate((values, [x * x for x in values],
+                                           [x * p for x, p in zip(values, patches, strict=True)])):  # fmt: skip
+            sums.store((a + b) + (c + d), code.times(w, 3 * LANES), LANES * at)
+
+
+@reordered_leaf
+def correlate(patch, pixels, starts, count, width, sums, scores):
+    """Write the correlations (:func:`zncc`) of ``count`` windows, whose first pixels have the indices ``starts``.
+    ``sums`` is a buffer [n, 3, LANES]."""
+    _sum(patch, pixels, starts, count, width, sums)
+    for w in range(count):
+        total = squares = cross = np.float32(0)
+        for k in range(LANES):
+            total += sums[w, 0, k]
+            squares += sums[w, 1, k]
+            cross += sums[w, 2, k]
+        scores[w] = _zncc(total, squares, cross)
 
 
 @reordered_leaf

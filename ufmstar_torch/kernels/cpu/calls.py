@@ -34,6 +34,11 @@ def array(value: Tensor) -> NDArray[Any]:
     return np.ascontiguousarray((value if value.is_cpu else value.cpu()).numpy())
 
 
+def arrays(*tensors: Tensor) -> list[NDArray[Any]]:
+    """As :func:`array`, of tensors on the CPU without a graph, none of which is half."""
+    return list(map(np.ascontiguousarray, map(Tensor.numpy, tensors)))
+
+
 def each(function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
     """The results of ``function`` for every tuple of arguments, on as many threads as torch may use."""
     if len(arguments) == 1:
@@ -51,7 +56,8 @@ def each(function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> 
 
 def shares_of_stream(streams: int, pixels: int) -> int:
     """Number of parts of the work on each of ``streams`` images with so many ``pixels``."""
-    return max(1, min(-(-torch.get_num_threads() // streams), pixels // _SHARE))
+    threads = torch.get_num_threads()
+    return 1 if threads <= streams else max(1, min(-(-threads // streams), pixels // _SHARE))
 
 
 @functools.lru_cache(maxsize=2)

@@ -1,7 +1,7 @@
-"""The check of a frame's values on the CPU (numba): a call for the cameras and a call for the pixels.
+"""The check of a frame's values on the CPU (numba): one call, and one for each further map.
 
-The same comparisons as the reference in :mod:`ufmstar_torch.frames.frame`, whose chain of small tensors takes a
-millisecond. Thresholds are rounded to the maps' dtype as torch rounds them.
+The same comparisons as the reference in :mod:`ufmstar_torch.frames.frame`. Thresholds are rounded to the maps' dtype as
+torch rounds them.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from ufmstar_torch.kernels.cpu.calls import array
 Matrices = NDArray[np.floating[Any]]
 _ROUNDING = 4e-16  # deviation of R^T R below which a further step changes nothing
 _LEAST_FOCAL, _LARGEST_FOCAL = FOCAL_RANGE
+_NO_MASK, _NO_LIMITS = np.empty((0, 0, 0), np.bool_), (0.0, 0.0, 0.0)
 
 
 def check_values(
@@ -35,70 +36,108 @@ def check_values(
     max_depth: float,
 ) -> FrameInput:
     """As :func:`ufmstar_torch.frames.frame.check_values`, for the CPU. Depth that is valid everywhere is not copied."""
-    z = array(depth)
-    b, shape = len(z), (len(z), z[0].size)
-    cameras = _checked_cameras(array(pose), array(intrinsics), b, z.shape[1:], rotation_tolerance)
-    wanted = np.ones(z.shape, np.bool_) if mask is None else array(mask)
-    use, safe, counts = wanted if mask is None else wanted.copy(), np.empty_like(z), np.empty((3, b), np.int64)
-    pixels = use.reshape(shape)
+    z, wanted = array(depth), _NO_MASK if mask is None else array(mask)
+    allowed, size = wanted, z.shape[1:]
     for values in (aleatoric, epistemic):
         if values is not None:
-            _restrict(pixels, array(values).reshape(shape))
+            allowed = np.ones(z.shape, np.bool_) if allowed is _NO_MASK else allowed.copy()
+            _restrict(allowed.reshape(len(z), -1), array(values).reshape(len(z), -1))
     limits = DEPTH_RANGE[0], min(max_depth, DEPTH_RANGE[1]), max_depth
-    wanted = wanted.reshape(shape)
-    usable = _count(z.reshape(shape), pixels, wanted, mask is not None, safe.reshape(shape), cameras[3], limits, counts)
-    T, K, deviation, fault, valid = map(torch.from_numpy, (*cameras, use))
-    beyond, out_of_range, valid_pixels = torch.from_numpy(counts).unbind()
+    cameras = _matrices(array(pose), array(intrinsics))
+    checked = _check(*cameras, float(size[0]), float(size[1]), rotation_tolerance, z, wanted, allowed, limits)
+    T, K, deviation, fault, valid, safe, *counts = map(torch.from_numpy, (*checked[:-1], *checked[-1]))
+    beyond, out_of_range, usable = counts
     return FrameInput(
-        torch.from_numpy(z if usable == z.size else safe), T, K, aleatoric, epistemic, None, valid, fault,
-        deviation, beyond, out_of_range, valid_pixels, fault,
-    )  # fmt: skip
+        safe, T, K, aleatoric, epistemic, None, valid, fault, deviation, beyond, out_of_range, usable, fault
+    )
 
 
 def camera_faults(pose: Matrices, K: Matrices, size: tuple[float, ...], tolerance: float) -> list[int]:
     """Codes of the first faults (``frame.FRAME_FAULTS``, 0 for none) of poses [B, 4, 4] [m] and intrinsics [B, 3, 3] of
     images of a size (H, W) [px]; ``tolerance`` is the largest deviation of R^T R from the identity."""
-    return _checked_cameras(pose, K, len(pose), size, tolerance)[3].tolist()
+    no_pixels = np.empty((len(pose), 0, 0), np.float32), _NO_MASK, _NO_MASK, _NO_LIMITS
+    return _check(*_matrices(pose, K), *map(float, size), tolerance, *no_pixels)[3].tolist()
 
 
-def _checked_cameras(
-    pose: Matrices, K: Matrices, streams: int, size: tuple[float, ...], tolerance: float
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """The poses with their nearest rotations and the intrinsics of each stream, identities where there is a fault; the
-    deviations max |R^T R - I| of the poses; and the codes of the first faults. One matrix may be of all streams."""
-    T, camera = (np.ascontiguousarray(value, np.float64).reshape(-1, *value.shape[-2:]) for value in (pose, K))
-    out = np.empty((streams, 4, 4)), np.empty((streams, 3, 3)), np.empty(streams), np.empty(streams, np.int64)
-    _check_cameras(T, camera, float(size[0]), float(size[1]), tolerance, *out)
-    return out
+def _matrices(*cameras: Matrices) -> list[NDArray[np.float64]]:
+    """Poses and intrinsics as float64 [n, ...]: one, or one of each stream."""
+    return [np.ascontiguousarray(x, np.float64).reshape(-1, *x.shape[-2:]) for x in cameras]
 
 
 @kernel
-def _check_cameras(poses, intrinsics, height, width, tolerance, out_T, out_K, deviations, faults):
-    """Write the results of :func:`_checked_cameras`."""
+def _check(poses, intrinsics, height, width, tolerance, depth, wanted, allowed, limits):
+    """Check cameras and pixels.
+
+    Args:
+        poses, intrinsics: [B, 4, 4] and [B, 3, 3], or one of all streams.
+        height, width: of the images [px].
+        tolerance: of the poses.
+        depth: [B, H, W]; it may have no pixels.
+        wanted: [B, H, W] the caller's mask, of size 0 without one.
+        allowed: [B, H, W] the part of it that :func:`_restrict` left; of size 0 = all.
+        limits: the least and the largest usable depth, and the largest depth that the network states [m].
+
+    Returns:
+        The poses with their nearest rotations and the intrinsics of each stream, identities where there is a fault; the
+        deviations max |R^T R - I| of the poses; the codes of the first faults; the usable pixels; the depth, 0 where
+        not usable; and counts [3, B] of the wanted pixels with a depth: those beyond the largest, those otherwise not
+        usable, and the usable ones.
+    """
+    b = len(depth)
+    T, K = empty((b, 4, 4), np.float64), empty((b, 3, 3), np.float64)
+    deviations, faults = empty(b, np.float64), empty(b, np.int64)
     gram, Q = empty((3, 3), np.float64), empty((3, 3), np.float64)
-    for b in range(faults.size):
-        T, K, R, camera = poses[b % len(poses)], intrinsics[b % len(intrinsics)], out_T[b], out_K[b]
-        _gram(T, gram)
-        deviations[b] = _deviation(gram)
-        fault = _pose_fault(T, deviations[b], tolerance)
-        faults[b] = fault = fault if fault > 0 else _intrinsics_fault(K, height, width)
-        for i in range(4):
-            for j in range(4):
-                R[i, j] = T[i, j] if fault == 0 and i < 3 else 1.0 if i == j else 0.0
+    for i in range(b):
+        pose, camera = poses[i % len(poses)], intrinsics[i % len(intrinsics)]
+        _check_camera(pose, camera, height, width, tolerance, gram, Q, T[i], K[i], deviations, faults, i)
+    use, counts, safe = empty(depth.shape, np.bool_), empty((3, b), np.int64), depth
+    real, every = depth.dtype.type, 0
+    for i in range(b):
+        low = real(limits[0]) if faults[i] == 0 else real(np.inf)
+        counts[0, i] = counts[1, i] = counts[2, i] = 0
+        for v in range(depth.shape[1]):
+            counts[2, i] += _within(depth[i, v], low, real(limits[1]), use[i, v])
+            if allowed.size > 0:
+                counts[2, i] += _remove(use[i, v], allowed[i, v])
+        every += counts[2, i]
+    if every < depth.size:
+        safe = empty(depth.shape, depth.dtype)
+    for i in range(b if every < depth.size else 0):
+        deepest = real(limits[2])
+        for v in range(depth.shape[1]):
+            z, usable, out = depth[i, v], use[i, v], safe[i, v]
+            for u in range(z.size):
+                has_depth = (z[u] > 0) & (z[u] < np.inf) & (faults[i] == 0) & (wanted.size == 0 or wanted[i, v, u])
+                counts[0, i] += has_depth & (z[u] > deepest)
+                counts[1, i] += has_depth & (z[u] <= deepest) & (not usable[u])
+                out[u] = z[u] if usable[u] else real(0)
+    return T, K, deviations, faults, use, safe, counts
+
+
+@leaf
+def _check_camera(T, K, height, width, tolerance, gram, Q, R, camera, deviations, faults, b):
+    """Write a camera's part of the results of :func:`_check`; ``gram`` and ``Q`` [3, 3] are scratch."""
+    _gram(T, gram)
+    deviations[b] = _deviation(gram)
+    fault = _pose_fault(T, deviations[b], tolerance)
+    faults[b] = fault = fault if fault > 0 else _intrinsics_fault(K, height, width)
+    for i in range(4):
+        for j in range(4):
+            R[i, j] = T[i, j] if fault == 0 and i < 3 else 1.0 if i == j else 0.0
+    for i in range(3):
+        for j in range(3):
+            camera[i, j] = K[i, j] if fault == 0 else 1.0 if i == j else 0.0
+    for _ in range(POLAR_STEPS if fault == 0 else 0):  # as ``camera.nearest_rotation``: R <- R (3 I - R^T R)/2
+        if _deviation(gram) < _ROUNDING:
+            break
         for i in range(3):
             for j in range(3):
-                camera[i, j] = K[i, j] if fault == 0 else 1.0 if i == j else 0.0
-        for _ in range(POLAR_STEPS if fault == 0 else 0):  # as ``camera.nearest_rotation``: R <- R (3 I - R^T R)/2
-            if _deviation(gram) < _ROUNDING:
-                break
-            for i in range(3):
-                for j in range(3):
-                    Q[i, j] = (1.5 if i == j else 0.0) - 0.5 * gram[i, j]
-            for i in range(3):
-                x, y, z = R[i, 0], R[i, 1], R[i, 2]
-                for j in range(3):
-                    R[i, j] = x * Q[0, j] + y * Q[1, j] + z * Q[2, j]
-            _gram(R, gram)
+                Q[i, j] = (1.5 if i == j else 0.0) - 0.5 * gram[i, j]
+        for i in range(3):
+            x, y, z = R[i, 0], R[i, 1], R[i, 2]
+            for j in range(3):
+                R[i, j] = x * Q[0, j] + y * Q[1, j] + z * Q[2, j]
+        _gram(R, gram)
 
 
 @leaf
@@ -166,42 +205,27 @@ def _intrinsics_fault(K, height, width):
 @kernel
 def _restrict(use, variances):
     """Clear ``use`` [B, P] where a variance [B, P] is negative, above ``LARGEST`` or NaN."""
-    for b in range(len(variances)):
-        _within(variances[b], variances.dtype.type(0.0), variances.dtype.type(LARGEST), use[b])
-
-
-@kernel
-def _count(depth, use, wanted, masked, safe, faults, limits, counts):
-    """Clear ``use`` [B, P] where the depth is out of range or the stream has a fault; return the number of usable
-    pixels. If some are not, write ``safe``: the depth, 0 where not usable.
-
-    Args:
-        wanted: the caller's mask, if ``masked``.
-        limits: the least and the largest usable depth, and the largest depth that the network states [m].
-        counts: [3, B] written: of the wanted pixels with a depth those beyond it, those otherwise not usable, and the
-            usable ones.
-    """
-    real, every = depth.dtype.type, 0
-    for b in range(faults.size):
-        low = real(limits[0]) if faults[b] == 0 else real(np.inf)
-        counts[0, b] = counts[1, b] = 0
-        counts[2, b] = _within(depth[b], low, real(limits[1]), use[b])
-        every += counts[2, b]
-    for b in range(faults.size if every < depth.size else 0):
-        z, usable, deepest = depth[b], use[b], real(limits[2])
-        for i in range(z.size):
-            has_depth = (z[i] > 0) & (z[i] < np.inf) & (faults[b] == 0) & (not masked or wanted[b, i])
-            counts[0, b] += has_depth & (z[i] > deepest)
-            counts[1, b] += has_depth & (z[i] <= deepest) & (not usable[i])
-            safe[b, i] = z[i] if usable[i] else real(0)
-    return every
+    high = variances.dtype.type(LARGEST)
+    for b in range(variances.shape[0]):
+        for i in range(variances.shape[1]):
+            use[b, i] &= (variances[b, i] >= 0) & (variances[b, i] <= high)
 
 
 @leaf
 def _within(values, low, high, use):
-    """Clear ``use`` where values are outside [low, high] or NaN; return the number that is left."""
+    """Write where values are in [low, high]; return their number."""
     count = 0
     for i in range(values.size):
-        use[i] &= (values[i] >= low) & (values[i] <= high)
+        use[i] = (values[i] >= low) & (values[i] <= high)
         count += use[i]
     return count
+
+
+@leaf
+def _remove(use, allowed):
+    """Clear ``use`` where not allowed; return the change of their number."""
+    change = 0
+    for i in range(use.size):
+        change -= use[i] & (not allowed[i])
+        use[i] &= allowed[i]
+    return change

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels.compile_cpu import contracted, kernel
 from ufmstar_torch.kernels.cpu.calls import each, shares_of_stream
-from ufmstar_torch.kernels.cpu.regress_cull import Seen, View, in_view
+from ufmstar_torch.kernels.cpu.regress_cull import Seen, View, in_view, settings_of
 from ufmstar_torch.kernels.cpu.regress_near import near
 from ufmstar_torch.kernels.cpu.regress_tiles import exact, exact_at
 from ufmstar_torch.steps.regress import HALF
@@ -36,9 +36,13 @@ def views_of(
     """The components in view of each stream, for the exact sum. The error for anchors is that of the most precise dtype
     among the depth's and the ``others``."""
     dtype = _DTYPES[depth.dtype]
-    errors = min(EPSILON[one] for one in (dtype, *others)), ERROR[dtype]
-    prior = config.prior_weight, config.prior_mean
-    return [in_view(one, depth[b], intrinsics[b], prior, *errors) for b, one in enumerate(seen)]
+    epsilon, error = min(map(EPSILON.__getitem__, (dtype, *others))), ERROR[dtype]
+    settings = settings_of(config.prior_weight, config.prior_mean, epsilon, error)
+    views = []
+    for b, one in enumerate(seen):
+        slot, fields, packed, terms, n = in_view(*one, depth[b], intrinsics[b], settings)
+        views.append(View(slot[:n], fields[:n], packed, terms[:n], len(slot), settings))
+    return views
 
 
 def regress_maps(
@@ -74,14 +78,20 @@ def regress_maps(
     out, out_f = regression(seen, depth, intrinsics, config, pixels, views, shift)
     if informative is not None:
         out_f[:, -1] *= informative.reshape(-1, *[1] * (out.ndim - 1))
+    shown, features = (out, out_f) if pixels is None else (out[:, None], out_f[:, :, None])
+    z = depth if pixels is None else at_pixels(depth, pixels)[:, None]
+    previous = z if smoothed is None else smoothed
+    memory = np.empty(previous.shape, previous.dtype)
     relative = config.unmeasured_relative**2 if config.unmeasured == "relative" else 0
-    settings = depth.dtype.type(relative), config.unmeasured == "nan"
-    z = depth if pixels is None else depth.reshape(len(out), -1)[np.arange(len(out))[:, None], pixels]
-    alpha, previous = (1.0, z) if smoothed is None else (float(config.ema_alpha), smoothed)
-    memory = np.empty_like(previous)
-    maps = out, out_f[:, -1], z, previous, memory
-    counts = each(_finish, [(*[x[b].reshape(-1) for x in maps], *settings, alpha) for b in range(len(out))])
+    settings = depth.dtype.type(relative), config.unmeasured == "nan", 1.0 if smoothed is None else config.ema_alpha
+    counts = each(_finish, [(b, shown, features, z, previous, memory, *settings) for b in range(len(out))])
     return out, out_f, None if smoothed is None else memory, counts
+
+
+def at_pixels(values: Reals, pixels: NDArray[np.int64]) -> Reals:
+    """The values of a map [B, H, W] at pixels [B, n], indices into the flattened image."""
+    index = pixels if len(values) == 1 else pixels + values[0].size * np.arange(len(values))[:, None]
+    return values.reshape(-1).take(index)
 
 
 def regression(
@@ -125,19 +135,21 @@ def regression(
 
 
 @kernel
-def _finish(shown, measured, depth, previous, memory, share, blank, alpha):
-    """Change M at the pixels of a stream; write its moving average with an ``alpha`` below 1, and return the number of
-    pixels that are not measured."""
+def _finish(b, shown, features, depth, previous, memory, share, blank, alpha):
+    """Change M [B, H, W] at the pixels of a stream, of which the last feature says how far it is measured; write its
+    moving average with an ``alpha`` below 1, and return the number of pixels that are not measured."""
     one, zero, unmeasured = shown.dtype.type(1), shown.dtype.type(0), 0
     half = shown.dtype.type(HALF)
-    for i in range(shown.size):
-        value, share_measured = shown[i], measured[i]
-        missing = one - share_measured
-        value = _plus(value, (missing if missing > zero else zero) * depth[i] * depth[i], share)
-        unmeasured += share_measured < half
-        current, last = memory.dtype.type(np.nan if blank and share_measured < half else value), previous[i]
-        memory[i] = last if current != current else current if last != last else (1 - alpha) * last + alpha * current
-        shown[i] = current if current != current else memory[i]
+    for v in range(shown.shape[1]):
+        row, measured, z = shown[b, v], features[b, features.shape[1] - 1, v], depth[b, v]
+        before, after = previous[b, v], memory[b, v]
+        for u in range(row.size):
+            missing = one - measured[u]
+            value = _plus(row[u], (missing if missing > zero else zero) * z[u] * z[u], share)
+            unmeasured += measured[u] < half
+            current, last = memory.dtype.type(np.nan if blank and measured[u] < half else value), before[u]
+            after[u] = last if current != current else current if last != last else (1 - alpha) * last + alpha * current
+            row[u] = current if current != current else after[u]
     return unmeasured
 
 

@@ -23,15 +23,17 @@ sums adds to it; the bounds contain their own rounding. tests/test_regress.py ch
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, reordered_leaf
-from ufmstar_torch.kernels.cpu.regress_vectors import TERMS, bounds
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
+from ufmstar_torch.kernels.cpu.regress_vectors import TERMS, bounds, largest
 from ufmstar_torch.kernels.cpu.rigid import COVARIANCE, WEIGHT, padded
+from ufmstar_torch.kernels.cpu.vectors import LANES
 
 HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
 FIELDS = 10  # of a component: mean (3), whitening (6), log2 of the peak
@@ -53,7 +55,6 @@ class Settings(NamedTuple):
         epsilon: of the culling for the image and for anchors.
         error: of the culling for maps, at least epsilon.
         least, least_product: log2 of the prior's parts of the denominator and of the numerator.
-        among: number of all components, of which a view has some.
     """
 
     prior_weight: float
@@ -62,7 +63,6 @@ class Settings(NamedTuple):
     error: float
     least: float
     least_product: float
-    among: int
 
 
 class Seen(NamedTuple):
@@ -82,6 +82,7 @@ class View(NamedTuple):
         fields: [n, 10] mean, whitening and log2 of the peak.
         packed: [10, n and more] the same by field, padded (``rigid.padded``), in the depth's dtype.
         terms: [n, TERMS] of the sum, in the depth's dtype.
+        among: number of all components of the mixture.
         settings: of the sum.
     """
 
@@ -89,40 +90,32 @@ class View(NamedTuple):
     fields: NDArray[np.float64]
     packed: NDArray[np.floating]
     terms: NDArray[np.floating]
+    among: int
     settings: Settings
 
 
-def in_view(
-    seen: Seen,
-    depth: NDArray[np.floating],
-    K: NDArray[np.float64],
-    prior: tuple[float, float],
-    epsilon: float,
-    error: float,
-) -> View:
-    """The components that can matter in an image.
-
-    Args:
-        seen: the mixture.
-        depth: [H, W], not positive where invalid.
-        K: [3, 3].
-        prior: its weight and mean.
-        epsilon, error: of :class:`Settings`.
-    """
-    n, dtype = len(seen.disagreement), depth.dtype
-    slot, fields, packed = np.empty(n, np.int64), np.empty((n, FIELDS)), np.empty((ROWS, padded(n)), dtype)
-    terms = np.empty((n, TERMS), dtype)
-    least = math.log2(prior[0]), math.log2(prior[0] * max(prior[1], _LEAST))
-    settings = Settings(*prior, epsilon, error, *least, n)
-    count = _in_view(*seen, K, depth, settings, slot, fields, packed, terms)
-    return View(slot[:count], fields[:count], packed, terms[:count], settings)
+@functools.lru_cache(maxsize=16)
+def settings_of(prior_weight: float, prior_mean: float, epsilon: float, error: float) -> Settings:
+    """The settings of the sum with a prior."""
+    least = math.log2(prior_weight), math.log2(prior_weight * max(prior_mean, _LEAST))
+    return Settings(prior_weight, prior_mean, epsilon, error, *least)
 
 
 @kernel
-def _in_view(components, m, features, K, depth, settings, index, fields, packed, constants):
-    """Write the first four of a :class:`View`; return the number of its components."""
+def in_view(components, m, features, depth, K, settings):
+    """The components that can matter in an image: the first four fields of a :class:`View`, with room for all
+    components, and the number of those.
+
+    Args:
+        components, m, features: of the mixture (:class:`Seen`).
+        depth: [H, W], not positive where invalid.
+        K: [3, 3].
+        settings: of the sum.
+    """
     height, width = depth.shape
     n = m.size
+    index, fields = empty(n, np.int64), empty((n, FIELDS), np.float64)
+    packed, constants = empty((ROWS, components.shape[1]), depth.dtype), empty((n, TERMS), depth.dtype)
     whitened = empty((WHITENED, components.shape[1]), np.float64)
     every = empty(n, np.int64)
     whiten(components, n, whitened)
@@ -132,27 +125,20 @@ def _in_view(components, m, features, K, depth, settings, index, fields, packed,
             whitened[i, k] *= _SCALE
         whitened[PEAK, k] = (math.log(whitened[PEAK, k]) - HALF_LOG_TWO_PI_CUBED) * _LOG2_E
     _pack(components, whitened, m, every, n, packed)
-    z = 0.0
-    for v in range(height):
-        z = max(z, np.float64(_largest(depth[v])))
+    work, whole = empty(_BOX + packed.shape[1], depth.dtype), depth.size // LANES * LANES
+    work[0] = 0
+    largest(depth, whole, work)
+    z = np.float64(work[0])
+    for i in range(whole, depth.size):
+        z = max(z, np.float64(depth[i // width, i % width]))
     left, top = (0 - K[0, 2]) / K[0, 0] * z, (0 - K[1, 2]) / K[1, 1] * z
     right, bottom = (width - 1 - K[0, 2]) / K[0, 0] * z, (height - 1 - K[1, 2]) / K[1, 1] * z
     box = min(left, 0.0), min(top, 0.0), 0.0, max(right, 0.0), max(bottom, 0.0), z
-    work = empty(_BOX + packed.shape[1], depth.dtype)
     # Blocks divide their threshold by n. A larger divisor makes this one lower in spite of rounding of the boxes.
     chosen = cull(packed, n, limit(settings.epsilon, n + n // 64 + 1), box, settings, work, index)
     _terms(components, whitened, index, chosen, m, features, fields, constants)
     _pack(components, whitened, m, index, chosen, packed)
-    return chosen
-
-
-@reordered_leaf
-def _largest(values):
-    """The largest of the values, at least 0."""
-    most = values.dtype.type(0)
-    for i in range(values.size):
-        most = max(most, values[i])
-    return most
+    return index, fields, packed, constants, chosen
 
 
 @leaf

@@ -166,7 +166,7 @@ def _blocks(depth, K, view, features, tiles, lists, sums, out, out_f, first, sha
         if not any_seen:
             _clear(v0, u0, _BLOCK, out, out_f)
             continue
-        share, box = limit(settings.error, settings.among), _union(tiles.boxes, seen)
+        share, box = limit(settings.error, view.among), _union(tiles.boxes, seen)
         count = cull(packed, view.slot.size, share, box, settings, work, in_block)
         share = limit(settings.error, count)
         for i in range(ROWS):
@@ -231,7 +231,7 @@ def _at_pixels(depth, K, pixels, begin, order, view, features, tiles, lists, sum
                         out_f[g, order[low + i]] = np.nan
                 continue
             box, settings = _box(tiles.boxes, 0), view.settings
-            share = limit(settings.error, settings.among)
+            share = limit(settings.error, view.among)
             chosen = cull(view.packed, view.slot.size, share, box, settings, lists.work, retained)
             filled = (count + LANES - 1) // LANES * LANES
             _average(filled, tiles, 0, retained, chosen, view, features, sums)

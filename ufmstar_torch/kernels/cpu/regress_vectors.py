@@ -38,6 +38,15 @@ def write_tile(code, values, image, at, stride):
 
 
 @vectors
+def largest(code, values, n, most):
+    """Raise the first number of ``most`` to the largest of the first n values, a multiple of ``LANES``."""
+    best = code.variable(most.one(0))
+    with code.loop(n, code.lanes) as i:
+        best.value = values.load(i).at_least(best.value)
+    most.put(best.value.everywhere(Lanes.at_least), 0)
+
+
+@vectors
 def place_points(code, z, grid, ray, points, hole, box):
     """Write the points of a tile from its origin, the middle of the tile at the least depth.
 

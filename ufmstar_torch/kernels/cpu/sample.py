@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.frames.output import SampleStatistics
-from ufmstar_torch.kernels.compile_cpu import kernel, leaf
-from ufmstar_torch.kernels.cpu.calls import array
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
+from ufmstar_torch.kernels.cpu.calls import array, arrays
 from ufmstar_torch.steps.regress import HALF
 from ufmstar_torch.steps.sample import random_order
 
@@ -20,23 +20,24 @@ from ufmstar_torch.steps.sample import random_order
 def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:
     """As :func:`ufmstar_torch.steps.sample.sample_pixels`; the same pixels."""
     flat = array(valid).reshape(len(valid), -1)
-    index, used = np.empty((len(flat), count), np.int64), np.empty((len(flat), count), np.bool_)
-    _choose(flat, random_order(flat.shape[1], seed).numpy(), index, used)
+    index, used = _choose(flat, random_order(flat.shape[1], seed).numpy(), count)
     return torch.from_numpy(index), torch.from_numpy(used)
 
 
 @kernel
-def _choose(valid, order, index, used):
-    """Write the first valid pixels in their order, then invalid ones; ``used`` is False for these."""
+def _choose(valid, order, count):
+    """Indices [B, count] of the first valid pixels in their order, then invalid ones, for which ``used`` is False."""
+    index, used = empty((len(valid), count), np.int64), empty((len(valid), count), np.bool_)
     for b in range(len(valid)):
         n = 0
         for wanted in (True, False):
             for i in range(order.size):
-                if n == index.shape[1]:
+                if n == count:
                     break
                 if valid[b, order[i]] == wanted:
                     index[b, n], used[b, n] = order[i], wanted
                     n += 1
+    return index, used
 
 
 def sample_summary(
@@ -44,66 +45,63 @@ def sample_summary(
 ) -> tuple[list[SampleStatistics], Tensor, Tensor]:
     """As :func:`ufmstar_torch.steps.sample.sample_summary`, without gradients: the same bits but for the
     standard error."""
+    rows: dict[int, int] = {}  # of each map in the table: V may be M
+    for value in maps:
+        rows.setdefault(id(value), len(rows))
     values = [array(value) for value in maps]
-    kind = np.result_type(*values)
-    table, counts = np.empty((4, len(values), len(used)), kind), np.empty((len(values), len(used)), np.int64)
-    error, share, mask = np.empty(len(used), kind), np.empty(len(used), np.float32), array(used)
-    for m, value in enumerate(values):
-        same = next(i for i, other in enumerate(maps) if other is maps[m])  # V may be M
-        if same < m:
-            table[:, m], counts[m] = table[:, same], counts[same]
-        else:
-            _statistics(np.asarray(value, kind), mask, table[:, m], counts[m])
-    _error(table[1, 0], counts[0], mask, array(measured), array(valid_pixels), error, share)
-    each = []
-    for row, count in zip(torch.from_numpy(table).unbind(1), torch.from_numpy(counts).unbind(), strict=True):
-        mean, variance, median, maximum = row.unbind()
-        each.append(SampleStatistics(mean, variance, median, maximum, count))
-    return each, torch.from_numpy(error), torch.from_numpy(share)
+    table = np.empty((len(rows), *used.shape), np.result_type(*values))
+    for value, one in zip(maps, values, strict=True):
+        table[rows[id(value)]] = one
+    *found, error, share = _summary(table, *arrays(used, measured, valid_pixels))
+    statistics = [SampleStatistics(*map(torch.from_numpy, (*row, n))) for row, n in zip(*found, strict=True)]
+    return [statistics[rows[id(value)]] for value in maps], torch.from_numpy(error), torch.from_numpy(share)
 
 
 @kernel
-def _error(variance, counts, used, measured, valid_pixels, error, share):
-    """Write the standard error of the mean, and the share of measured pixels."""
-    single = np.float32
-    for b in range(error.size):
-        n, many = 0, 0
-        for i in range(used.shape[1]):
-            n += used[b, i]
+def _summary(values, used, measured, valid_pixels):
+    """Mean, variance, median and maximum [M, 4, B] of the ``used`` values [M, B, n] without NaN, their numbers [M, B],
+    the standard error [B] of the mean of the first, and the share [B] of measured pixels."""
+    maps, streams, n = values.shape
+    single, real = np.float32, values.dtype.type
+    table, counts = empty((maps, 4, streams), values.dtype), empty((maps, streams), np.int64)
+    error, share, scratch = empty(streams, values.dtype), empty(streams, single), empty((2, n), values.dtype)
+    for m in range(maps):
+        for b in range(streams):
+            counts[m, b] = _statistics(values[m, b], used[b], scratch, table[m], b)
+    for b in range(streams):
+        every, many = 0, 0
+        for i in range(n):
+            every += used[b, i]
             many += used[b, i] and measured[b, i] >= HALF
-        share[b] = single(many) / single(n)
-        unsampled = single(1) - single(n) / single(max(valid_pixels[b], 1))
-        error[b] = math.sqrt(variance[b] / error.dtype.type(counts[b]) * unsampled)
+        share[b] = single(many) / single(every)
+        unsampled = single(1) - single(every) / single(max(valid_pixels[b], 1))
+        error[b] = math.sqrt(table[0, 1, b] / real(counts[0, b]) * unsampled)
+    return table, counts, error, share
 
 
-@kernel
-def _statistics(values, used, out, counts):
-    """Write mean, variance, median and maximum [4, B] of the ``used`` values [B, n] without NaN, and the numbers of
-    values."""
-    n, real = values.shape[1], values.dtype.type
-    terms, present = np.empty(n, values.dtype), np.empty(n, values.dtype)
-    for row in range(len(values)):
-        count = 0
-        for i in range(n):
-            value = values[row, i]
-            terms[i] = 0
-            if used[row, i] and value == value:
-                terms[i] = present[count] = value
-                count += 1
-        counts[row] = count
-        mean = out[0, row] = folded(terms) / real(count)
-        for i in range(n):
-            difference = values[row, i] - mean
-            terms[i] = difference * difference if used[row, i] and difference == difference else 0
-        out[1, row] = out[2, row] = out[3, row] = np.nan
-        if count > 1:
-            out[1, row] = folded(terms) / (real(count) - real(1))
-        if count > 0:
-            out[2, row] = smallest(present, count, (count - 1) // 2)
-            largest = present[0]
-            for i in range(1, count):
-                largest = max(largest, present[i])
-            out[3, row] = largest
+@leaf
+def _statistics(values, used, scratch, out, b):
+    """Write the four statistics of the values [n] of stream ``b`` to ``out`` [4, B]; return the number of values."""
+    real, terms, present, count = values.dtype.type, scratch[0], scratch[1], 0
+    for i in range(values.size):
+        terms[i] = 0
+        if used[i] and values[i] == values[i]:
+            terms[i] = present[count] = values[i]
+            count += 1
+    mean = out[0, b] = folded(terms) / real(count)
+    for i in range(values.size):
+        difference = values[i] - mean
+        terms[i] = difference * difference if used[i] and difference == difference else 0
+    out[1, b] = out[2, b] = out[3, b] = np.nan
+    if count > 1:
+        out[1, b] = folded(terms) / (real(count) - real(1))
+    if count > 0:
+        out[2, b] = smallest(present, count, (count - 1) // 2)
+        largest = present[0]
+        for i in range(1, count):
+            largest = max(largest, present[i])
+        out[3, b] = largest
+    return count
 
 
 @leaf

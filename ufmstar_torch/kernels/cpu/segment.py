@@ -89,8 +89,11 @@ def gaussians(
             write_labels(spans[b], runs[b], slot, out[b])
         return out
 
-    mean, covariance, weight = (_padded([fit[i] for fit in fits]) for i in range(3))
-    none, means = np.zeros_like(weight), np.empty((*weight.shape, 0))
+    if streams == 1 and fits[0][2].size > 0:
+        mean, covariance, weight = [value[None] for value in fits[0][:3]]
+    else:
+        mean, covariance, weight = map(_padded, zip(*[fit[:3] for fit in fits], strict=True))
+    none, means = np.zeros(weight.shape), np.empty((*weight.shape, 0))
     if features is not None:
         means = _feature_means(features, labels(), weight.astype(z.dtype)).astype(np.float64)
     return (mean, covariance, weight, none, none, none, np.zeros((*weight.shape, 5)), means), labels
@@ -98,8 +101,6 @@ def gaussians(
 
 def _padded(values: Sequence[Maps]) -> Maps:
     """[B, K, ...] of values [k, ...] by stream, zeros behind them; K is at least 1."""
-    if len(values) == 1 and len(values[0]) > 0:
-        return values[0][None]
     out = np.zeros((len(values), max(1, *map(len, values)), *values[0].shape[1:]))
     for padded, value in zip(out, values, strict=True):
         padded[: len(value)] = value

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -25,8 +26,8 @@ from ufmstar_torch.gaussians.camera import relative_pose
 from ufmstar_torch.gaussians.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.gaussians.mixture import GaussianMixture
 from ufmstar_torch.gaussians.state import UfMStarState
-from ufmstar_torch.kernels.cpu.calls import array, each
-from ufmstar_torch.kernels.cpu.regress import regress_maps, views_of
+from ufmstar_torch.kernels.cpu.calls import array, arrays, each
+from ufmstar_torch.kernels.cpu.regress import at_pixels, regress_maps, views_of
 from ufmstar_torch.kernels.cpu.regress_cull import Seen, View
 from ufmstar_torch.kernels.cpu.rigid import FIELDS, padded
 from ufmstar_torch.kernels.cpu.segment import gaussians
@@ -38,7 +39,8 @@ from ufmstar_torch.steps.step import StepObserver, step_output, unobserved
 _MIXTURE = tuple(field.name for field in fields(GaussianMixture))
 _STREAM = ("T_world_first", "started", "frames", "skipped")
 _EPSILON = {dtype: torch.finfo(dtype).eps for dtype in (torch.float32, torch.float64)}
-_Arrays = tuple[NDArray[Any], ...]
+_of_mixture, _of_stream = attrgetter(*_MIXTURE), attrgetter(*_STREAM)
+_Arrays = Sequence[NDArray[Any]]
 _Match = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_], int]  # the result of ``match``
 
 
@@ -52,17 +54,15 @@ def step(
 ) -> tuple[UfMStarState, UncertaintyOutput]:
     """As :func:`ufmstar_torch.steps.step.step`, for CPU tensors."""
     stage = unobserved if observer is None else observer.stage
-    depth, K = array(frame.depth), array(frame.intrinsics)
-    camera, counts = (array(frame.fault), array(frame.T_world_cam), K), np.zeros((len(COUNTS), len(depth)), np.int64)
+    depth, K, *rest = arrays(frame.depth, frame.intrinsics, frame.fault, frame.T_world_cam)
+    camera, counts = (*rest, K), np.zeros((len(COUNTS), len(depth)), np.int64)
     informative = None if frame.informative is None else array(frame.informative)
     segments = _segment(frame, depth if informative is None else array(frame.informative_depth), K, config, state)
     stage("segment")
 
-    slots = tuple([array(getattr(state, name)) for name in _MIXTURE])
-    before = tuple([array(getattr(state, name)) for name in _STREAM])
-    after = tuple([np.empty_like(value) for value in before])
+    slots, after = arrays(*_of_mixture(state)), [value.copy() for value in arrays(*_of_stream(state))]
     thresholds = config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE
-    arguments = camera, before, after, slots[:3], segments[:3], frame.size, thresholds, counts
+    arguments = camera, tuple(after), tuple(slots[:3]), segments[:3], frame.size, thresholds, counts
     matched = each(match, [(b, *arguments) for b in range(len(depth))])
     stage("correspond")
 
@@ -78,28 +78,31 @@ def step(
         views = views_of(seen, depth, K, config)
     stage("append")
 
-    smoothed = array(memory_for(state.smoothed, frame.size)) if pixels is None and config.ema_alpha < 1 else None
+    smoothed = arrays(memory_for(state.smoothed, frame.size))[0] if pixels is None and config.ema_alpha < 1 else None
+    at = None if pixels is None else array(pixels)
     shown, regressed, memory, counts[UNMEASURED] = regress_maps(
-        seen, depth, K, config, None if pixels is None else array(pixels), views=views, shift=shift,
-        informative=informative, smoothed=smoothed,
-    )  # fmt: skip
+        seen, depth, K, config, at, views=views, shift=shift, informative=informative, smoothed=smoothed
+    )
     stage("regress")
 
-    parts = regressed.swapaxes(1, -1) if pixels is not None else regressed.transpose(0, 2, 3, 1)
+    parts = regressed.swapaxes(1, -1) if at is not None else regressed.transpose(0, 2, 3, 1)
     last = parts.shape[-1] - 1
     of_maps = shown, parts[..., last], parts[..., : last - columns]
     maps = dict(zip(("disagreement", "measured", "features"), map(torch.from_numpy, of_maps), strict=True))
+    changed = dict(zip(_STREAM, map(torch.from_numpy, after), strict=True)) | updated
+    if memory is not None:
+        changed["smoothed"] = torch.from_numpy(memory)
     residual = None
     if learnt is not None:
         residual = torch.from_numpy(parts[..., last - columns : last])
         residual = residual if shift is not None else learnt.residual(residual)
-    changed = dict(zip(_STREAM, map(torch.from_numpy, after), strict=True)) | updated
-    if memory is not None:
-        changed["smoothed"] = torch.from_numpy(memory)
-    if learnt is not None:
         changed |= learnt.tensors()
-    counted = dict(zip(COUNTS, torch.from_numpy(counts).unbind(), strict=True))
-    out = step_output(frame, maps, residual, pixels, counted, learnt)
+    counted = dict(zip(COUNTS, map(torch.from_numpy, counts), strict=True))
+    maps |= {"depth": frame.depth, "valid": frame.valid}
+    if at is not None:
+        z = at_pixels(depth, at)
+        maps |= {"depth": torch.from_numpy(z), "valid": torch.from_numpy(z > 0)}
+    out = step_output(frame, maps, residual, counted, learnt)
     stage("average")
     return state.with_tensors(changed), out
 
@@ -120,21 +123,18 @@ def _join(
     """Step 4: the mixture after the frame with the sums over anchors, by name; and the mixture in the form for the
     regression, with ``columns`` for anchors. ``first`` is camera-to-world of the first cameras."""
     b, capacity = slots[2].shape
-    totals = [occupied + int(counts[NEW, i]) for i, (*_, occupied) in enumerate(matched)]
-    while capacity < max(totals):
+    needed = max([occupied + int(counts[NEW, i]) for i, (*_, occupied) in enumerate(matched)])
+    while capacity < needed:
         capacity *= 2
-    updated = tuple([_extended(value, capacity) for value in slots])
+    updated = tuple([value.copy() if value.shape[1] == capacity else _extended(value, capacity) for value in slots])
     settings = (
         config.overlap_weighted, _EPSILON[state.covariance.dtype], config.view_baseline or 0.0, config.near_plane
     )  # fmt: skip
     members = np.zeros(b) if frame.member is None else array(frame.member)
-    features = slots[-1].shape[2] + columns + 1
-    seen = [Seen(np.empty((FIELDS, padded(n))), np.empty(n), np.empty((n, features))) for n in totals]
-    current, common = (*segments[:3], segments[-1]), (settings, counts)
-    each(join, [
-        (i, camera, first, members, updated, current, matched[i], *common, seen[i])
-        for i in range(b)
-    ])  # fmt: skip
+    rest = settings, slots[-1].shape[2] + columns + 1, counts
+    fixed, current = (camera, first, members, updated), (*segments[:3], segments[-1])
+    joined = each(join, [(i, *fixed, current, matched[i], *rest) for i in range(b)])
+    seen = [Seen(*one) for one in joined]
     mixture, sums = dict(zip(_MIXTURE, map(torch.from_numpy, updated), strict=True)), dict(state.by_component)
     limit = config.max_components
     if limit is None or capacity <= limit:
@@ -148,8 +148,6 @@ def _join(
 def _extended(value: NDArray[Any], capacity: int) -> NDArray[Any]:
     """A copy of slots [B, K, ...], followed by empty ones up to the capacity."""
     occupied = value.shape[1]
-    if occupied == capacity:
-        return value.copy()
     out = np.zeros((len(value), capacity, *value.shape[2:]), value.dtype)
     out[:, :occupied] = value
     return out

@@ -17,12 +17,12 @@ SEGMENTS, MATCHED, PAIRS, NEW, DROPPED, COMPONENTS, SINGLE_VIEW, UNMEASURED = ra
 
 
 @kernel
-def match(b, camera, before, after, mixture, segments, size, thresholds, counts):
+def match(b, camera, stream, mixture, segments, size, thresholds, counts):
     """Step 3 for stream ``b``: transform M_(i-1) [K] into the camera frame and match it with C_i [C].
 
     Args:
         camera: fault [B], camera-to-world [B, 4, 4] and intrinsics [B, 3, 3] of the frame.
-        before, after: T_world_first [B, 4, 4], started, frames and skipped [B] of the state; the latter are written.
+        stream: T_world_first [B, 4, 4], started, frames and skipped [B] of the state; changed.
         mixture, segments: mean, covariance and weight.
         size: H, W of the image.
         thresholds: of :func:`matches`: eta, eta_occl, near plane, widening.
@@ -33,15 +33,16 @@ def match(b, camera, before, after, mixture, segments, size, thresholds, counts)
         which are the first ones.
     """
     faults, poses, cameras = camera
-    valid, pose, first = faults[b] == 0, poses[b], after[0][b]
+    firsts, started, frames, skipped = stream
+    valid, pose, first = faults[b] == 0, poses[b], firsts[b]
     mean, covariance, weight = mixture[0][b], mixture[1][b], mixture[2][b]
     mean_c, cov_c, weight_c = segments[0][b], segments[1][b], segments[2][b]
     for i in range(4):
         for j in range(4):
-            first[i, j] = pose[i, j] if valid and not before[1][b] else before[0][b, i, j]
-    after[1][b] = before[1][b] or valid
-    after[2][b] = before[2][b] + (1 if valid else 0)
-    after[3][b] = before[3][b] + (0 if valid else 1)
+            first[i, j] = pose[i, j] if valid and not started[b] else first[i, j]
+    started[b] = started[b] or valid
+    frames[b] += valid
+    skipped[b] += not valid
     motion, n = empty((3, 4), np.float64), 0
     relative(first, pose, motion)
     while n < weight.size and weight[n] > 0:
@@ -69,7 +70,7 @@ def match(b, camera, before, after, mixture, segments, size, thresholds, counts)
 
 
 @kernel
-def join(b, camera, first, members, slots, segments, matched, settings, counts, seen):
+def join(b, camera, first, members, slots, segments, matched, settings, width, counts):
     """Step 4 for stream ``b``: fuse the pairs, append the new components, and transform the mixture into the camera
     frame for the regression.
 
@@ -82,9 +83,12 @@ def join(b, camera, first, members, slots, segments, matched, settings, counts, 
         segments: mean, covariance, weight and features [B, C, ...] of C_i.
         matched: the result of :func:`match`.
         settings: as :func:`fuse_pairs`: whether weighted by overlap, epsilon, b_0 (0 = the paper) and near plane.
+        width: number of features for the regression: the mixture's, some that are not written, and the last, that of
+            ``regress.with_measured_share``.
         counts: [8, B] rows of components and of those seen in one view are written.
-        seen: written (:class:`Seen`); the last feature is that of ``regress.with_measured_share``, those between the
-            mixture's and the last are not written.
+
+    Returns:
+        The fields of :class:`Seen`.
     """
     pairs, overlap, new, occupied = matched
     mean, covariance, weight, disagreement = slots[0][b], slots[1][b], slots[2][b], slots[3][b]
@@ -110,7 +114,7 @@ def join(b, camera, first, members, slots, segments, matched, settings, counts, 
         mean, covariance, weight, disagreement, compared, views, references, features, moved, turned, weight_c,
         features_c, new, occupied, view, settings[2],
     )  # fmt: skip
-    components, m, columns = seen
+    components, m, columns = empty((FIELDS, padded(n)), np.float64), empty(n, np.float64), empty((n, width), np.float64)
     gather(n, mean, covariance, weight, components)
     relative(first[b], pose, motion)
     turn(motion, components.shape[1], components.shape[1], components)
@@ -119,6 +123,7 @@ def join(b, camera, first, members, slots, segments, matched, settings, counts, 
         m[i] = disagreement[i]
         for f in range(features.shape[1]):
             columns[i, f] = features[i, f]
-        columns[i, columns.shape[1] - 1] = -math.expm1(-np.float64(views[i]))
+        columns[i, width - 1] = -math.expm1(-np.float64(views[i]))
         alone += views[i] == 0
     counts[COMPONENTS, b], counts[SINGLE_VIEW, b] = n, alone
+    return components, m, columns

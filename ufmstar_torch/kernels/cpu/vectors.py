@@ -62,6 +62,11 @@ class Lanes:
         """Minimum; ``self`` for NaN."""
         return (self > other).select(other, self)
 
+    def floats(self) -> Lanes:
+        """The single-precision numbers of bytes."""
+        kind = ir.VectorType(ir.FloatType(), self.value.type.count)
+        return self._new(self._builder.uitofp(self.value, kind))
+
     def size(self) -> Lanes:
         """Absolute values."""
         return self.at_least(self * -1.0)
@@ -104,13 +109,18 @@ class Lanes:
 
 
 class Memory:
-    """A contiguous array; indices count its numbers."""
+    """A contiguous array; indices count its numbers. A vector of bytes has as many numbers as one of floats."""
 
     def __init__(self, builder: Any, data: Any, flags: tuple[str, ...]) -> None:
         real = data.type.pointee
         self._flags = flags
-        self._builder, self._data, self._size = builder, data, 8 if isinstance(real, ir.DoubleType) else 4
-        self._vector = ir.VectorType(real, _BYTES // self._size)
+        byte = isinstance(real, ir.IntType) and real.width == 8
+        self._builder, self._data, self._size = (
+            builder,
+            data,
+            8 if isinstance(real, ir.DoubleType) else 1 if byte else 4,
+        )
+        self._vector = ir.VectorType(real, LANES if byte else _BYTES // self._size)
 
     def _at(self, index: Any, offset: int) -> Any:
         index = _INDEX(index) if isinstance(index, int) else index

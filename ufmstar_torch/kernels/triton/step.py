@@ -145,7 +145,8 @@ def device_step(
         "skipped": poses.skipped, "smoothed": result.memory,
     })  # fmt: skip
     maps = {"disagreement": result.disagreement, "measured": result.measured, "features": result.features}
-    out = step_output(frame, maps, None, None, of_step)
+    maps |= {"depth": frame.depth, "valid": frame.valid}
+    out = step_output(frame, maps, None, of_step)
     return updated, out
 
 
