@@ -5,8 +5,8 @@
 prints for each sequence figures on the removed half: of the network, and of the posterior with the rest of the depth as
 anchors alone, with dense anchors of the images alone, and with both (``--anchors sensor``), also by the cause of
 the removal. In each frame, a sixth of the depth is removed at depth edges, a sixth because it is farthest, and the
-remainder in discs of .03 to .12 image widths. The exact depth of tours gets the noise of ``--sensor``, blurred over 3
-pixels.
+remainder in discs of .03 to .12 image widths or, with ``--dark``, on the darkest surfaces. The exact depth of tours
+gets the noise of ``--sensor``, blurred over 3 pixels.
 """
 
 from __future__ import annotations
@@ -38,11 +38,14 @@ DISCS = 0.03, 0.12  # radii [widths]
 FIGURES = ("rmse", "delta1", "ece_delta", "mixture_ece_delta", "ece_q", "nll")
 
 
-CAUSES = EDGE, FAR, DISC = "edges", "far", "discs"
+CAUSES = EDGE, FAR, HOLE = "edges", "far", "holes"
 
 
-def removed(depth: NDArray[np.float32], seed: int) -> dict[str, NDArray[np.bool_]]:
-    """By cause, [H, W] True at the removed pixels, which are half of those with a depth."""
+def removed(
+    depth: NDArray[np.float32], seed: int, image: NDArray[np.uint8] | None = None
+) -> dict[str, NDArray[np.bool_]]:
+    """By cause, [H, W] True at the removed pixels, which are half of those with a depth; with an RGB image, the holes
+    are its darkest pixels."""
     import cv2
 
     valid, rng, kernel = depth > 0, np.random.default_rng(seed), np.ones((9, 9), np.uint8)
@@ -52,22 +55,26 @@ def removed(depth: NDArray[np.float32], seed: int) -> dict[str, NDArray[np.bool_
     edge = valid & (contrast > np.quantile(contrast[valid], 1 - EACH))
     left = valid & ~edge
     far = left & (depth > np.quantile(depth[left], 1 - EACH * valid.sum() / left.sum()))
-    left, disc = left & ~far, np.zeros_like(valid)
+    left, hole = left & ~far, np.zeros_like(valid)
     height, width = depth.shape
     v, u = np.ogrid[:height, :width]
-    while (edge | far | disc).sum() < SHARE * valid.sum():
+    if image is not None:
+        grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 3.0)
+        grey = cv2.resize(grey, (width, height))
+        hole = left & (grey <= np.quantile(grey[left], (SHARE - 2 * EACH) * valid.sum() / left.sum()))
+    while image is None and (edge | far | hole).sum() < SHARE * valid.sum():
         radius, row, column = rng.uniform(*DISCS) * width, rng.uniform(0, height), rng.uniform(0, width)
-        disc |= left & ((v - row) ** 2 + (u - column) ** 2 < radius**2)
-    return {EDGE: edge, FAR: far, DISC: disc}
+        hole |= left & ((v - row) ** 2 + (u - column) ** 2 < radius**2)
+    return {EDGE: edge, FAR: far, HOLE: hole}
 
 
-def rest(entry: Entry, seed: int, noise: str | None) -> NDArray[np.float32]:
+def rest(entry: Entry, seed: int, noise: str | None, dark: bool = False) -> NDArray[np.float32]:
     """The depth that serves as anchors, with the noise of a kind of sensor."""
     import cv2
 
     assert entry.load_depth is not None
-    depth = entry.load_depth()
-    left = np.where(np.any([*removed(depth, seed).values()], axis=0), np.float32(0), depth)
+    depth, image = entry.load_depth(), entry.load_image() if dark and entry.load_image else None
+    left = np.where(np.any([*removed(depth, seed, image).values()], axis=0), np.float32(0), depth)
     if noise is None:
         return left
     noises = cv2.GaussianBlur(np.random.default_rng([seed, 1]).standard_normal(depth.shape), (0, 0), 1.0)
@@ -78,8 +85,8 @@ def rest(entry: Entry, seed: int, noise: str | None) -> NDArray[np.float32]:
 class RemovedHalf:
     """Figures of the network and of the posterior on the removed half of a sequence's depth."""
 
-    def __init__(self, whole: FrameSequence) -> None:
-        self._whole, self.anchors = whole, list[int]()
+    def __init__(self, whole: FrameSequence, dark: bool) -> None:
+        self._whole, self._dark, self.anchors = whole, dark, list[int]()
         self.network, self.posterior = ({cause: SequenceMetrics() for cause in ("all", *CAUSES)} for _ in range(2))
 
     def add(self, result: FrameResult) -> None:
@@ -89,7 +96,7 @@ class RemovedHalf:
         row, frame = result.rows[UFM], self._whole[result.index]
         if frame.depth is None or not row.corrected or row.landmarks is None:
             return
-        causes = removed(frame.depth, result.index)
+        causes = removed(frame.depth, result.index, frame.image if self._dark else None)
         for cause, gone in {"all": np.any([*causes.values()], axis=0), **causes}.items():
             hidden = np.where(gone, frame.depth, np.float32(0))
             truth = truth_at(replace(frame, depth=hidden), row.intrinsics, row.size)
@@ -100,14 +107,16 @@ class RemovedHalf:
         self.anchors.append(len(row.landmarks.depth))
 
 
-def measure(path: str, weights: str, sensor: str | None, images: bool, frames: int | None) -> RemovedHalf:
+def measure(path: str, weights: str, sensor: str | None, images: bool, frames: int | None, dark: bool) -> RemovedHalf:
     """Run one kind of anchors on a sequence."""
     whole = open_sequence(path)
     if frames is not None:
         whole = replace(whole, entries=whole.entries[:frames])
     noise = sensor if path.startswith(PREFIX) else None
     entries = tuple(
-        replace(entry, load_depth=entry.load_depth and partial(rest, entry, seed, noise), load_image=entry.load_image)
+        replace(
+            entry, load_depth=entry.load_depth and partial(rest, entry, seed, noise, dark), load_image=entry.load_image
+        )
         for seed, entry in enumerate(whole.entries)
     )
     source = NetworkChoice("", "fastdepth", (weights,), None).load(torch.device("cpu"))
@@ -116,7 +125,7 @@ def measure(path: str, weights: str, sensor: str | None, images: bool, frames: i
         replace(whole, entries=entries), range(len(entries)), source, config.within(source.max_depth, False),
         torch.device("cpu"), {}, landmarks="dense", sensor=sensor,
     )  # fmt: skip
-    (row, _), judged = job.row(), RemovedHalf(whole)
+    (row, _), judged = job.row(), RemovedHalf(whole, dark)
     assert row.anchors is not None
     without_images = patch.object(row.anchors, "tracked", return_value=None)
     with nullcontext() if images else without_images:
@@ -131,12 +140,13 @@ def main() -> None:
     parser.add_argument("sequences", nargs="+", metavar="SEQUENCE")
     parser.add_argument("--frames", type=int, help="first ones alone")
     parser.add_argument("--sensor", default="stereo")
+    parser.add_argument("--dark", action="store_true", help="remove depth of dark surfaces instead of discs")
     options = parser.parse_args()
     for path in options.sequences:
         print(path)
         kinds = {"sensor": (options.sensor, False), "images": (None, True), "both": (options.sensor, True)}
         for name, (sensor, images) in kinds.items():
-            judged = measure(path, options.weights, sensor, images, options.frames)
+            judged = measure(path, options.weights, sensor, images, options.frames, options.dark)
             if name == "sensor":
                 print("  network      ", figures_of(judged.network["all"]))
             for cause in ("all", *CAUSES) if name == "both" else ("all",):

@@ -123,7 +123,7 @@ def at_nodes(state, after, size, logs, seen, fit, motion, beyond):
         e = offset + mean[0] + X[:, 1] * mean[1] - after["most"]
         P = moving(motion, size, logs, e, share, field.ratio(after, "between"), beyond)
         elsewhere_ = [spreads.second_moment(1.0, 0.1, *each) for each in zip(e, wide, strict=True)]
-        p, spread = 1 - (1 - p) * (1 - P), (1 - P) * np.array(spread) + P * np.array(elsewhere_)
+        p, spread = 1 - (1 - p) * (1 - P), np.maximum((1 - P) * spread + P * elsewhere_, 0.02**2)
     alone, spread = np.array(alone), np.array(spread)
     beyond = np.maximum((spread - (1 - p) * alone) / np.maximum(p, 1e-12), alone)
     alone = np.minimum(alone, np.quantile(alone, 0.7))

@@ -193,6 +193,8 @@ def test_half_of_a_depth_camera_s_depth_is_removed(script: Any, noise: str | Non
     assert depth[causes["far"]].min() > 4
     left = sensor.rest(Entry("0", np.eye(4), None, depth.copy), 0, noise)
     np.testing.assert_array_equal(left > 0, (depth > 0) & ~gone.any(0))
+    image = np.repeat(np.linspace(0, 255, 320, dtype=np.uint8)[None, :, None], 240, 0).repeat(3, 2)
+    assert np.nonzero(sensor.removed(depth, 0, image)["holes"])[1].max() < 120, "the darkest surfaces"
     wall = left[(left > 0) & (depth == 2.5)]
     assert wall.std() == pytest.approx(sigma, rel=0.1)
     assert wall.mean() == pytest.approx(2.5, abs=0.01)

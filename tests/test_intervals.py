@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import math
 
 import numpy as np
 import oracle_interval as oracle
@@ -43,12 +42,6 @@ def test_a_mixture_s_intervals_and_probabilities_equal_the_oracle_s(components, 
     for x in (0.05, 0.9, 1.3, 2.0, 2.4, 5.0):
         expected = oracle.probability_nearer(components, x, quantiles)
         assert float(mixture.below(torch.tensor([[x]]))) == pytest.approx(expected, rel=1e-6, abs=1e-7)
-
-
-def test_of_one_normal_distribution_far_from_zero_it_is_the_textbook_s():
-    lower, upper = distribution([(1.0, 3.0, 0.01)]).interval(0.9)
-    assert (float(lower), float(upper)) == pytest.approx((3 - 0.1 * 1.6449, 3 + 0.1 * 1.6449), rel=1e-4)
-    assert float(distribution([(1.0, 3.0, 0.01)]).below(torch.tensor([[2.9]]))) == pytest.approx(0.1586553, rel=1e-5)
 
 
 @given(st.floats(0.01, 0.99), st.floats(0.0, 0.5), st.floats(0.05, 3.0), st.floats(0.3, 2.0), st.floats(0.1, 3.0))
@@ -107,22 +100,11 @@ def weighed(distance, area, everywhere):
     return weights
 
 
-@pytest.mark.parametrize("factor", [0.5, 1.0, 2.5])
-def test_the_quantiles_follow_the_scores(factor):
-    """Scores are ``factor`` times those of a normal distribution: 200 frames later the quantiles are too."""
-    rng, state, last = np.random.default_rng(1), np.zeros(4), []
-    for _ in range(200):
-        state = updated(state, factor * np.abs(rng.standard_normal(100)), np.ones(100))
-        last.append(np.exp(state[1:]))
-    assert np.mean(last[-50:], 0)[:2] == pytest.approx(factor, rel=0.1)
-    assert np.mean(last[-50:], 0)[2] == pytest.approx(factor, rel=0.2)
-
-
-def test_old_scores_are_forgotten_and_a_frame_with_few_counts_less():
+def test_the_quantiles_follow_the_scores_forget_old_ones_and_a_frame_with_few_counts_less():
     rng, state = np.random.default_rng(2), np.zeros(4)
-    for factor in [1.0] * 60 + [3.0] * 60:
+    for factor in [3.0] * 60 + [0.5] * 90:
         state = updated(state, factor * np.abs(rng.standard_normal(100)), np.ones(100))
-    assert math.exp(state[2]) == pytest.approx(3, rel=0.2)
+    assert np.exp(state[1:3]) == pytest.approx(0.5, rel=0.1)
     one, many = (updated(state, np.full(n, 99.0), np.ones(n)) for n in (1, 100))
     assert 0 < one[2] - state[2] < 0.1 * (many[2] - state[2])
 

@@ -263,10 +263,11 @@ def test_a_ratio_that_most_anchors_have_is_never_discarded():
     assert np.median(np.abs(error)) < 0.3
 
 
-def approached(frames=12):
-    """Frames of an exact network, whose depths are 1.35 times too large, and anchors of a board at twice its distance
-    that grows from a twentieth to nearly half of the image."""
-    rng = np.random.default_rng(0)
+def approached(said, noise, frames=12):
+    """Frames of an exact network, whose depths are 1.35 times too large, and of anchors that say ``said`` times the
+    distance of a board that grows from a twentieth to nearly half of the image; ``noise`` is relative. Yields the
+    network's depth, the board's mask, the posterior's depth and |z|."""
+    rng, packed = np.random.default_rng(0), torch.zeros(1, SIZE, dtype=torch.float64)
     for share in np.linspace(0.22, 0.68, frames):
         depth, half = np.full((48, 64), 4.0), np.array([48, 64]) * share / 2
         depth += np.linspace(0, 1, 64)
@@ -276,22 +277,27 @@ def approached(frames=12):
         depth[board] = 1.5
         pixel = (rng.uniform(0.02, 0.96, (400, 2)) * [64, 48]).round()
         u, v = pixel.astype(int).T
-        factor = np.where(board[v, u], 2.0, 1.0) * np.exp(rng.normal(0, 0.02, 400)) / 1.35
-        yield depth, board, pixel, depth[v, u] * factor, (0.02 * depth[v, u]) ** 2
+        factor = np.where(board[v, u], said, 1.0) * np.exp(rng.normal(0, noise, 400)) / 1.35
+        frame, rows = checked(depth, pixel, depth[v, u] * factor, (noise * depth[v, u]) ** 2)
+        rows = replace(rows, motion=torch.from_numpy(points(-4.0, (48, 64)))[None])
+        packed, out = update(packed, frame, rows, torch.zeros(1, 48, 64, dtype=torch.float64), MODEL)
+        found = out.depth[0].numpy()
+        yield depth, board, found, np.abs(found - depth / 1.35) / out.variance[0].sqrt().numpy()
 
 
 def test_a_thing_that_walks_ahead_neither_shifts_the_scale_nor_escapes_however_large_it_becomes():
-    packed, z = torch.zeros(1, SIZE, dtype=torch.float64), []
-    for depth, board, *anchors in approached():
-        frame, rows = checked(depth, *anchors)
-        rows = replace(rows, motion=torch.from_numpy(points(-4.0, (48, 64)))[None])
-        packed, out = update(packed, frame, rows, torch.zeros(1, 48, 64, dtype=torch.float64), MODEL)
-        found, sigma = out.depth[0].numpy(), out.variance[0].sqrt().numpy()
-        z.append(np.abs(found - depth / 1.35) / sigma)
+    on_board = []
+    for depth, board, found, z in approached(2.0, 0.02):
+        on_board.append(z[board])
         assert np.median(found[board] * 1.35 / depth[board]) > 1.9, "the evidence's depth is stated"
-        assert np.sqrt(np.mean(z[-1][~board] ** 2)) < 1.5
-    last = [values[board] for values, (_, board, *_) in zip(z, approached(), strict=True)][3:]
-    assert np.sqrt(np.mean(np.concatenate(last) ** 2)) < 4
+        assert np.sqrt(np.mean(z[~board] ** 2)) < 1.5
+    assert np.sqrt(np.mean(np.concatenate(on_board[3:]) ** 2)) < 4
+
+
+def test_what_comes_nearer_by_little_is_covered():
+    """Precise anchors of an exact network say .95 times the distance: no test fails."""
+    on_board = [z[board] for _, board, _, z in approached(0.95, 0.005)][3:]
+    assert np.sqrt(np.mean(np.concatenate(on_board) ** 2)) < 3
 
 
 def test_an_exact_network_s_posterior_covers_what_moves_in_a_tour(moving_tour):

@@ -19,7 +19,7 @@ from ufmstar_torch.kernels.compile_cpu import kernel
 from ufmstar_torch.posterior import field
 from ufmstar_torch.posterior.moments import divide, second_moments
 from ufmstar_torch.posterior.running import FEATURES, RATIOS, SIZE, constants, priors, views, write_ratios
-from ufmstar_torch.posterior.scene import SIDE, elsewhere_variance
+from ufmstar_torch.posterior.scene import SIDE
 from ufmstar_torch.posterior.update import update
 
 MODEL = PosteriorConfig()
@@ -494,13 +494,6 @@ def test_far_from_evidence_the_variance_is_larger_and_never_below_what_ufm_star_
     torch.testing.assert_close(small, none, equal_nan=True)  # less than the uncertainty that the anchors leave
     assert float((large - none)[:, 44:].mean()) > 0.1
     assert bool((large >= none)[np.nonzero(depth)].all())
-
-
-def test_another_surface_is_less_certain_than_the_anchors_around_agree():
-    arguments = np.array([0.0, 0.1, 3.0]), np.array([0.01, 0.02, 0.01])
-    expected = [0.01 * MODEL.elsewhere, 0.1 + 0.02 * MODEL.elsewhere, MODEL.widest]
-    found = [elsewhere_variance(constants(MODEL), *pair) for pair in zip(*arguments, strict=True)]
-    np.testing.assert_allclose(found, expected)
 
 
 def test_before_the_first_anchor_of_a_source_the_deviation_is_about_the_depth():

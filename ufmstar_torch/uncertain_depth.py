@@ -402,7 +402,8 @@ class UncertainDepth(NetworksInTurn):
     ) -> None:
         """Run every network twice on noise, and compile all kernels or load them from disk. State, evidence and the
         number of images do not change; a network with a state of its own sees the noise. Without this, the first images
-        wait for the compiler and for the libraries of a GPU.
+        wait for the compiler and for the libraries of a GPU. Where there are two cores, a second process compiles the
+        kernels of the search for anchors.
 
         Args:
             size: (H, W) of the images [px]; without networks, of the depth maps.

@@ -88,7 +88,7 @@ def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **opti
     read, broken, depths = _read_frames(sequence)
     if broken:
         problems.append(f"{len(broken)} of the {read} frames read cannot be decoded, first {broken[0]}")
-        remedies.append("they are skipped and counted when the sequence is used; copy them again if it is many")
+        remedies.append("they are skipped and counted when the sequence is used; if it is many, copy or convert them")
     outcome = check_sequence(sequence, pairs)
     checked = {**asdict(outcome), "read": read, "unreadable": broken}
     del checked["problems"], checked["undecided"]

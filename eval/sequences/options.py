@@ -93,12 +93,8 @@ def check_scale(name: str, scale: float | None) -> None:
 
 def with_camera_files(options: Options, folder: Path) -> Options:
     """The options with the cameras of files in a sequence's folder, which win over a layout's default cameras."""
-    color, depth = camera_file(folder, FILES), camera_file(folder, DEPTH_FILES)
-    if options.intrinsics is None and color is not None:
-        options = replace(options, intrinsics=color)
-    if options.depth_intrinsics is None and depth is not None:
-        options = replace(options, depth_intrinsics=depth)
-    return options
+    files = {"intrinsics": camera_file(folder, FILES), "depth_intrinsics": camera_file(folder, DEPTH_FILES)}
+    return replace(options, **{name: file for name, file in files.items() if file and getattr(options, name) is None})
 
 
 def resolve(root: Path, name: str | Path) -> Path:

@@ -50,14 +50,10 @@ class PoseRefinement(SavedState):
     """
 
     HELD: ClassVar = {
-        "_variance": "given_pose_variance",
-        "_learnt": "pose_errors_learnt",
-        "_last_error": "last_pose_error",
-        "_recent_score": "surprise_lately",
-        "correlated": "correlated_pose_variance",
-        "shared": "remaining_pose_variance",
-        "_offset_variance": "pose_variance_by_offset",
-    }
+        "_variance": "given_pose_variance", "_learnt": "pose_errors_learnt", "_last_error": "last_pose_error",
+        "_recent_score": "surprise_lately", "correlated": "correlated_pose_variance",
+        "shared": "remaining_pose_variance", "_offset_variance": "pose_variance_by_offset",
+    }  # fmt: skip
     RANGES: ClassVar = {"_variance": POSITIVE}
 
     def __init__(self) -> None:

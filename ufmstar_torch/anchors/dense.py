@@ -117,12 +117,8 @@ class DenseEvidence(SavedState):
 
     needs_image = True
     HELD: ClassVar = {
-        "_size": "size",
-        "_K": "K",
-        "_depth": "depth",
-        "_contradicted": "contradicted",
-        "_baseline": "baseline",
-    }
+        "_size": "size", "_K": "K", "_depth": "depth", "_contradicted": "contradicted", "_baseline": "baseline",
+    }  # fmt: skip
     RANGES: ClassVar = {"_depth": POSITIVE}
     PREFIXES: ClassVar = {"_tracker": "corners_"}
 

@@ -29,17 +29,10 @@ class Memory(SavedState):
     """
 
     HELD: ClassVar = {
-        "_point": "landmark_point",
-        "_pose": "landmark_pose",
-        "_sigma": "landmark_sigma",
-        "_patch": "landmark_patch",
-        "_used": "landmark_used",
-        "_confirmed": "landmark_confirmed",
-        "_failed": "landmark_failed",
-        "_seen": "landmark_seen",
-        "frame": "landmark_frame",
-        "apart": "landmark_apart",
-    }
+        "_point": "landmark_point", "_pose": "landmark_pose", "_sigma": "landmark_sigma", "_patch": "landmark_patch",
+        "_used": "landmark_used", "_confirmed": "landmark_confirmed", "_failed": "landmark_failed",
+        "_seen": "landmark_seen", "frame": "landmark_frame", "apart": "landmark_apart",
+    }  # fmt: skip
 
     def __init__(self, count: int, fading: float) -> None:
         self._count, self._fading = count, fading
@@ -80,17 +73,14 @@ class Memory(SavedState):
         depth: float, measured: tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]],
         trusted: bool,
     ) -> tuple[int, int, float]:  # fmt: skip
-        """Confirm or refute landmarks by new measurements, and store these.
+        """Confirm or refute landmarks by new measurements, and store these; arguments as of
+        :func:`ufmstar_torch.anchors.kernels.landmarks.settle`.
 
         Args:
             sighted: of the image; its first n pixels, inverse depths and variances are overwritten by those with a
                 depth.
-            image: [H, W].
-            T_world_cam: [4, 4] [m].
-            K: [3, 3] [px].
             depth: median of the scene [m].
-            measured: of the searched pixels, as :func:`ufmstar_torch.anchors.kernels.landmarks.settle`.
-            trusted: False = poses and images contradict each other; no measurement is used.
+            measured: of the searched pixels: ``agreed``, ``accepted``, ``rho`` and ``variance``.
 
         Returns:
             n; the number of refuted landmarks; the new median of the scene's depth [m].

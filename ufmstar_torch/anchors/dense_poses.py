@@ -43,13 +43,9 @@ class PoseErrors(SavedState):
     """
 
     HELD: ClassVar = {
-        "_initialised": "pose_known",
-        "_variance": "pose_variance",
-        "_unexplained": "pose_left",
-        "_disagreement": "pose_disagreement",
-        "_camera": "camera_error",
-        "_covariance": "camera_covariance",
-    }
+        "_initialised": "pose_known", "_variance": "pose_variance", "_unexplained": "pose_left",
+        "_disagreement": "pose_disagreement", "_camera": "camera_error", "_covariance": "camera_covariance",
+    }  # fmt: skip
 
     def __init__(self, baselines: int, memory: float) -> None:
         self._baselines, self._memory = baselines, memory
@@ -84,19 +80,8 @@ class PoseErrors(SavedState):
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
         """Correct depths for errors of the poses and the camera, and update the estimates of these errors.
 
-        Args:
-            pixel: [M, 2] (u, v).
-            accepted: [M] bool, True for the pixels to use, each with a match in at least one view.
-            measured: their matches.
-            views: V keyframes.
-            K: [3, 3] from :meth:`camera`, as in the views [px].
-            depth: median of the scene [m].
-            trusted: False = poses and images contradict each other; the camera's errors are not updated.
-
-        Returns:
-            [M] inverse depths [1/m], their variances [1/m^2], and the largest squared distance of a match from its
-            epipolar line, over its variance, of all views, NaN where no view measures it. Of other pixels: 0, 0, NaN.
-        """
+        Arguments, with ``K`` from :meth:`camera`, and results ``rho``, ``variance`` and ``off`` as of
+        :func:`ufmstar_torch.anchors.kernels.poses.correct`; 0, 0 and NaN for pixels that are not accepted."""
         rho, variance, off_line = np.zeros(len(pixel)), np.zeros(len(pixel)), np.full(len(pixel), np.nan)
         errors = Errors(self._variance, self._unexplained, self._camera, self._covariance, self._disagreement)
         cameras = views, K, inverse_intrinsics(K), depth, trusted, self._memory

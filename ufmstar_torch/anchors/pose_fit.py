@@ -71,10 +71,9 @@ class Reading:
 UNCHANGED = Reading()
 _CONVENTIONS = tuple(Reading(poses=name) for name in CONVENTIONS if name != OURS)
 _OTHERS = (
-    *_CONVENTIONS,
-    *(Reading(late=frames) for frames in _LATE),
+    *_CONVENTIONS, *(Reading(late=frames) for frames in _LATE),
     *(Reading(factor=float(factor)) for factor in _FACTORS),
-)
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

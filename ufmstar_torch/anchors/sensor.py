@@ -107,25 +107,12 @@ def completed(sensor: Landmarks, others: Landmarks, depth: NDArray[np.float32], 
         depth: [H, W] of the sensor at the image's pixels, 0 = none [m].
         kind: of the sensor, as for :func:`sensor_landmarks`.
     """
-    if not len(others.depth):
-        return replace(
-            others,
-            pixel=sensor.pixel,
-            depth=sensor.depth,
-            variance=sensor.variance,
-            motion=None,
-            tracked=sensor.tracked + others.tracked,
-            shared=0.0,
-            scale=0.0,
-        )
-    height, width = depth.shape
-    column, row = (
-        np.rint(x).astype(int).clip(0, size - 1) for x, size in zip(others.pixel.T, (width, height), strict=True)
-    )
-    apart = ~(_spread((depth > 0).astype(np.float32)) > 0)[row, column]
+    if not len(others.depth):  # then its common errors concern no depth
+        others = replace(others, shared=0.0, scale=0.0)
+    row, column = _nearest_pixel(others.pixel, depth.shape)
     z = np.where(_away_from_edges(depth, kind), depth, np.float32(0))[row, column].astype(np.float64)
-    corrected = _without_common_errors(others, z, (height, width), kind)
-    apart &= ~_too_near(corrected, sensor)
+    corrected = _without_common_errors(others, z, depth.shape, kind)
+    apart = _none_around(depth > 0)[row, column] & ~_too_near(corrected, sensor)
     return replace(
         corrected,
         pixel=np.concatenate([sensor.pixel, corrected.pixel[apart]]),
@@ -200,9 +187,8 @@ class SensorMemory:
         inside, rho = row >= 0, (1 / z).astype(np.float32)
         nearest = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0).astype(np.float32)
         np.maximum.at(nearest, (row[inside], column[inside]), rho[inside])
-        hole = _spread((depth > 0).astype(np.float32)) == 0
-        shown = inside & hole[row, column] & (_NEARER * rho >= _spread(nearest, _AROUND)[row, column])
-        index = np.flatnonzero(shown)[::-1]  # the newest first
+        hidden = _NEARER * rho < _spread(nearest, _AROUND)[row, column]
+        index = np.flatnonzero(inside & _none_around(depth > 0)[row, column] & ~hidden)[::-1]  # the newest first
         cell = (_CELLS * row[index] // depth.shape[0]) * _CELLS + _CELLS * column[index] // depth.shape[1]
         return index[np.unique(cell, return_index=True)[1]]
 
@@ -211,12 +197,7 @@ class SensorMemory:
         retained: NDArray[np.bool_],
     ) -> None:  # fmt: skip
         """Store the landmarks away from holes behind the ``retained`` points."""
-        height, width = depth.shape
-        column, row = (
-            np.rint(x / step).astype(int).clip(0, size - 1)
-            for x, size in zip(sensor.pixel.T, (width, height), strict=True)
-        )
-        whole = (_spread((depth <= 0).astype(np.float32), _WHOLE) == 0)[row, column]
+        whole = _none_around(depth <= 0, _WHOLE)[_nearest_pixel(sensor.pixel / step, depth.shape)]
         ray = np.concatenate([sensor.pixel[whole], np.ones((int(whole.sum()), 1))], axis=1) @ np.linalg.inv(K).T
         point = (sensor.depth[whole, None] * ray) @ T[:3, :3].T + T[:3, 3]
         self._point = np.concatenate([self._point[retained], point])[-_STORED:]
@@ -227,12 +208,12 @@ def _too_near(others: Landmarks, sensor: Landmarks) -> NDArray[np.bool_]:
     """[N] True for uncertain landmarks of the images that are much nearer than the sensor's depth beside them."""
     if not len(sensor.depth):
         return np.zeros(len(others.depth), np.bool_)
-    beside = np.square(others.pixel[:, None] - sensor.pixel).sum(axis=-1).argmin(axis=1)
+    nearest = np.square(others.pixel[:, None] - sensor.pixel).sum(axis=-1).argmin(axis=1)
     uncertain = others.variance > np.square(_UNCERTAIN * others.depth)
-    return uncertain & (others.depth < _SHARE_BESIDE * sensor.depth[beside])
+    return uncertain & (others.depth < _SHARE_BESIDE * sensor.depth[nearest])
 
 
-def _without_common_errors(others: Landmarks, z: NDArray[np.float64], size: tuple[int, int], kind: str) -> Landmarks:
+def _without_common_errors(others: Landmarks, z: NDArray[np.float64], size: tuple[int, ...], kind: str) -> Landmarks:
     """The landmarks less b . x, with the variances after that (the module's equation).
 
     Args:
@@ -274,6 +255,17 @@ def _away_from_edges(depth: NDArray[np.float32], kind: str) -> NDArray[np.bool_]
     nearest = 1 / _spread(np.where(valid, 1 / np.where(valid, depth, 1), 1e-6).astype(np.float32))
     z = np.where(valid, depth, 0).astype(np.float64)
     return valid & (farthest - nearest <= _SHARE * z + _SIGMAS * sensor_sigma(z, kind))
+
+
+def _nearest_pixel(pixel: NDArray[np.float64], size: tuple[int, ...]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns [N] of the nearest pixels of a map [H, W] to the positions (u, v) ``pixel`` [N, 2]."""
+    column, row = np.rint(pixel).astype(np.int64).clip(0, (size[1] - 1, size[0] - 1)).T
+    return row, column
+
+
+def _none_around(mask: NDArray[np.bool_], side: int = _SIDE) -> NDArray[np.bool_]:
+    """[H, W] True where the mask is False in the whole square of ``side`` pixels."""
+    return _spread(mask.astype(np.float32), side) == 0
 
 
 def _spread(values: NDArray[np.float32], side: int = _SIDE) -> NDArray[np.float32]:

@@ -175,19 +175,14 @@ class LandmarkMap:
 
 def _read_text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     lines = [line.partition("#")[0].replace(",", " ").split() for line in read_text(path).splitlines()]
-    rows = [(number, columns) for number, columns in enumerate(lines, start=1) if columns]
-    if rows and not _is_number(rows[0][1][0]):
-        rows = rows[1:]  # names of the columns
-    for number, columns in rows:
-        if len(columns) != 4 or not all(map(_is_number, columns)):
-            raise ValueError(f"line {number} holds {' '.join(columns)!r}")
-    values = np.array([columns for _, columns in rows], dtype=np.float64).reshape(-1, 4)
+    named = next((number for number, words in enumerate(lines) if words), None)  # may name the columns
+    rows = []
+    for number, words in enumerate(lines):
+        try:
+            x, y, z, sigma = map(float, words)
+            rows.append([x, y, z, sigma])
+        except ValueError:
+            if words and (number != named or words[0][0] in "+-.0123456789"):
+                raise ValueError(f"line {number + 1} holds {' '.join(words)!r}") from None
+    values = np.array(rows, dtype=np.float64).reshape(-1, 4)
     return values[:, :3], values[:, 3]
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True

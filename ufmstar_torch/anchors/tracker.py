@@ -95,20 +95,10 @@ class LandmarkTracker(SavedState):
 
     needs_image = True
     HELD: ClassVar = {
-        "_gray": "gray",
-        "_K": "K",
-        "_pixel": "pixel",
-        "_seen": "seen",
-        "_input_poses": "given_poses",
-        "_poses": "poses",
-        "_number": "number",
-        "_noise": "noise",
-        "_line_error": "off",
-        "_newest_line_error": "off_now",
-        "baseline": "baseline",
-        "_depth": "depth",
-        "_depth_count": "depths_judged",
-    }
+        "_gray": "gray", "_K": "K", "_pixel": "pixel", "_seen": "seen", "_input_poses": "given_poses",
+        "_poses": "poses", "_number": "number", "_noise": "noise", "_line_error": "off",
+        "_newest_line_error": "off_now", "baseline": "baseline", "_depth": "depth", "_depth_count": "depths_judged",
+    }  # fmt: skip
     RANGES: ClassVar = {"_depth": POSITIVE}
 
     @check_kinds

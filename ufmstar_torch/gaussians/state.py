@@ -175,8 +175,8 @@ class UfMStarState:
         """A copy with some tensors replaced, by name."""
         named = {**vars(self), **changed}
         for group in ("by_component", "by_stream"):
-            if own := named[group]:
-                named[group] = {name: named.pop(name, value) for name, value in own.items()}
+            if values := named[group]:
+                named[group] = {name: named.pop(name, value) for name, value in values.items()}
         state = UfMStarState.__new__(UfMStarState)  # the constructor takes ten times as long
         vars(state).update(named)
         return state

@@ -7,12 +7,11 @@ value):
 
     log t_L <- log t_L + step (share of the frame's scores above t_L - (1 - L)) / slope,
 
-with step = max(rate, 1/(n + 3)). n counts frames with scores.
-``slope`` is the change of the share per unit of log t for a normal distribution, so that
-all levels adapt at the same rate; the constant rate forgets old frames. A frame with few scores takes a smaller step.
+with step = max(rate, 1/(n + 3)). n counts frames with scores; the constant rate forgets old ones. ``slope`` is the
+change of the share per unit of log t for a normal distribution, so that all levels adapt at the same rate.
 
-Anchors lie on textured surfaces, and a held-out one is farther from the others than most pixels are. Each score
-therefore has as weight the share of the image at its distance from evidence, relative to the share of the scores there.
+A held-out anchor is farther from the others than most pixels are. Each score therefore has as weight the share of the
+image at its distance from evidence, relative to the share of the scores there.
 At pixels the quantile is
 
     ``TRANSFER`` normal value (t_L/normal value)^``TRUST``.
@@ -37,7 +36,7 @@ from ufmstar_torch.posterior.running import LARGEST_FACTOR, LEAST_FACTOR
 _SLOPE: Final = tuple(2 * z * math.exp(-z * z / 2) / math.sqrt(2 * math.pi) for z in NORMAL)
 # Factors from the scores' quantiles to the pixels', fitted on tours (docs/measure_thresholds.py --fit), and exponent of
 # the scores' quantiles over the normal ones.
-TRANSFER: Final = (0.91, 1.11, 1.05)
+TRANSFER: Final = (0.88, 1.1, 1.02)
 TRUST: Final = 0.5
 RATE: Final = 0.1  # step of the adaptation in frames with many scores
 PRIOR: Final = 3.0  # number of frames that the start counts for

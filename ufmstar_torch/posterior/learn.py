@@ -126,9 +126,8 @@ def _add_held_out(scene, weight, left_out, ratios, rest, held_out, config, sums)
         unseen = away * ratios[UNSEEN]
         wide, factor = elsewhere_variance(config, around[i], unseen), inlier_factor(config, ratios, away)
         inlier, more_wrong = (
-            scale * (factor * (variance + noise + unseen) + steep[i]),
-            wrong_factor(config, away, scale),
-        )
+            scale * (factor * (variance + noise + unseen) + steep[i]), wrong_factor(config, away, scale),
+        )  # fmt: skip
         p = min(ratios[WRONG] * more_wrong, MOST_WRONG)
         z2 = error * error / inlier - (error + offset) ** 2 / (noise + wide)
         # infinite odds of the evidence's surface make 0

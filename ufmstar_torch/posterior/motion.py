@@ -30,6 +30,9 @@ w (``update``). The stated depth stays that of the evidence, which is right more
 exceeds one half; its variance is the second moment about it. P adds to the probability p of another surface:
 1 - (1 - p)(1 - P).
 
+The relative variance of a surface is at least ``LEAST``: what moves by a few hundredths of the camera's motion fails no
+test, and no ratio shows it.
+
 The constants are fitted to eight tours with six moving things each, FastDepth and the demo's network; ``_NEARER`` to
 six tours with and without things that move, FastDepth, an exact network and one that errs by another factor in every
 cube of space.
@@ -50,6 +53,8 @@ from ufmstar_torch.posterior.scene import AnchorRows, node_of
 _MOVING, _NEARER = 0.8, 0.05
 # Log odds of motion without evidence, share a, weight of the ratio's likelihood, and c_0.
 _PRIOR, _PASSING, _WEIGHT, _CERTAIN = -1.57, 0.12, 1.06, 0.15
+# Least variance over the squared depth, where images are tested for motion.
+LEAST = 0.02**2
 # Window of the mean: standard deviation and half width [nodes], and difference of log d at which a weight is halved.
 _SIGMA, _HALF, _CONTRAST = 1.5, 3, 0.3
 _WIDE = 2 * _HALF + 1

@@ -36,13 +36,10 @@ Variance over the squared depth at a node, with share = min(1, distance/reach):
   Gaussian window of width ``near``, and of one virtual anchor with z^2 = 1.
 - ``steepness`` is the variance of f over a node and its neighbours: a depth edge may be one node off in f.
 - m exceeds v where v is large, because the error of the depth is log-normal. Errors beyond a factor F (``farthest``) do
-  not count: without this limit, errors that never occur would decide the variance. The output ``inlier`` is m(v), at
-  most its 70 % quantile over the image.
-- p is the probability that the depth is of another surface than its evidence. Where the inliers' variance exceeds the
-  usual one of the image, a larger output ``outlier`` stands for the difference (``moments.divide``).
-- The ratios include the held-out anchors of this frame.
-
-In views that share little with the evidence, v has a part for the change of the network's scale (``overlap``).
+  not count: without this limit, errors that never occur would decide the variance.
+- p is the probability that the depth is of another surface than its evidence. The outputs ``inlier`` and ``outlier``
+  are m(v) and p, changed by ``moments.divide``.
+- In views that share little with the evidence, v has a part for the change of the network's scale (``overlap``).
 
 Before the first anchor the network may be off by any factor. The squared share of the variance of b's constant in that
 before the first anchor is ``unmeasured``: with it p is raised towards ``misscaled``, w towards ``widest``, and a_0
@@ -64,7 +61,7 @@ the certainty of every pixel.
 Anchors that matching has measured are wrong on surfaces that move. Those whose ratio to the prediction no surface of
 the stream has are left out (``motion.plausible``). With the probability P of ``motion``, the depth is that of the
 prediction at the scale of most surfaces: the variance becomes (1 - P) V + P tail, with the tail about their ratio
-instead of b . x, and p includes P.
+instead of b . x, and p includes P. V is at least ``motion.LEAST``.
 
 A stream whose anchors were all invalid so far has the network's depth with the variance of a node without evidence. A
 stream without anchors has UfM*'s output.
@@ -93,7 +90,7 @@ from ufmstar_torch.posterior.distribution import LEVELS
 from ufmstar_torch.posterior.field import at
 from ufmstar_torch.posterior.learn import sums_of
 from ufmstar_torch.posterior.moments import divide, second_moments
-from ufmstar_torch.posterior.motion import in_image, plausible, probability, surfaces, tested, tests_at
+from ufmstar_torch.posterior.motion import LEAST, in_image, plausible, probability, surfaces, tested, tests_at
 from ufmstar_torch.posterior.overlap import confirm, scale_elsewhere
 from ufmstar_torch.posterior.running import (
     BETWEEN,
@@ -347,6 +344,7 @@ def _add_motion(nodes, x, mean, c, wide, motion, beyond, size, scene, b, ratios,
             tail = second_moments(config, nodes[2, i], 1.0, e[i], wide[i])[0]
             nodes[2, i] = (1 - P[i]) * nodes[2, i] + P[i] * tail
             nodes[4, i] = 1 - (1 - nodes[4, i]) * (1 - P[i])
+        nodes[2, i] = max(nodes[2, i], LEAST)
 
 
 @kernel

@@ -35,11 +35,8 @@ def compare(pose, newest, count, T, K, K_inverse, size, depth, baselines, views,
     ring = len(pose)
     distance, chosen = empty(ring, np.float64), empty(len(baselines), np.float64)
     world, K_R, A, origin = (
-        empty(3, np.float64),
-        empty((3, 3), np.float64),
-        empty((3, 3), np.float64),
-        empty(3, np.float64),
-    )
+        empty(3, np.float64), empty((3, 3), np.float64), empty((3, 3), np.float64), empty(3, np.float64),
+    )  # fmt: skip
     for i in range(ring):
         square = 0.0
         for j in range(3):

@@ -272,7 +272,7 @@ def settle(landmarks, frame, image, T, K_inverse, sighted, agreed, accepted, rho
     Returns:
         K, and the number of refuted landmarks.
     """
-    landmark_count, count, total = len(sighted.slot), len(landmarks.used), len(sighted.rho)
+    landmark_count, total = len(sighted.slot), len(sighted.rho)
     before, spread = empty(total, np.float64), empty(total, np.float64)
     measured, storable, valid = empty(total, np.bool_), empty(total, np.bool_), empty(total, np.bool_)
     squares, variances, values = empty(total, np.float64), empty(total, np.float64), empty(total, np.float64)
@@ -314,22 +314,28 @@ def settle(landmarks, frame, image, T, K_inverse, sighted, agreed, accepted, rho
             _refute(landmarks, slot)
     if compared >= _ENOUGH:
         numbers[0] = memory * apart + (1 - memory) * _beyond(squares[:compared], variances[:compared], values)
-    free = 0
     for n in range(landmark_count, total):
         valid[n] = measured[n]
+    _store_new(landmarks, frame, flat, width, height, sighted, measured, storable, T, K_inverse, window)
+    found = _move_up(sighted, valid, values)
+    if found >= _ENOUGH:
+        numbers[1] *= np.exp((1 - memory) * np.log(median(values, found) / numbers[1]))
+    return found, refuted
+
+
+@reordered_leaf
+def _store_new(landmarks, frame, flat, width, height, sighted, measured, storable, T, K_inverse, window):
+    """Store measured pixels without a landmark in free slots, and then in those of the oldest landmarks."""
+    free, count = 0, len(landmarks.used)
+    for n in range(len(sighted.slot), len(measured)):
         if not (measured[n] and storable[n]):
             continue
         while free < count and landmarks.used[free]:
             free += 1
         slot = free if free < count else _oldest(landmarks)
-        if free == count and landmarks.seen[slot] == frame:
-            continue
-        landmarks.confirmed[slot] = 0
-        _store(landmarks, slot, frame, flat, width, height, sighted, n, T, K_inverse, window)
-    found = _move_up(sighted, valid, values)
-    if found >= _ENOUGH:
-        numbers[1] *= np.exp((1 - memory) * np.log(median(values, found) / numbers[1]))
-    return found, refuted
+        if free < count or landmarks.seen[slot] != frame:
+            landmarks.confirmed[slot] = 0
+            _store(landmarks, slot, frame, flat, width, height, sighted, n, T, K_inverse, window)
 
 
 @leaf

@@ -41,10 +41,8 @@ def check_anchor_values(
     values = [array(x) for x in (pixel, depth, variance)]
     used = np.ones((streams, n), np.bool_) if mask is None else array(mask)
     position, valid, index = (
-        np.zeros((streams, n, 2)),
-        np.zeros((streams, n), np.bool_),
-        np.zeros((streams, n), np.int64),
-    )
+        np.zeros((streams, n, 2)), np.zeros((streams, n), np.bool_), np.zeros((streams, n), np.int64),
+    )  # fmt: skip
     (predicted, out_depth), out_variance = np.ones((2, streams, n)), np.zeros((streams, n))
     rejected, contradiction = np.zeros(streams, np.int64), np.zeros(streams)
     outputs = position, index, predicted, out_depth, out_variance, valid, rejected, contradiction

@@ -71,10 +71,8 @@ def _tracks(pixel, seen, T, K, damping, steps, point, covariance, error, ahead):
     centre, origin = empty((views, 3), np.float64), empty(3, np.float64)
     _cameras(T, K, to_image, to_ray, centre, origin)
     obs, work, inverse = (
-        empty((views, 3 * _LANES), np.float64),
-        empty(14 * _LANES, np.float64),
-        empty((3, 3), np.float64),
-    )
+        empty((views, 3 * _LANES), np.float64), empty(14 * _LANES, np.float64), empty((3, 3), np.float64),
+    )  # fmt: skip
     for first in range(0, seen.shape[0], _LANES):
         count = min(_LANES, seen.shape[0] - first)
         for w in range(views):
