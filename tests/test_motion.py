@@ -37,14 +37,6 @@ def searches(failing, seed=0):
 # --- tests in images -----------------------------------------------------------------------------------------
 
 
-def test_a_region_whose_tests_fail_moves_and_one_whose_tests_pass_does_not():
-    ratios = MotionTests(0.8).log_ratios(searches(4), SHAPE, CELL)
-    assert ratios.shape == (12, 16)
-    assert ratios[:, 0].min() > 0
-    assert ratios[:, 8:].max() < 0
-    assert (np.diff(ratios[6, 1:7]) < 0).all(), "the window spreads each test over its neighbours"
-
-
 def test_the_log_ratio_is_the_weighted_sum_of_the_tests_log_ratios():
     tests = MotionTests(0.8)
     pixel = np.array([[45.0, 45.0], [45.0, 45.0], [45.0, 45.0]])
@@ -64,11 +56,6 @@ def test_where_tests_fail_everywhere_nothing_moves_more_than_elsewhere():
     for seed in range(10):
         ratios = tests.log_ratios(searches(16, seed), SHAPE, CELL)
     assert ratios.max() < 0.2
-
-
-def test_without_a_test_nothing_is_known():
-    nothing = MotionTest(SEARCH, np.zeros((0, 2)), np.zeros(0, bool), np.zeros(0, bool))
-    assert not MotionTests(0.8).log_ratios([nothing], SHAPE, CELL).any()
 
 
 def test_the_state_of_the_tests_goes_on_to_the_bit():

@@ -93,8 +93,9 @@ def check_scale(name: str, scale: float | None) -> None:
 
 def with_camera_files(options: Options, folder: Path) -> Options:
     """The options with the cameras of files in a sequence's folder, which win over a layout's default cameras."""
-    files = {"intrinsics": camera_file(folder, FILES), "depth_intrinsics": camera_file(folder, DEPTH_FILES)}
-    return replace(options, **{name: file for name, file in files.items() if file and getattr(options, name) is None})
+    color = camera_file(folder, FILES) if options.intrinsics is None else options.intrinsics
+    depth = camera_file(folder, DEPTH_FILES) if options.depth_intrinsics is None else options.depth_intrinsics
+    return replace(options, intrinsics=color, depth_intrinsics=depth)
 
 
 def resolve(root: Path, name: str | Path) -> Path:

@@ -133,11 +133,8 @@ class LandmarkMap:
     def update(
         self, image: NDArray[np.uint8] | None, T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
     ) -> Landmarks:
-        """The landmarks in an image; without an image, those less than 80 degrees off the optical axis.
-
-        Raises:
-            ValueError: a pose or intrinsics of another shape, or not finite.
-        """
+        """The landmarks in an image; without an image, those less than 80 degrees off the optical axis. Raises
+        ValueError: a pose or intrinsics of another shape, or not finite."""
         T, K = np.asarray(T_world_cam, dtype=np.float64), np.asarray(K, dtype=np.float64)
         if T.shape != (4, 4) or K.shape != (3, 3) or not (np.isfinite(T).all() and np.isfinite(K).all()):
             raise ValueError("T_world_cam must be a finite 4x4 matrix and K a finite 3x3 matrix")
@@ -164,11 +161,7 @@ class LandmarkMap:
         return {}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Do nothing: a map has no state.
-
-        Raises:
-            ValueError: ``state`` is that of another source.
-        """
+        """Do nothing: a map has no state. Raises ValueError: ``state`` is that of another source."""
         if state:
             raise ValueError(f"state must be empty for a map of landmarks, got {sorted(state)}")
 

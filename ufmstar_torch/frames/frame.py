@@ -104,16 +104,9 @@ class FrameInput:
 
 
 def check_values(
-    depth: Tensor,
-    pose: Tensor,
-    intrinsics: Tensor,
-    aleatoric: Tensor | None,
-    epistemic: Tensor | None,
-    mask: Tensor | None,
-    *,
-    rotation_tolerance: float,
-    max_depth: float,
-) -> FrameInput:
+    depth: Tensor, pose: Tensor, intrinsics: Tensor, aleatoric: Tensor | None, epistemic: Tensor | None,
+    mask: Tensor | None, *, rotation_tolerance: float, max_depth: float,
+) -> FrameInput:  # fmt: skip
     """Check a frame's values; the caller has checked shapes and dtypes. All maps have one dtype and device.
 
     Args:
@@ -152,20 +145,11 @@ CheckKernel = Callable[..., FrameInput]  # as ``check_values``
 
 
 def check_frame(
-    depth: Tensor,
-    pose: CameraLike,
-    intrinsics: CameraLike,
-    aleatoric: Array | None,
-    epistemic: Array | None,
-    valid: Array | None,
-    *,
-    variances_in_h: bool = False,
-    rotation_tolerance: float,
-    max_depth: float = DEPTH_RANGE[1],
-    member: int | Tensor = 0,
-    informative: Tensor | None = None,
+    depth: Tensor, pose: CameraLike, intrinsics: CameraLike, aleatoric: Array | None, epistemic: Array | None,
+    valid: Array | None, *, variances_in_h: bool = False, rotation_tolerance: float,
+    max_depth: float = DEPTH_RANGE[1], member: int | Tensor = 0, informative: Tensor | None = None,
     kernel: CheckKernel = check_values,
-) -> FrameInput:
+) -> FrameInput:  # fmt: skip
     """Check and normalise one frame (shapes as in :meth:`ufmstar_torch.UfMStar.forward`).
 
     Args:

@@ -70,16 +70,8 @@ _LARGE = 1e100  # limit of a product: a further factor stays in range
 
 @part
 def plausible(anchors, frames, ratios, size, grid, config):
-    """The anchors whose ratio a surface that stands still may have, and [R C] the share of the others at every node.
-
-    Args:
-        anchors: :class:`~ufmstar_torch.posterior.scene.AnchorRows`.
-        frames: number of frames with anchors before.
-        ratios: up to the frame before.
-        size: H and W.
-        grid: of the frame.
-        config: of the posterior.
-    """
+    """The :class:`AnchorRows` whose ratio a surface that stands still may have, and [R C] the share of the others at
+    every node. ``frames`` with anchors, and the ``ratios``, are those before; ``size`` is H and W."""
     valid, n, far, total = empty(anchors.valid.size, np.bool_), grid.log_depth.size, 0, 0
     beyond, count = empty(n, np.float64), empty(n, np.float64)
     for i in range(n):
@@ -105,17 +97,11 @@ def plausible(anchors, frames, ratios, size, grid, config):
 
 @part
 def surfaces(scene, b, memory, priors, ratios, config, sums):
-    """The constant c of a frame; writes the sums [2, R] for the ratios "centre" and "between" (``running``).
+    """The constant c of a frame with the coefficients ``b`` [4]; writes the ``sums`` [2, R] for the ratios "centre" and
+    "between" (``running``). ``memory`` and ``ratios`` are those before.
 
     Each iteration computes c for s by a step of iterated reweighting, and s for c. The first starts at the most
     probable of some quantiles of y - b_u u - b_v v.
-
-    Args:
-        scene: of the frame.
-        b: [4] coefficients of the frame.
-        memory, priors, ratios: up to the frame before.
-        config: of the posterior.
-        sums: changed.
     """
     nu, s2, mean = config.degrees_of_freedom, ratios[BETWEEN], ratios[CENTRE]
     variance = _CHANGE**2 if memory.frames[0] > 0 else config.prior_sigma**2

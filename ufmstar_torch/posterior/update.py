@@ -321,18 +321,9 @@ def _nodes(scene, field, left_out, away, unconfirmed, ratios, config):
 
 @part
 def _add_motion(nodes, x, mean, c, wide, motion, beyond, size, scene, b, ratios, config):
-    """Add the probability of motion to the ``nodes`` [6, n].
-
-    Args:
-        nodes, x, mean, wide: from :func:`_nodes`; the first changes.
-        c: constant of most surfaces.
-        motion: as in :func:`of_frame`.
-        beyond: [n] from ``motion.plausible``.
-        size: H and W.
-        scene: of the frame.
-        b: [4] coefficients.
-        ratios: up to this frame.
-        config: of the posterior.
+    """Add the probability of motion to the ``nodes`` [6, n]. These, ``x``, ``mean``, ``wide`` are from :func:`_nodes`.
+    ``c``: constant of most surfaces; ``motion`` as in :func:`of_frame`; ``beyond`` [n] from ``motion.plausible``;
+    ``size``: H and W; ``b`` [4]: coefficients; ``ratios`` up to this frame.
     """
     grid, e = scene.grid, empty(mean.size, np.float64)
     for i in range(e.size):

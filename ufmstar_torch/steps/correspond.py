@@ -42,12 +42,9 @@ class Correspondence:
 
 
 def correspond(
-    previous_cam: GaussianMixture,
-    current_cam: GaussianMixture,
-    intrinsics: Tensor,
-    size: tuple[int, int],
+    previous_cam: GaussianMixture, current_cam: GaussianMixture, intrinsics: Tensor, size: tuple[int, int],
     config: UfMStarConfig,
-) -> Correspondence:
+) -> Correspondence:  # fmt: skip
     """Match the current image's Gaussians with those of earlier views in the image plane.
 
     A component is a candidate where its mean lies beyond ``config.near_plane`` and projects into the image. k

@@ -40,14 +40,9 @@ LEAST = 0.01
 
 
 def fuse(
-    mixture: GaussianMixture,
-    current: GaussianMixture,
-    pairs: Correspondence,
-    view: Tensor,
-    config: UfMStarConfig,
-    *,
-    rounds: int | None = None,
-) -> GaussianMixture:
+    mixture: GaussianMixture, current: GaussianMixture, pairs: Correspondence, view: Tensor, config: UfMStarConfig,
+    *, rounds: int | None = None,
+) -> GaussianMixture:  # fmt: skip
     """Fuse every matched pair into the mixture.
 
     For each k the matched c are applied one after the other in increasing index (SPGF's emission order);

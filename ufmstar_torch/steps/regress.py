@@ -88,13 +88,9 @@ def _pairs_at_a_time(device: torch.device, size: int) -> int:
 
 
 def regress_image(
-    mixture_cam: GaussianMixture,
-    depth: Tensor,
-    intrinsics: Tensor,
-    valid: Tensor,
-    config: UfMStarConfig,
+    mixture_cam: GaussianMixture, depth: Tensor, intrinsics: Tensor, valid: Tensor, config: UfMStarConfig,
     pixels: Tensor | None = None,
-) -> Regression:
+) -> Regression:  # fmt: skip
     """:func:`regress` at every pixel of a depth map, [B, H, W] and [B, H, W, F], or at some, [B, n] and [B, n, F].
 
     Args:

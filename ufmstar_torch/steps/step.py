@@ -73,26 +73,15 @@ class Step(Protocol):
     """Steps 2 to 5 for one image; see :func:`step`."""
 
     def __call__(
-        self,
-        state: UfMStarState,
-        frame: FrameInput,
-        config: UfMStarConfig,
-        *,
-        pixels: Tensor | None = None,
+        self, state: UfMStarState, frame: FrameInput, config: UfMStarConfig, *, pixels: Tensor | None = None,
         observer: StepObserver | None = None,
-    ) -> tuple[UfMStarState, UncertaintyOutput]: ...
+    ) -> tuple[UfMStarState, UncertaintyOutput]: ...  # fmt: skip
 
 
 def step(
-    state: UfMStarState,
-    frame: FrameInput,
-    config: UfMStarConfig,
-    *,
-    pixels: Tensor | None = None,
-    observer: StepObserver | None = None,
-    kernels: Kernels = REFERENCE,
-    grow: bool = True,
-) -> tuple[UfMStarState, UncertaintyOutput]:
+    state: UfMStarState, frame: FrameInput, config: UfMStarConfig, *, pixels: Tensor | None = None,
+    observer: StepObserver | None = None, kernels: Kernels = REFERENCE, grow: bool = True,
+) -> tuple[UfMStarState, UncertaintyOutput]:  # fmt: skip
     """Segment, correspond, fuse, regress (section "Uncertainty from Motion*", steps 2 to 5).
 
     Args:
@@ -161,12 +150,9 @@ def step(
 
 
 def step_output(
-    frame: FrameInput,
-    maps: dict[str, Tensor],
-    residual: Tensor | None,
-    counts: Mapping[str, Tensor],
+    frame: FrameInput, maps: dict[str, Tensor], residual: Tensor | None, counts: Mapping[str, Tensor],
     learnt: anchors.Learnt | None = None,
-) -> UncertaintyOutput:
+) -> UncertaintyOutput:  # fmt: skip
     """The output of a step from its maps, and from the check of the frame and its anchors.
 
     Args:

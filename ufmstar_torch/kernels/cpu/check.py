@@ -25,16 +25,9 @@ _NO_MASK, _NO_LIMITS = np.empty((0, 0, 0), np.bool_), (0.0, 0.0, 0.0)
 
 
 def check_values(
-    depth: Tensor,
-    pose: Tensor,
-    intrinsics: Tensor,
-    aleatoric: Tensor | None,
-    epistemic: Tensor | None,
-    mask: Tensor | None,
-    *,
-    rotation_tolerance: float,
-    max_depth: float,
-) -> FrameInput:
+    depth: Tensor, pose: Tensor, intrinsics: Tensor, aleatoric: Tensor | None, epistemic: Tensor | None,
+    mask: Tensor | None, *, rotation_tolerance: float, max_depth: float
+) -> FrameInput:  # fmt: skip
     """As :func:`ufmstar_torch.frames.frame.check_values`, for the CPU. Depth that is valid everywhere is not copied."""
     z, wanted = array(depth), _NO_MASK if mask is None else array(mask)
     allowed, size = wanted, z.shape[1:]

@@ -46,17 +46,11 @@ def views_of(
 
 
 def regress_maps(
-    seen: Sequence[Seen],
-    depth: Reals,
-    intrinsics: NDArray[np.float64],
-    config: UfMStarConfig,
-    pixels: NDArray[np.int64] | None = None,
-    *,
-    views: Sequence[View] | None = None,
-    shift: NDArray[np.float64] | None = None,
-    informative: NDArray[np.bool_] | None = None,
+    seen: Sequence[Seen], depth: Reals, intrinsics: NDArray[np.float64], config: UfMStarConfig,
+    pixels: NDArray[np.int64] | None = None, *, views: Sequence[View] | None = None,
+    shift: NDArray[np.float64] | None = None, informative: NDArray[np.bool_] | None = None,
     smoothed: Reals | None = None,
-) -> tuple[Reals, Reals, Reals | None, list[int]]:
+) -> tuple[Reals, Reals, Reals | None, list[int]]:  # fmt: skip
     """The regression at the pixels of depth maps that are positive exactly where they are valid, M where it was not
     measured (``steps.regress.set_unmeasured``), and the moving average (``steps.regress.smooth``).
 
@@ -95,14 +89,10 @@ def at_pixels(values: Reals, pixels: NDArray[np.int64]) -> Reals:
 
 
 def regression(
-    seen: Sequence[Seen],
-    depth: Reals,
-    intrinsics: NDArray[np.float64],
-    config: UfMStarConfig,
-    pixels: NDArray[np.int64] | None = None,
-    views: Sequence[View] | None = None,
+    seen: Sequence[Seen], depth: Reals, intrinsics: NDArray[np.float64], config: UfMStarConfig,
+    pixels: NDArray[np.int64] | None = None, views: Sequence[View] | None = None,
     shift: NDArray[np.float64] | None = None,
-) -> tuple[Reals, Reals]:
+) -> tuple[Reals, Reals]:  # fmt: skip
     """M [B, H, W] or [B, n], and the features [B, F, ...], as those of
     :func:`ufmstar_torch.steps.regress.regress_image`, over the components in view; arguments as :func:`regress_maps`.
     """

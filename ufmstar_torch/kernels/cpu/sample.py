@@ -45,16 +45,14 @@ def sample_summary(
 ) -> tuple[list[SampleStatistics], Tensor, Tensor]:
     """As :func:`ufmstar_torch.steps.sample.sample_summary`, without gradients: the same bits but for the
     standard error."""
-    rows: dict[int, int] = {}  # of each map in the table: V may be M
-    for value in maps:
-        rows.setdefault(id(value), len(rows))
-    values = [array(value) for value in maps]
-    table = np.empty((len(rows), *used.shape), np.result_type(*values))
-    for value, one in zip(maps, values, strict=True):
-        table[rows[id(value)]] = one
+    distinct = {id(value): array(value) for value in maps}  # V may be M
+    table = np.empty((len(distinct), *used.shape), np.result_type(*distinct.values()))
+    for m, value in enumerate(distinct.values()):
+        table[m] = value
     *found, error, share = _summary(table, *arrays(used, measured, valid_pixels))
-    statistics = [SampleStatistics(*map(torch.from_numpy, (*row, n))) for row, n in zip(*found, strict=True)]
-    return [statistics[rows[id(value)]] for value in maps], torch.from_numpy(error), torch.from_numpy(share)
+    each = [SampleStatistics(*map(torch.from_numpy, (*row, n))) for row, n in zip(*found, strict=True)]
+    by_map = dict(zip(distinct, each, strict=True))
+    return [by_map[id(value)] for value in maps], torch.from_numpy(error), torch.from_numpy(share)
 
 
 @kernel

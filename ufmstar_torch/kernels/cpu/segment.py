@@ -57,12 +57,9 @@ def segment(
 
 
 def gaussians(
-    z: Maps,
-    intrinsics: NDArray[np.float64],
-    config: SPGFConfig,
-    features: Maps | None = None,
+    z: Maps, intrinsics: NDArray[np.float64], config: SPGFConfig, features: Maps | None = None,
     floor: tuple[float, float, float] = _NO_FLOOR,
-) -> tuple[tuple[Maps, ...], Callable[[], NDArray[np.int64]]]:
+) -> tuple[tuple[Maps, ...], Callable[[], NDArray[np.int64]]]:  # fmt: skip
     """The fields of the mixture of :func:`segment`, float64 with the values of the depth's dtype, and a function that
     computes the labels. ``floor``: near plane, variance of a pixel and share of the trace, below which no eigenvalue of
     a covariance is (``steps.step``)."""

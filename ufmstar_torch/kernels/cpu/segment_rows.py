@@ -135,17 +135,9 @@ def _scanline(
                 continue
             if newest.n > 0:
                 front, waiting, done = _push(
-                    newest,
-                    older,
-                    front,
-                    waiting,
-                    ring_size,
-                    limits.sparse,
-                    segments,
-                    segments_int,
-                    done,
+                    newest, older, front, waiting, ring_size, limits.sparse, segments, segments_int, done,
                     finished_index,
-                )
+                )  # fmt: skip
             started += 1
             newest = _fresh(u, k, started, x[u], z)
         run = _begun(runs, first_run, run, u, started)

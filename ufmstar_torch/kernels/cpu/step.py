@@ -45,13 +45,9 @@ _Match = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_], int]  
 
 
 def step(
-    state: UfMStarState,
-    frame: FrameInput,
-    config: UfMStarConfig,
-    *,
-    pixels: Tensor | None = None,
+    state: UfMStarState, frame: FrameInput, config: UfMStarConfig, *, pixels: Tensor | None = None,
     observer: StepObserver | None = None,
-) -> tuple[UfMStarState, UncertaintyOutput]:
+) -> tuple[UfMStarState, UncertaintyOutput]:  # fmt: skip
     """As :func:`ufmstar_torch.steps.step.step`, for CPU tensors."""
     stage = unobserved if observer is None else observer.stage
     depth, K, *rest = arrays(frame.depth, frame.intrinsics, frame.fault, frame.T_world_cam)
@@ -98,10 +94,8 @@ def step(
         residual = residual if shift is not None else learnt.residual(residual)
         changed |= learnt.tensors()
     counted = dict(zip(COUNTS, map(torch.from_numpy, counts), strict=True))
-    maps |= {"depth": frame.depth, "valid": frame.valid}
-    if at is not None:
-        z = at_pixels(depth, at)
-        maps |= {"depth": torch.from_numpy(z), "valid": torch.from_numpy(z > 0)}
+    z = None if at is None else at_pixels(depth, at)
+    maps["depth"], maps["valid"] = (frame.depth, frame.valid) if z is None else map(torch.from_numpy, (z, z > 0))
     out = step_output(frame, maps, residual, counted, learnt)
     stage("average")
     return state.with_tensors(changed), out

@@ -23,16 +23,9 @@ from ufmstar_torch.kernels.triton.matrices import exact
 
 
 def check_values(
-    depth: Tensor,
-    pose: Tensor,
-    intrinsics: Tensor,
-    aleatoric: Tensor | None,
-    epistemic: Tensor | None,
-    mask: Tensor | None,
-    *,
-    rotation_tolerance: float,
-    max_depth: float,
-) -> FrameInput:
+    depth: Tensor, pose: Tensor, intrinsics: Tensor, aleatoric: Tensor | None, epistemic: Tensor | None,
+    mask: Tensor | None, *, rotation_tolerance: float, max_depth: float,
+) -> FrameInput:  # fmt: skip
     """As :func:`ufmstar_torch.frames.frame.check_values`."""
     depth = depth.contiguous()
     b, height, width = depth.shape
