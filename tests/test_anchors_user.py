@@ -64,10 +64,7 @@ def test_what_cannot_be_seen_or_makes_no_sense_is_not_valid(point, variance):
     assert result.depth[0, 1] == result.variance[0, 1] == 0
 
 
-def test_the_mask_and_padding_are_respected():
-    points, spread = torch.tensor([[at(10.0, 10.0, 2.0)] * 3]), torch.zeros(1, 3)
-    mask = torch.tensor([[True, False, True]])
-    assert torch.equal(Anchors.from_points(points, spread, K, (H, W), mask).valid, mask)
+def test_no_point_is_no_anchor():
     assert Anchors.from_points(torch.zeros(2, 0, 3), torch.zeros(2, 0), K, (H, W)).valid.shape == (2, 0)
 
 
@@ -79,8 +76,6 @@ def test_the_mask_and_padding_are_respected():
         ({"points_cam": np.zeros((1, 4, 3))}, TypeError, "points_cam must be a dense torch.Tensor, got ndarray"),
         ({"variance": torch.zeros(4)}, ValueError, r"variance must have shape \(1, 4\), got"),
         ({"intrinsics": torch.zeros(2, 3, 3)}, ValueError, r"intrinsics must have shape \(3, 3\) or \(1, 3, 3\)"),
-        ({"valid": torch.ones(1, 4)}, TypeError, "valid must be a torch.bool tensor"),
-        ({"valid": torch.ones(1, 3).bool()}, ValueError, r"valid must have shape \(1, 4\)"),
     ],
 )
 def test_wrong_kinds_and_shapes_are_named(change, error, told):

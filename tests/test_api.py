@@ -51,10 +51,10 @@ def test_public_names():
 def test_signatures():
     observation = ["depth", "pose", "intrinsics", "aleatoric", "epistemic", "valid"]
     assert names(UfMStar.__init__) == ["config", "recalibration", "dtype", "device"]
-    view, sampled = ["member", "informative"], ["pixels", "fraction", "seed", "average"]
+    view, sampled = ["member", "informative"], ["pixels", "fraction", "seed"]
     assert names(UfMStar.forward) == [*observation, *view, "anchors", "confidence"]
     assert names(UfMStar.mean_uncertainty) == [*observation, *view, *sampled, "anchors", "confidence"]
-    assert names(UfMStar.query) == ["points", "frame"]
+    assert names(UfMStar.query) == ["points"]
     assert names(UfMStar.reset) == ["streams", "keep_evidence"]
     made_of = [
         "networks",
@@ -71,7 +71,7 @@ def test_signatures():
     assert names(UncertainDepth.__init__) == made_of
     images = ["image", "pose", "intrinsics", "valid", "anchors"]
     assert names(UncertainDepth.forward) == images
-    assert names(UncertainDepth.mean_uncertainty) == [*images, "pixels", "fraction", "seed", "average"]
+    assert names(UncertainDepth.mean_uncertainty) == [*images, "pixels", "fraction", "seed"]
 
 
 def test_few_settings():

@@ -128,7 +128,7 @@ def test_state_is_saved_restored_and_loaded_as_a_whole():
         ufm(depth, T, K, anchors=anchors, confidence=sigma.float())
     other.load_state_dict(ufm.state_dict())
     depth, sigma, anchors, T, _ = inputs[-1]
-    sample = ufm.mean_uncertainty(depth, T, K, confidence=sigma.float(), average=False, fraction=1.0)
+    sample = ufm.mean_uncertainty(depth, T, K, confidence=sigma.float(), fraction=1.0)
     ufm.load_state_dict(other.state_dict())
     assert sample.mean > 0
     last = [one(depth, T, K, anchors=anchors, confidence=sigma.float()).variance for one in (ufm, other)]

@@ -98,7 +98,6 @@ REFUSED = {
     "points of other streams": (lambda: seen().query(torch.zeros(2, 5, 3)), ValueError, r"points must be \[1, N, 3\]"),
     "points without streams": (lambda: seen().query(torch.zeros(5, 3)), ValueError, r"points must be \[1, N, 3\]"),
     "points in the plane": (lambda: seen().query(torch.zeros(1, 5, 2)), ValueError, r"points must be \[1, N, 3\]"),
-    "points of another frame": (lambda: seen().query(torch.zeros(1, 5, 3), "camera"), ValueError, "frame must be"),
     "points of no mixture": (lambda: UfMStar().query(torch.zeros(1, 5, 3)), ValueError, "query needs a mixture"),
     "an image of one channel": (lambda: model(IMAGE[:, :1]), ValueError, r"image must be \[B, 3, H, W\]"),
     "a tensor with channels last": (lambda: model(torch.tensor(PICTURE)[None]), ValueError, "image .*permute"),
@@ -213,7 +212,7 @@ WRONG = (
 )
 GOOD = {"depth": DEPTH, "pose": POSE, "intrinsics": K}
 IMAGE_GOOD = {"image": torch.zeros(1, 3, H, W), "pose": POSE, "intrinsics": K}
-SAMPLE = {"pixels": None, "fraction": None, "seed": 0, "average": False}
+SAMPLE = {"pixels": None, "fraction": None, "seed": 0}
 
 
 def network_of_zeros():
@@ -226,7 +225,7 @@ PUBLIC = {
         lambda **k: seen()(**k), GOOD | dict.fromkeys(("aleatoric", "epistemic", "valid")),
     ),
     "mean_uncertainty": (lambda **k: seen().mean_uncertainty(**k), GOOD | SAMPLE),
-    "query": (lambda **k: seen().query(**k), {"points": torch.zeros(1, 1, 3), "frame": "world"}),
+    "query": (lambda **k: seen().query(**k), {"points": torch.zeros(1, 1, 3)}),
     "reset": (lambda **k: seen().reset(**k), {"streams": None, "keep_evidence": False}),
     "warm_up": (lambda **k: seen().warm_up(**k), {"size": (H, W), "streams": 1, "progress": None}),
     "UncertainDepth": (

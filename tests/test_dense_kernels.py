@@ -17,7 +17,7 @@ from ufmstar_torch.kernels.compile_cpu import reordered
 from ufmstar_torch.kernels.cpu.vectors import LANES
 
 K = np.array([[90.0, 0, 47.5], [0, 90.0, 35.5], [0, 0, 1]])
-SEARCH = Search(start=0.5, low=-0.01, high=2.0, sigmas=3.5, least_score=0.85, rival=1.2, match=1.0)
+SEARCH = Search(start=0.5, low=-0.01, high=2.0, sigmas=3.5, least_score=0.85, rival=1.2)
 
 
 def plane(seed, T, z=2.0, shape=(72, 96)):
@@ -63,7 +63,7 @@ def test_one_view_agrees_with_the_loops(scene):
     image, pixel, others = scene
     for k in range(3):
         view = views(others[k : k + 1], MOVED[k : k + 1], np.eye(4))
-        search = Search(0.5, 0.4, 0.6, 3.5, 0.85, 1.0, 1.0)
+        search = Search(0.5, 0.4, 0.6, 3.5, 0.85, 1.0)
         result = measure(image, pixel, view, search)
         chosen = np.flatnonzero(result.agreed == 1)[:6]
         assert len(chosen) == 6
@@ -78,7 +78,7 @@ def test_one_view_agrees_with_the_loops(scene):
 def test_the_centre_of_the_texture_agrees_with_the_loops(scene):
     image, pixel, others = scene
     view = views(others[1:2], MOVED[1:2], np.eye(4))
-    search = Search(0.5, 0.4, 0.6, 3.5, 0.85, 1.0, 1.0)
+    search = Search(0.5, 0.4, 0.6, 3.5, 0.85, 1.0)
     result = measure(image, pixel, view, search)
     chosen = np.flatnonzero(result.agreed == 1)[:8]
     expected = [oracle_dense.centre_of_texture(image, pixel[n], 0.5, view.H[0], view.b[0]) for n in chosen]
@@ -111,10 +111,10 @@ def test_a_plane_is_where_it_is_and_as_uncertain_as_stated(scene):
 def test_the_variance_is_the_smallest_of_the_views_and_follows_the_poses_noise(scene):
     image, pixel, others = scene
     each = [
-        measure(image, pixel, views([o], [T], np.eye(4)), Search(0.5, 0.4, 0.6, 3.5, 0.85, 1.0, 1.0))
+        measure(image, pixel, views([o], [T], np.eye(4)), Search(0.5, 0.4, 0.6, 3.5, 0.85, 1.0))
         for o, T in zip(others, MOVED, strict=True)
     ]
-    together = measure(image, pixel, views(others, MOVED, np.eye(4)), Search(0.5, 0.4, 0.6, 3.5, 0.85, 1.0, 1.0))
+    together = measure(image, pixel, views(others, MOVED, np.eye(4)), Search(0.5, 0.4, 0.6, 3.5, 0.85, 1.0))
     all_agree = (together.agreed == 3) & np.all([one.agreed > 0 for one in each], axis=0)
     assert all_agree.sum() > 20
     smallest = np.min([np.where(one.agreed > 0, one.variance, np.inf) for one in each], axis=0)

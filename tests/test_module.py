@@ -274,33 +274,28 @@ def test_the_oldest_of_equally_far_components_is_dropped_and_sums_follow():
         assert int(room.dropped) == dropped
 
 
-@pytest.mark.parametrize("average", [False, True], ids=["of the frame", "with the moving average"])
-def test_mean_uncertainty(average):
-    dense, sampled, all_of_it = (UfMStar(CONFIG) for _ in range(3))
+def test_mean_uncertainty():
+    dense, sampled, all_of_it = UfMStar(CONFIG.replace(ema_alpha=1.0)), UfMStar(CONFIG), UfMStar(CONFIG)
     for i in range(8):
         depth, pose, intrinsics = frame(i, torch.float64)
         a = torch.full_like(depth, 0.01)
-        if not average:
-            dense.config = dense.config.replace(ema_alpha=1.0)
         out = dense(depth, pose, intrinsics, a)
         truth = out.variance[out.valid].mean().item()
-        exact = all_of_it.mean_uncertainty(depth, pose, intrinsics, a, fraction=1.0, average=average)
+        exact = all_of_it.mean_uncertainty(depth, pose, intrinsics, a, fraction=1.0)
         assert exact.mean.item() == pytest.approx(truth, rel=1e-5)
         assert exact.pixels.item() == out.valid.sum().item()
         assert exact.standard_error.item() < 1e-12, "every pixel is sampled"
-        if not average:
-            estimate = sampled.mean_uncertainty(depth, pose, intrinsics, a, pixels=200, seed=i)
-            assert estimate.pixels.item() == 200
-            assert abs(estimate.mean.item() - truth) <= 3 * estimate.standard_error.item() + 1e-12
-    if not average:
-        assert unchanged(sampled, all_of_it.state_dict())  # the state does not depend on the query's pixels
-        state = copy.deepcopy(sampled.state_dict())
-        means = []
-        for seed in (3, 3, 4):
-            sampled.load_state_dict(state)
-            means.append(sampled.mean_uncertainty(depth, pose, intrinsics, a, pixels=200, seed=seed).mean)
-        assert torch.equal(means[0], means[1])
-        assert not torch.equal(means[0], means[2])
+        estimate = sampled.mean_uncertainty(depth, pose, intrinsics, a, pixels=200, seed=i)
+        assert estimate.pixels.item() == 200
+        assert abs(estimate.mean.item() - truth) <= 3 * estimate.standard_error.item() + 1e-12
+    assert unchanged(sampled, all_of_it.state_dict())  # the state does not depend on the query's pixels
+    state = copy.deepcopy(sampled.state_dict())
+    means = []
+    for seed in (3, 3, 4):
+        sampled.load_state_dict(state)
+        means.append(sampled.mean_uncertainty(depth, pose, intrinsics, a, pixels=200, seed=seed).mean)
+    assert torch.equal(means[0], means[1])
+    assert not torch.equal(means[0], means[2])
 
 
 def test_query_is_the_dense_map_at_its_own_points():

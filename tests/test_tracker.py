@@ -106,14 +106,10 @@ def test_anchors_lie_on_the_depth_map():
     for frame in walk()[:8]:
         result = tracker.update(frame.image, frame.T_world_cam, frame.intrinsics)
     small = resize_intrinsics(torch.from_numpy(frame.intrinsics), (180, 240), (90, 120))
-    anchors = result.anchors(frame.intrinsics, small, capacity=300)
-    n = len(result.depth)
-    assert anchors.depth.shape == (1, 300)
-    assert anchors.valid.sum() == n
-    np.testing.assert_allclose(anchors.pixel[0, :n].numpy(), (result.pixel + 0.5) / 2 - 0.5, atol=1e-9)
-    np.testing.assert_array_equal(anchors.variance[0, :n].numpy(), result.variance)
-    with pytest.raises(ValueError, match="capacity must be at least"):
-        result.anchors(frame.intrinsics, small, capacity=n - 1)
+    anchors = result.anchors(frame.intrinsics, small)
+    assert anchors.valid.sum() == len(result.depth)
+    np.testing.assert_allclose(anchors.pixel[0].numpy(), (result.pixel + 0.5) / 2 - 0.5, atol=1e-9)
+    np.testing.assert_array_equal(anchors.variance[0].numpy(), result.variance)
 
 
 @pytest.mark.parametrize("turned", [0.0, 0.2])

@@ -143,19 +143,17 @@ class UfMStar(StatefulModule):
         pixels: int | None = None,
         fraction: float | None = None,
         seed: int = 0,
-        average: bool = False,
         anchors: Anchors | None = None,
         confidence: Array | None = None,
     ) -> MeanUncertainty:
         """Averages of V, M, A, E and B per image for active learning (section "Compute- and memory efficiency"). Like
         :meth:`forward`, but regresses only a sample of pixels. For a first view (``measured`` near 0),
-        ``config.unmeasured`` determines the mean. The posterior needs whole maps and does nothing.
+        ``config.unmeasured`` determines the mean. The posterior and the moving average need whole maps and do nothing.
 
         Args:
             pixels: size of the sample per image; None, without ``fraction``: 1000.
             fraction: size of the sample as a share of all pixels, in (0, 1]; excludes ``pixels``.
             seed: of the sample, which otherwise depends only on the image's size and its valid pixels.
-            average: apply the moving average, as :meth:`forward` does; else the mean is over this frame's V only.
 
         Raises:
             ValueError: both ``pixels`` and ``fraction``, or one out of range; and as :meth:`forward`.
@@ -167,7 +165,7 @@ class UfMStar(StatefulModule):
         )  # fmt: skip
         kernels = self._kernels(depth)[1].sample
         index, used = kernels.pixels(frame.valid, *sample_size(frame.size, pixels, fraction, seed))
-        out = self._observe(frame, index, average=bool(require("average", average, bool)))
+        out = self._observe(frame, index)
         return mean_uncertainty(out, used, kernels.summary)
 
     def warm_up(
@@ -183,12 +181,11 @@ class UfMStar(StatefulModule):
         twin = UfMStar(self.config, dtype=self.mean.dtype, device=self.mean.device)
         warm_up(twin, size, streams, progress)
 
-    def query(self, points: Array, frame: str = "world") -> Regression:
+    def query(self, points: Array) -> Regression:
         """The disagreement at any 3D point, from the current mixture; the state does not change.
 
         Args:
-            points: [B, N, 3] [m].
-            frame: "world" (the poses' frame) or "first" (each stream's first camera).
+            points: [B, N, 3] in the world [m].
 
         Returns:
             disagreement [B, N] [m^2], and with ``config.variances_in_h`` features [B, N, 3]: A, E and 1. Where M was
@@ -196,9 +193,9 @@ class UfMStar(StatefulModule):
             "relative" gives NaN, since a point has no depth.
 
         Raises:
-            ValueError: wrong shape or frame, or there was no frame yet.
+            ValueError: wrong shape, or there was no frame yet.
         """
-        return query(self.state, as_tensor("points", points), frame, self.config)
+        return query(self.state, as_tensor("points", points), self.config)
 
     @property
     def mixture(self) -> GaussianMixture:
@@ -265,7 +262,7 @@ class UfMStar(StatefulModule):
         return replace(frame, anchors=checked)
 
     def _observe(
-        self, frame: FrameInput, pixels: Tensor | None = None, *, average: bool = True,
+        self, frame: FrameInput, pixels: Tensor | None = None, *,
         network: Mapping[str, Tensor | None] | None = None,
     ) -> UncertaintyOutput:  # fmt: skip
         """Run the step and the corrections by anchors, and store the new state. The maps are [B, n] at ``pixels``,
@@ -277,7 +274,7 @@ class UfMStar(StatefulModule):
             if self.observer is not None:
                 self.observer.stage("check")
             step, kernels = self._kernels(frame.depth)
-            state, out = step(state, frame, self.config, pixels=pixels, smooth=average, observer=self.observer)
+            state, out = step(state, frame, self.config, pixels=pixels, observer=self.observer)
             merging = kernels.merge
             state, out, factor = variance.corrected(state, frame, out, self.config, self.recalibration, pixels, merging)
         # With gradients to A and E.

@@ -370,7 +370,6 @@ class UncertainDepth(NetworksInTurn):
         pixels: int | None = None,
         fraction: float | None = None,
         seed: int = 0,
-        average: bool = False,
     ) -> MeanUncertainty:
         """Like :meth:`forward`, but computes the average of V per image, for active learning. The default source of
         anchors does not search the image: V has B only from a source that the constructor was passed, or from earlier
@@ -378,7 +377,7 @@ class UncertainDepth(NetworksInTurn):
 
         Args:
             image, pose, intrinsics, valid, anchors: as in :meth:`forward`.
-            pixels, fraction, seed, average: as in :meth:`UfMStar.mean_uncertainty`.
+            pixels, fraction, seed: as in :meth:`UfMStar.mean_uncertainty`.
 
         Raises:
             ValueError, TypeError: as :meth:`UfMStar.mean_uncertainty`; alternation and landmarks then do not advance.
@@ -388,7 +387,7 @@ class UncertainDepth(NetworksInTurn):
             maps = p.arguments(confidence=self.ufm.uses_confidence)
             mean = self.ufm.mean_uncertainty(
                 pose=predicted.pose, intrinsics=p.K, valid=valid, anchors=found,
-                pixels=pixels, fraction=fraction, seed=seed, average=average, **maps,
+                pixels=pixels, fraction=fraction, seed=seed, **maps,
             )  # fmt: skip
         self._undo(mean.statistics)
         self._next += 1

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ufmstar_torch.frames.arguments import require_float, require_mask
+from ufmstar_torch.frames.arguments import require_float
 from ufmstar_torch.gaussians.fixed_order import apply
 from ufmstar_torch.runtime.kinds import check_kinds
 
@@ -71,10 +71,7 @@ class Anchors:
 
     @classmethod
     @check_kinds
-    def from_points(
-        cls, points_cam: Tensor, variance: Tensor, intrinsics: Tensor, size: tuple[int, int],
-        valid: Tensor | None = None,
-    ) -> Anchors:  # fmt: skip
+    def from_points(cls, points_cam: Tensor, variance: Tensor, intrinsics: Tensor, size: tuple[int, int]) -> Anchors:
         """Convert points in the camera frame, such as landmarks of a map or returns of a range sensor, to anchors.
 
         A point is invalid if it lies behind the camera or outside the image, or if a value is not finite. Rows of
@@ -85,10 +82,9 @@ class Anchors:
             variance: [B, N] of z [m^2].
             intrinsics: [B, 3, 3] or [3, 3] of the depth map [px].
             size: (H, W) of the depth map [px].
-            valid: [B, N] bool, True = use; None = all.
 
         Raises:
-            TypeError: the points or the variance have no floating dtype, or ``valid`` is not bool.
+            TypeError: the points or the variance have no floating dtype.
             ValueError: a shape is wrong.
         """
         points = require_float("points_cam", points_cam).detach().double()
@@ -99,8 +95,6 @@ class Anchors:
         K = require_float("intrinsics", intrinsics, [(3, 3), (b, 3, 3)]).detach().double().to(points.device)
         z = points[..., 2]
         usable = points.isfinite().all(-1) & (z > 0) & sigma2.isfinite() & (sigma2 >= 0)
-        if valid is not None:
-            usable = usable & require_mask("valid", valid, [(b, n)])
         safe = torch.where(usable[..., None], points, torch.ones_like(points))
         pixel = apply(K.expand(b, 3, 3)[:, None], safe)[..., :2] / safe[..., 2:]
         usable = usable & inside(pixel, size)

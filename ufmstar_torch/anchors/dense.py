@@ -82,8 +82,6 @@ class DenseConfig(Checked):
 
     # [width]: least distance of a corner from all dense anchors to become an anchor
     corner_distance: ClassVar[float] = 0.04
-    # [1]: variance of a match over that computed from its residual for independent pixels
-    match_noise: ClassVar[float] = 1.0
     # [1]: least share of the pixels with two or more matches whose matches all agree; where it is smaller, poses and
     # images contradict each other, and no match is used
     min_share: ClassVar[float] = 0.2
@@ -290,8 +288,7 @@ class DenseEvidence(SavedState):
 
     def _search(self) -> Search:
         config, rho = self.config, 1 / self._depth
-        accepted = config.sigmas, config.least_score, config.rival, config.match_noise
-        return Search(rho, _FARTHEST * rho, _NEAREST * rho, *accepted)
+        return Search(rho, _FARTHEST * rho, _NEAREST * rho, config.sigmas, config.least_score, config.rival)
 
     def _compared(self, T: NDArray, K: NDArray, width: int) -> tuple[Views, Views] | None:
         """Choose keyframes to compare with a camera T [4, 4]: at the full and at half the size; None if there is no

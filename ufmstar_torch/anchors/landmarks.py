@@ -68,37 +68,21 @@ class Landmarks:
         """No landmarks: the image was skipped for a ``fault``."""
         return cls(np.zeros((0, 2)), np.zeros(0), np.zeros(0), 0, none=fault)
 
-    def anchors(self, K_camera: NDArray[np.float64], intrinsics: Tensor, capacity: int | None = None) -> Anchors:
+    def anchors(self, K_camera: NDArray[np.float64], intrinsics: Tensor) -> Anchors:
         """Convert to the anchors of one stream, in the pixels of its depth map.
 
         Args:
             K_camera: [3, 3] of the images [px].
             intrinsics: [3, 3] or [1, 3, 3] of the depth map [px]: the same camera, resized or cropped.
-            capacity: pad to this number, for constant shapes from frame to frame.
-
-        Raises:
-            ValueError: more landmarks than ``capacity``.
         """
-        result, K = batched([self], intrinsics.device, capacity), intrinsics.reshape(3, 3)
+        result, K = batched([self], intrinsics.device), intrinsics.reshape(3, 3)
         same = K.is_cpu and np.array_equal(K.numpy(), K_camera)
         return result if same else result.moved(torch.as_tensor(K_camera), K)
 
 
-def batched(landmarks: Sequence[Landmarks], device: torch.device, capacity: int | None = None) -> Anchors:
-    """The anchors [B, N] of B streams in the pixels of their images, padded and masked.
-
-    Args:
-        landmarks: of each stream.
-        device: of the anchors.
-        capacity: N; None = the largest number of landmarks.
-
-    Raises:
-        ValueError: more landmarks than ``capacity``.
-    """
-    b, n = len(landmarks), max(len(one.depth) for one in landmarks)
-    rows = n if capacity is None else capacity
-    if rows < n:
-        raise ValueError(f"capacity must be at least the number of landmarks, {n}, got {capacity}")
+def batched(landmarks: Sequence[Landmarks], device: torch.device) -> Anchors:
+    """The anchors [B, N] of B streams in the pixels of their images, padded and masked, on a device."""
+    b, rows = len(landmarks), max(len(one.depth) for one in landmarks)
     # NumPy: each torch operation takes several times as long after a network.
     pixel, (depth, variance), valid = np.zeros((b, rows, 2)), np.zeros((2, b, rows)), np.zeros((b, rows), np.bool_)
     tested = [one.motion for one in landmarks if one.motion is not None]

@@ -85,7 +85,6 @@ class ImageFit:
     error: float  # median distance from the half lines [px]
     limit: float  # largest ``error`` of right poses [px]
     reading: Reading  # the best one; ``UNCHANGED`` unless another one is much better
-    best_error: float  # median distance under ``reading`` [px]
     problem: str  # "" = none
 
     @property
@@ -161,7 +160,7 @@ def pose_fit(cameras: Cameras, width: float, corners: Sequence[FollowedCorners])
         if reading == UNCHANGED and baseline > _HALVES * least and baseline - least > _APART and least <= limit:
             reading, error, best = _OTHERS[others.index(least)], baseline, least
     motion = float(np.median([one.motion for one in near]))
-    fit = ImageFit(len(near), motion, error, limit, reading, best, "")
+    fit = ImageFit(len(near), motion, error, limit, reading, "")
     if reading != UNCHANGED:
         return replace(fit, problem=f"{fit._distance}, but by {best:.1f} px under another reading: {reading}")
     if error > limit:

@@ -188,7 +188,9 @@ def check_frame(
     if variances_in_h:
         frame = replace(frame, features=_variances(a, e, plain))
     if informative is not None:
-        informative = _of_streams("informative", informative, plain)
+        if not isinstance(informative, Tensor) or informative.dtype != torch.bool or informative.shape != shape[:1]:
+            raise ValueError(f"informative must be a bool tensor [{len(plain)}], got {informative!r}")
+        informative = _moved(informative, plain.device)
         if informative.is_cpu and bool(informative.all()):
             informative = None
     if informative is None and isinstance(member, int) and member == 0:
@@ -237,13 +239,6 @@ def _of_depth(name: str, value: Tensor, plain: Tensor) -> Tensor:
     if value.is_meta and not plain.is_meta:
         raise ValueError(f"{name} must hold values, got a tensor on device meta")
     return _constant(value)
-
-
-def _of_streams(name: str, value: Tensor, plain: Tensor) -> Tensor:
-    """A checked mask [B] on the depth's device."""
-    if not isinstance(value, Tensor) or value.dtype != torch.bool or value.shape != plain.shape[:1]:
-        raise ValueError(f"{name} must be a bool tensor [{len(plain)}], got {value!r}")
-    return _moved(value, plain.device)
 
 
 def of_streams(cameras: Tensor, streams: int) -> Tensor:

@@ -100,10 +100,10 @@ def weigh(distance, area, everywhere, weights):
 
 
 @leaf
-def quantiles(state, out, first):
-    """Write |z| at the levels for pixels, increasing, to ``out[first:first + 3]``, from the state [4] of :func:`adapt`;
-    NaN before ``LEAST_FRAMES`` frames with scores."""
+def quantiles(state, out):
+    """Write |z| at the levels for pixels, increasing, to ``out`` [3], from the state [4] of :func:`adapt`; NaN
+    before ``LEAST_FRAMES`` frames with scores."""
     largest = 0.0
     for i in range(len(LEVELS)):
         largest = max(largest, math.exp(TRUST * state[1 + i]) * NORMAL[i] * TRANSFER[i])
-        out[first + i] = largest if state[0] >= LEAST_FRAMES else np.nan
+        out[i] = largest if state[0] >= LEAST_FRAMES else np.nan

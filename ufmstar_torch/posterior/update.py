@@ -275,7 +275,7 @@ def of_frame(memory, maps, view, anchors, motion, priors, config, outputs, shown
     interpolate(maps, nodes, field.coefficients, grid, config, outputs)
     shown[0] = ratios[CALIBRATION] if memory.sums[1, CALIBRATION] > 0 else np.nan
     shown[1] = ratios[UNSEEN]
-    quantiles(memory.intervals, shown, 2)
+    quantiles(memory.intervals, shown[2:])
 
 
 @part

@@ -211,23 +211,6 @@ def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Ten
     return memory, torch.where(new.isnan(), torch.nan, memory).to(current.dtype)
 
 
-def moving_average(
-    memory: Tensor, disagreement: Tensor, size: tuple[int, int], alpha: float, pixels: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """The moving average of a frame: the new memory [B, H, W] in its dtype, and the map to output.
-
-    Args:
-        memory: [B, h, w] of the previous frame [m^2].
-        disagreement: [B, H, W], or [B, n] at ``pixels``, which updates the memory at these pixels.
-        size: H and W.
-        alpha: in (0, 1].
-        pixels: [B, n] indices into the flattened image, or None.
-    """
-    memory = memory_for(memory, size)
-    mixed, shown = smooth(at_pixels(memory, pixels), disagreement, alpha)
-    return with_pixels(memory, pixels, mixed), shown
-
-
 def memory_for(memory: Tensor, size: tuple[int, int]) -> Tensor:
     """The memory of a moving average [B, h, w] for a frame of ``size``; all NaN after a change of the size."""
     return memory if memory.shape[1:] == size else memory.new_full((memory.shape[0], *size), torch.nan)
@@ -236,11 +219,6 @@ def memory_for(memory: Tensor, size: tuple[int, int]) -> Tensor:
 def at_pixels(values: Tensor, pixels: Tensor | None) -> Tensor:
     """The values of a map [B, H, W] at pixels [B, n], indices into the flattened image; None = all pixels."""
     return values if pixels is None else torch.gather(values.flatten(1), 1, pixels)
-
-
-def with_pixels(values: Tensor, pixels: Tensor | None, changed: Tensor) -> Tensor:
-    """The map [B, H, W] with the values ``changed`` [B, n] at pixels [B, n]; None = at all pixels [B, H, W]."""
-    return changed if pixels is None else values.flatten(1).scatter(1, pixels, changed).view(values.shape)
 
 
 def with_measured_share(mixture: GaussianMixture) -> GaussianMixture:
@@ -275,20 +253,16 @@ def set_unmeasured(
     return replace(result, disagreement=disagreement, features=result.features[..., :-1]), measured
 
 
-def query(state: UfMStarState, points: Tensor, frame: str, config: UfMStarConfig) -> Regression:
+def query(state: UfMStarState, points: Tensor, config: UfMStarConfig) -> Regression:
     """See :meth:`ufmstar_torch.UfMStar.query`, of a state of B streams."""
-    if not isinstance(frame, str) or frame not in ("world", "first"):
-        raise ValueError(f"frame must be 'world' or 'first', got {frame!r}")
     streams = len(state.weight)
     if streams == 0:
         raise ValueError("query needs a mixture: call the module on a frame first")
     if points.dim() != 3 or points.shape[0] != streams or points.shape[2] != 3:
         raise ValueError(f"points must be [{streams}, N, 3], got {tuple(points.shape)}")
     with undisturbed(points):
-        local = points.detach()
-        if frame == "world":
-            T = invert_rigid(state.T_world_first)
-            local = apply(T[:, None, :3, :3], local.double()) + T[:, None, :3, 3]
+        T = invert_rigid(state.T_world_first)
+        local = apply(T[:, None, :3, :3], points.detach().double()) + T[:, None, :3, 3]
         dtype = torch.float64 if points.dtype == torch.float64 else torch.float32
         result = regress(with_measured_share(state.mixture), local.to(dtype), config)
         return set_unmeasured(result, None, config)[0]

@@ -74,13 +74,13 @@ class Step(Protocol):
 
     def __call__(
         self, state: UfMStarState, frame: FrameInput, config: UfMStarConfig, *, pixels: Tensor | None = None,
-        smooth: bool = True, observer: StepObserver | None = None,
+        observer: StepObserver | None = None,
     ) -> tuple[UfMStarState, UncertaintyOutput]: ...  # fmt: skip
 
 
 def step(
     state: UfMStarState, frame: FrameInput, config: UfMStarConfig, *, pixels: Tensor | None = None,
-    smooth: bool = True, observer: StepObserver | None = None, kernels: Kernels = REFERENCE, grow: bool = True,
+    observer: StepObserver | None = None, kernels: Kernels = REFERENCE, grow: bool = True,
 ) -> tuple[UfMStarState, UncertaintyOutput]:  # fmt: skip
     """Segment, correspond, fuse, regress (section "Uncertainty from Motion*", steps 2 to 5).
 
@@ -88,8 +88,8 @@ def step(
         state: of the previous image; not modified.
         frame: checked input of B streams.
         config: of UfM*.
-        pixels: [B, n] indices into the flattened image to regress only there; None = every pixel.
-        smooth: apply the exponential moving average.
+        pixels: [B, n] indices into the flattened image to regress only there, without the moving average; None = every
+            pixel.
         observer: called after every stage.
         kernels: implementation of each part.
         grow: whether the mixture may get more slots; False: the caller has provided enough.
@@ -133,10 +133,9 @@ def step(
     stage("regress")
 
     smoothed = state.smoothed
-    if smooth and config.ema_alpha < 1.0:
-        smoothed, maps["disagreement"] = regress.moving_average(
-            smoothed, maps["disagreement"], frame.size, config.ema_alpha, pixels
-        )
+    if pixels is None and config.ema_alpha < 1.0:
+        memory = regress.memory_for(smoothed, frame.size)
+        smoothed, maps["disagreement"] = regress.smooth(memory, maps["disagreement"], config.ema_alpha)
     dropped = gone + without_slot + (current_cam.valid & ~far_enough).sum(1)
     counts = _counts(mixture, current_cam, pairs, maps["measured"], new.sum(1) - without_slot, dropped)
     of_anchors = {} if learnt is None else learnt.tensors()

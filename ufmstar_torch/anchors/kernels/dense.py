@@ -78,7 +78,6 @@ class Search(NamedTuple):
         sigmas: half width of later searches, and largest difference between views, in standard deviations.
         least_score: least ZNCC of a match.
         rival: least ratio of 1 - ZNCC between the best match elsewhere on the first line and the best one.
-        match: factor on the variance that a match's residual would give for independent pixels.
     """
 
     start: float
@@ -87,7 +86,6 @@ class Search(NamedTuple):
     sigmas: float
     least_score: float
     rival: float
-    match: float
 
 
 class Measured(NamedTuple):
@@ -180,7 +178,7 @@ def steepest(image, cell, row, column, pixel):
 @reordered
 def _measure(image, pixel, keys, views, search, rho, variance, agreed, contradicted, shown, each, centre):
     H, b, noise = views.H, views.b, views.noise
-    start, first_low, first_high, sigmas, least_score, least_rival, match = search
+    start, first_low, first_high, sigmas, least_score, least_rival = search
     height, width = image.shape
     flat = image.reshape(image.size)
     corner, share = empty(WIDE * WIDE, np.uint32), empty((2, WIDE * WIDE), np.float32)
@@ -224,7 +222,7 @@ def _measure(image, pixel, keys, views, search, rho, variance, agreed, contradic
                 continue
             # G of the normalised window along and across the line; a pixel's variance from the remaining differences.
             g_ee, g_ep, g_pp = out[1], out[2], out[3]
-            pixel_noise = match * 2 * max(1 - out[5], 0.0) / (COUNT - 4)  # rounding can put a ZNCC above 1
+            pixel_noise = 2 * max(1 - out[5], 0.0) / (COUNT - 4)  # rounding can put a ZNCC above 1
             slope = g_ep / g_ee
             schur = g_pp - g_ep * slope
             along = pixel_noise / g_ee + LEAST_MATCH

@@ -196,12 +196,12 @@ def _intrinsics_fault(K, height, width):
 
 
 @kernel
-def _restrict(use, values):
-    """Clear ``use`` [B, P] where values [B, P] are outside [0, LARGEST] or NaN."""
-    low, high = values.dtype.type(0), values.dtype.type(LARGEST)
-    for b in range(values.shape[0]):
-        for i in range(values.shape[1]):
-            use[b, i] &= (values[b, i] >= low) & (values[b, i] <= high)
+def _restrict(use, variances):
+    """Clear ``use`` [B, P] where a variance [B, P] is negative, above ``LARGEST`` or NaN."""
+    high = variances.dtype.type(LARGEST)
+    for b in range(variances.shape[0]):
+        for i in range(variances.shape[1]):
+            use[b, i] &= (variances[b, i] >= 0) & (variances[b, i] <= high)
 
 
 @leaf

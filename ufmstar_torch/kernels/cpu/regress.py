@@ -62,7 +62,8 @@ def regress_maps(
         views: with the exact sum, those of :func:`views_of`; None = computed here.
         shift: [B, 2] added to the two features before the last, of three or more; None = zero.
         informative: [B] False for the streams whose image shows nothing; None = all True.
-        smoothed: [B, H, W] the moving average of the frame before, NaN without a value; None = M is not averaged.
+        smoothed: [B, H, W] the moving average of the frame before, NaN without a value; None = M is not averaged, as at
+            ``pixels``.
 
     Returns:
         M [B, H, W] or [B, n]; the features [B, F, ...], every one a contiguous map; the moving average after the frame;
@@ -72,29 +73,19 @@ def regress_maps(
     if informative is not None:
         out_f[:, -1] *= informative.reshape(-1, *[1] * (out.ndim - 1))
     shown, features = (out, out_f) if pixels is None else (out[:, None], out_f[:, :, None])
-    z, previous = depth, depth if smoothed is None else smoothed
-    if pixels is not None:
-        z = at_pixels(depth, pixels)[:, None]
-        previous = z if smoothed is None else at_pixels(smoothed, pixels)[:, None]
+    z = depth if pixels is None else at_pixels(depth, pixels)[:, None]
+    previous = z if smoothed is None else smoothed
     memory = np.empty(previous.shape, previous.dtype)
     relative = config.unmeasured_relative**2 if config.unmeasured == "relative" else 0
     settings = depth.dtype.type(relative), config.unmeasured == "nan", 1.0 if smoothed is None else config.ema_alpha
     counts = each(_finish, [(b, shown, features, z, previous, memory, *settings) for b in range(len(out))])
-    if smoothed is None:
-        return out, out_f, None, counts
-    if pixels is not None:
-        mixed, memory = memory[:, 0], smoothed.copy()
-        memory.reshape(-1)[_flat(memory, pixels)] = mixed
-    return out, out_f, memory, counts
+    return out, out_f, None if smoothed is None else memory, counts
 
 
 def at_pixels(values: Reals, pixels: NDArray[np.int64]) -> Reals:
     """The values of a map [B, H, W] at pixels [B, n], indices into the flattened image."""
-    return values.reshape(-1).take(_flat(values, pixels))
-
-
-def _flat(values: Reals, pixels: NDArray[np.int64]) -> NDArray[np.int64]:
-    return pixels if len(values) == 1 else pixels + values[0].size * np.arange(len(values))[:, None]
+    index = pixels if len(values) == 1 else pixels + values[0].size * np.arange(len(values))[:, None]
+    return values.reshape(-1).take(index)
 
 
 def regression(

@@ -46,7 +46,7 @@ _Match = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_], int]  
 
 def step(
     state: UfMStarState, frame: FrameInput, config: UfMStarConfig, *, pixels: Tensor | None = None,
-    smooth: bool = True, observer: StepObserver | None = None,
+    observer: StepObserver | None = None,
 ) -> tuple[UfMStarState, UncertaintyOutput]:  # fmt: skip
     """As :func:`ufmstar_torch.steps.step.step`, for CPU tensors."""
     stage = unobserved if observer is None else observer.stage
@@ -74,7 +74,7 @@ def step(
         views = views_of(seen, depth, K, config)
     stage("append")
 
-    smoothed = arrays(memory_for(state.smoothed, frame.size))[0] if smooth and config.ema_alpha < 1 else None
+    smoothed = arrays(memory_for(state.smoothed, frame.size))[0] if pixels is None and config.ema_alpha < 1 else None
     at = None if pixels is None else array(pixels)
     shown, regressed, memory, counts[UNMEASURED] = regress_maps(
         seen, depth, K, config, at, views=views, shift=shift, informative=informative, smoothed=smoothed

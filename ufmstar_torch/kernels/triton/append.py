@@ -162,7 +162,7 @@ def _append(
         has_slot = new & (slot < capacity_k)
         k = b * capacity_k + slot
         x, y, z = moved(R, t, x, y, z)
-        xx, xy, xz, yy, yz, zz = load_symmetric(covariance_c + 9 * c, 1, valid)
+        xx, xy, xz, yy, yz, zz = load_symmetric(covariance_c + 9 * c, valid)
         xx, xy, xz, yy, yz, zz = turned(R, xx, xy, xz, yy, yz, zz)
         tl.store(mean + 3 * k, x, mask=has_slot)
         tl.store(mean + 3 * k + 1, y, mask=has_slot)

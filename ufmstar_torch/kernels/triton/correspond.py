@@ -161,7 +161,7 @@ def _project_listed(
         x = tl.load(mean + 3 * k, mask=inside, other=0.0).to(tl.float64)
         y = tl.load(mean + 3 * k + 1, mask=inside, other=0.0).to(tl.float64)
         z = tl.load(mean + 3 * k + 2, mask=inside, other=0.0).to(tl.float64)
-        xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * k, 1, inside)
+        xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * k, inside)
         if turn:
             x, y, z = moved(R, t, x, y, z)
             xx, xy, xz, yy, yz, zz = turned(R, xx, xy, xz, yy, yz, zz)

@@ -110,7 +110,7 @@ def _floor(covariance, floor, lifted, count, chunk: tl.constexpr):
     inside = n < count
     n = n.to(tl.int64)
     limit = tl.load(floor + n, mask=inside, other=0.0)
-    xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * n, 1, inside)
+    xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * n, inside)
     xx, xy, xz, yy, yz, zz = floored(xx, xy, xz, yy, yz, zz, limit)
     store_symmetric(lifted + 9 * n, xx, xy, xz, yy, yz, zz, inside)
 
@@ -197,7 +197,7 @@ def _fuse(
     k = b * capacity_k + slot
     R, t, view = R + 9 * b, t + 3 * b, view + 4 * b
     x, y, z = _vector(mean + 3 * k, inside)
-    xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * k, 1, inside)
+    xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * k, inside)
     # A rotation rounds mirrored entries differently. Components without matches retain both triangles.
     yx, zx = _number(covariance + 9 * k + 3, inside), _number(covariance + 9 * k + 6, inside)
     zy = _number(covariance + 9 * k + 7, inside)
@@ -220,7 +220,7 @@ def _fuse(
             c, remaining = _next_match(remaining, index_c, b * capacity_c + part * word, use)
             index = b * capacity_c + c
             cx, cy, cz = _vector(mean_c + 3 * index, use)
-            c0, c1, c2, c3, c4, c5 = load_symmetric(covariance_c + 9 * index, 1, use)
+            c0, c1, c2, c3, c4, c5 = load_symmetric(covariance_c + 9 * index, use)
             cx, cy, cz = moved(R, t, cx, cy, cz)
             c0, c1, c2, c3, c4, c5 = turned(R, c0, c1, c2, c3, c4, c5)
             pi_c = _number(weight_c + index, use)

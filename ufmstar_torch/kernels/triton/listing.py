@@ -121,7 +121,7 @@ def _prepare(
         y = tl.load(mean + 3 * k + 1, mask=inside, other=0.0).to(tl.float64)
         z = tl.load(mean + 3 * k + 2, mask=inside, other=0.0).to(tl.float64)
         x, y, z = moved(R, t, x, y, z)
-        xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * k, 1, inside)
+        xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * k, inside)
         xx, yy, zz = tl.where(inside, xx, 1.0), tl.where(inside, yy, 1.0), tl.where(inside, zz, 1.0)
         xx, xy, xz, yy, yz, zz = turned(R, xx, xy, xz, yy, yz, zz)
         i00, i10, i11, i20, i21, i22, det = whitened(xx, xy, xz, yy, yz, zz)

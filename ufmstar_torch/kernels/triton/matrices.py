@@ -26,14 +26,14 @@ def lowest_bit(mask):
 
 
 @triton.jit
-def load_symmetric(pointer, stride, mask):
-    """The upper triangle of full matrices [..., 3, 3] whose entries are ``stride`` apart, as float64."""
+def load_symmetric(pointer, mask):
+    """The upper triangle of full matrices [..., 3, 3], contiguous, as float64."""
     xx = tl.load(pointer, mask=mask, other=0.0).to(tl.float64)
-    xy = tl.load(pointer + stride, mask=mask, other=0.0).to(tl.float64)
-    xz = tl.load(pointer + 2 * stride, mask=mask, other=0.0).to(tl.float64)
-    yy = tl.load(pointer + 4 * stride, mask=mask, other=0.0).to(tl.float64)
-    yz = tl.load(pointer + 5 * stride, mask=mask, other=0.0).to(tl.float64)
-    zz = tl.load(pointer + 8 * stride, mask=mask, other=0.0).to(tl.float64)
+    xy = tl.load(pointer + 1, mask=mask, other=0.0).to(tl.float64)
+    xz = tl.load(pointer + 2, mask=mask, other=0.0).to(tl.float64)
+    yy = tl.load(pointer + 4, mask=mask, other=0.0).to(tl.float64)
+    yz = tl.load(pointer + 5, mask=mask, other=0.0).to(tl.float64)
+    zz = tl.load(pointer + 8, mask=mask, other=0.0).to(tl.float64)
     return xx, xy, xz, yy, yz, zz
 
 

@@ -56,8 +56,6 @@ def regress_frame(
     memory: Tensor,
     config: UfMStarConfig,
     counts: Tensor,
-    *,
-    smooth: bool,
 ) -> FrameRegression:
     """Compute regression, unmeasured pixels and moving average of a frame in two launches.
 
@@ -68,9 +66,8 @@ def regress_frame(
         memory: of the moving average.
         config: of UfM*.
         counts: [7, B] int64 (``append``), to which unmeasured pixels are added.
-        smooth: whether to average.
     """
-    depth, average = frame.depth.contiguous(), smooth and config.ema_alpha < 1.0
+    depth, average = frame.depth.contiguous(), config.ema_alpha < 1.0
     if average and memory.shape != depth.shape:
         memory = memory.new_full(depth.shape, torch.nan)
     updated = torch.empty_like(memory) if average else memory

@@ -390,7 +390,7 @@ def _lift(
     occupied = tl.load(weight + k, mask=inside, other=0.0) > 0
     if tl.max(occupied.to(tl.int32), 0) > 0:
         z = tl.load(mean + 3 * k + 2, mask=occupied, other=1.0)
-        xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * k, 1, occupied)
+        xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * k, occupied)
         across = tl.maximum(z, exact(near_plane, z)) / focal
         least = tl.maximum(across * across * pixel_variance, epsilon * (xx + yy + zz))
         xx, xy, xz, yy, yz, zz = floored(xx, xy, xz, yy, yz, zz, least)

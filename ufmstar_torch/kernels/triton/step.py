@@ -79,16 +79,15 @@ class DeviceStep:
         config: UfMStarConfig,
         *,
         pixels: Tensor | None = None,
-        smooth: bool = True,
         observer: StepObserver | None = None,
     ) -> tuple[UfMStarState, UncertaintyOutput]:
         state = self._with_room(state, frame, config)
         plain = config.anchors is None and not config.overlap_weighted
         if plain and pixels is None and observer is None:
-            updated, out = device_step(state, frame, config, smooth=smooth)
+            updated, out = device_step(state, frame, config)
         else:
             updated, out = step(
-                state, frame, config, pixels=pixels, smooth=smooth, observer=observer, kernels=self._kernels, grow=False
+                state, frame, config, pixels=pixels, observer=observer, kernels=self._kernels, grow=False
             )
         self._count = None if _full(state, config) else Count.of(updated, out.statistics.components)
         return updated, out
@@ -107,7 +106,7 @@ class DeviceStep:
 
 
 def device_step(
-    state: UfMStarState, frame: FrameInput, config: UfMStarConfig, *, smooth: bool = True
+    state: UfMStarState, frame: FrameInput, config: UfMStarConfig
 ) -> tuple[UfMStarState, UncertaintyOutput]:
     """One image through steps 2 to 5 with the slots that the state has; see :func:`ufmstar_torch.steps.step.step`."""
     b = frame.depth.shape[0]
@@ -134,7 +133,7 @@ def device_step(
         mixture, current, poses.to_first, poses.view, matched, counts, near_plane=config.near_plane,
         paper=config.view_baseline is None,
     )  # fmt: skip
-    result = regress_frame(mixture, poses.to_camera, frame, state.smoothed, config, counts, smooth=smooth)
+    result = regress_frame(mixture, poses.to_camera, frame, state.smoothed, config, counts)
     of_step = {
         "components": counts[ends.COMPONENTS], "segments": counts[ends.SEGMENTS], "matched": counts[ends.MATCHED],
         "pairs": counts[ends.PAIRS], "new": counts[ends.NEW], "dropped": counts[ends.DROPPED] + removed,
