@@ -35,7 +35,7 @@ def test_anchored_without_anchors_is_plain():
         assert a.anchored is None
         assert bool((b.anchored[b.valid] == 0).all())
         assert b.statistics.anchors.tolist() == [0]
-    with pytest.raises(ValueError, match=r"UfMStarConfig\.anchors is None"):
+    with pytest.raises(ValueError, match=r"anchors must be None where UfMStarConfig\.anchors is off"):
         plain(*arguments, anchors=anchors_of(depth, 5, np.random.default_rng(0)))
 
 

@@ -176,7 +176,7 @@ def test_pose_scale_and_max_truth(tmp_path):
     assert (depth > 1.5).any()
     np.testing.assert_array_equal(sequence[3].depth, np.where(depth <= 1.5, depth, 0))
     for name, value in (("pose_scale", 0), ("pose_scale", np.inf), ("max_truth", -1)):
-        with pytest.raises(ValueError, match=f"{name} must be a positive number"):
+        with pytest.raises(ValueError, match=f"{name} must lie in"):
             open_sequence(path, **{name: value})
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import sys
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -15,8 +16,6 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
-import torch
-from torch import Tensor
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 _NAMES: dict[Any, tuple[tuple[type, ...], str]] = {
@@ -25,7 +24,6 @@ _NAMES: dict[Any, tuple[tuple[type, ...], str]] = {
     bool: ((bool, np.bool_), "True or False"),
     str: ((str,), "text"),
     Path: ((Path,), "a pathlib.Path"),
-    Tensor: ((Tensor,), "a dense torch.Tensor"),
     np.ndarray: ((np.ndarray,), "a NumPy array"),
     NoneType: ((NoneType,), "None"),
 }
@@ -76,18 +74,23 @@ def _fits(value: object, hint: Any) -> bool:
     if origin is Literal:
         return isinstance(value, tuple({type(arg) for arg in args}))
     if origin in _SEQUENCES:
-        return _is_several(value, (Sequence, np.ndarray, Tensor)) and _items_fit(cast("Sequence[Any]", value), args)
+        return _is_several(value, (Sequence, np.ndarray, *_tensor())) and _items_fit(cast("Sequence[Any]", value), args)
     if origin in _OTHERS:
         return _is_several(value, origin)
     if origin is Callable:
         return callable(value)
     kind = NoneType if hint is None else origin or hint
-    if isinstance(value, Tensor) and kind is Tensor:
-        return value.layout == torch.strided
+    if kind in _tensor():
+        return isinstance(value, kind) and str(value.layout) == "torch.strided"
     if kind in _NAMES:
         return isinstance(value, _NAMES[kind][0]) and (kind is bool or not isinstance(value, bool | np.bool_))
     unchecked = kind is Any or not isinstance(kind, type) or getattr(kind, "_is_protocol", False)
     return unchecked or isinstance(value, kind)
+
+
+def _tensor() -> tuple[Any, ...]:
+    """The class of tensors where torch is imported; without it no value is one, and ``--help`` does not wait for it."""
+    return (sys.modules["torch"].Tensor,) if "torch" in sys.modules else ()
 
 
 def _is_several(value: object, kinds: Any) -> bool:
@@ -96,8 +99,8 @@ def _is_several(value: object, kinds: Any) -> bool:
 
 
 def _items_fit(values: Sequence[Any], args: tuple[Any, ...]) -> bool:
-    if isinstance(values, np.ndarray | Tensor):
-        if values.ndim != 1 or not (isinstance(values, Tensor) or values.dtype.kind in "iuf"):
+    if isinstance(values, (np.ndarray, *_tensor())):
+        if values.ndim != 1 or (isinstance(values, np.ndarray) and values.dtype.kind not in "iuf"):
             return False
         values = values.tolist()
     if len(args) > 1 and args[1] is not ...:
@@ -119,4 +122,6 @@ def _described(hint: Any) -> str:
     if origin is type:
         return f"a class derived from {args[0].__name__}"
     kind = NoneType if hint is None else origin or hint
+    if kind in _tensor():
+        return "a dense torch.Tensor"
     return _NAMES[kind][1] if kind in _NAMES else f"{'an' if kind.__name__[0] in 'AEIO' else 'a'} {kind.__name__}"
