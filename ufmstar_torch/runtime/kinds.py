@@ -66,7 +66,7 @@ def require(name: str, value: Any, hint: Any) -> Any:
     return value
 
 
-def _fits(value: object, hint: Any) -> bool:
+def _fits(value: Any, hint: Any) -> bool:
     hint = hint.__bound__ or Any if isinstance(hint, TypeVar) else hint
     origin, args = get_origin(hint), get_args(hint)
     if origin in _UNIONS:
@@ -74,7 +74,7 @@ def _fits(value: object, hint: Any) -> bool:
     if origin is Literal:
         return isinstance(value, tuple({type(arg) for arg in args}))
     if origin in _SEQUENCES:
-        return _is_several(value, (Sequence, np.ndarray, *_tensor())) and _items_fit(cast("Sequence[Any]", value), args)
+        return _is_several(value, (Sequence, np.ndarray, *_tensor())) and _items_fit(value, args)
     if origin in _OTHERS:
         return _is_several(value, origin)
     if origin is Callable:
@@ -98,8 +98,8 @@ def _is_several(value: object, kinds: Any) -> bool:
     return isinstance(value, kinds) and not isinstance(value, str | bytes) and getattr(value, "ndim", 1) > 0
 
 
-def _items_fit(values: Sequence[Any], args: tuple[Any, ...]) -> bool:
-    if isinstance(values, (np.ndarray, *_tensor())):
+def _items_fit(values: Any, args: tuple[Any, ...]) -> bool:
+    if hasattr(values, "ndim"):  # an array or a tensor
         if values.ndim != 1 or (isinstance(values, np.ndarray) and values.dtype.kind not in "iuf"):
             return False
         values = values.tolist()
