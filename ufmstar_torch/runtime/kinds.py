@@ -81,7 +81,7 @@ def _fits(value: Any, hint: Any) -> bool:
         return callable(value)
     kind = NoneType if hint is None else origin or hint
     if kind in _tensor():
-        return isinstance(value, kind) and str(value.layout) == "torch.strided"
+        return isinstance(value, kind) and str(getattr(value, "layout", "")) == "torch.strided"
     if kind in _NAMES:
         return isinstance(value, _NAMES[kind][0]) and (kind is bool or not isinstance(value, bool | np.bool_))
     unchecked = kind is Any or not isinstance(kind, type) or getattr(kind, "_is_protocol", False)
