@@ -16,8 +16,7 @@ are network_depth and the root of ufm_variance.
 
 from __future__ import annotations
 
-import struct
-import zlib
+import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -127,6 +126,7 @@ def is_length_png(path: Path) -> bool:
 # Metres per count, finest first, with ranges of 65.5 m, 256 m (KITTI's), 655 m and 6.6 km.
 DEPTH_UNITS = (0.001, 1 / 256, 0.01, 0.1)
 FULL = 65535
+PNG_STRATEGY = 3  # zlib's Z_RLE, which looks for runs alone: as small as its level 1 in .7 of the time
 
 
 def fitting_unit(depth: NDArray[Any]) -> float:
@@ -144,19 +144,17 @@ def encode_length_png(values: NDArray[Any], unit: float, quantity: str) -> bytes
     a value beyond the range becomes 65535. Text keys: ``depth_scale`` = metres per count (also for sigma), ``unit``,
     ``quantity``, ``invalid``, ``saturated`` = number of values beyond the range.
     """
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
     usable = (values >= 0) & (values < np.inf)
     counts = np.rint(np.where(usable, values, 0).astype(np.float64) / unit)
     # Clipped in float64: a cast of larger values to 16 bits would wrap around.
-    rows = np.where(usable, np.clip(counts, 1, FULL), 0).astype(">u2").view(np.uint8)
-    # Differences to the row above (PNG's filter 2), of which zlib looks for runs alone: .6 of Pillow's time.
-    lines = np.full((len(rows), rows.shape[1] + 1), 2, np.uint8)
-    lines[0, 1:] = rows[0]
-    np.subtract(rows[1:], rows[:-1], out=lines[1:, 1:])
-    deflate = zlib.compressobj(1, strategy=zlib.Z_RLE)
-    texts = {"depth_scale": repr(float(unit)), "unit": "metres per count", "quantity": quantity}
-    texts |= {"invalid": "0", "saturated": str(np.count_nonzero(counts > FULL))}
-    chunks = [b"IHDR" + struct.pack(">2I5B", rows.shape[1] // 2, len(rows), 16, 0, 0, 0, 0)]
-    chunks += [b"tEXt" + f"{key}\0{text}".encode("ascii") for key, text in texts.items()]
-    chunks += [b"IDAT" + deflate.compress(lines.tobytes()) + deflate.flush(), b"IEND"]
-    framed = (struct.pack(">I", len(c) - 4) + c + struct.pack(">I", zlib.crc32(c)) for c in chunks)
-    return b"\x89PNG\r\n\x1a\n" + b"".join(framed)
+    coded = np.where(usable, np.clip(counts, 1, FULL), 0).astype(np.uint16)
+    text, content = PngInfo(), io.BytesIO()
+    entries = {"depth_scale": repr(float(unit)), "unit": "metres per count", "quantity": quantity}
+    entries |= {"invalid": "0", "saturated": str(np.count_nonzero(counts > FULL))}
+    for key, value in entries.items():
+        text.add_text(key, value)
+    Image.fromarray(coded).save(content, "PNG", compress_type=PNG_STRATEGY, pnginfo=text)
+    return content.getvalue()
