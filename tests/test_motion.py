@@ -10,7 +10,7 @@ import oracle_field
 import oracle_posterior as oracle
 import pytest
 import torch
-from test_posterior import MODEL, K, checked, scene
+from posterior_cases import MODEL, K, checked, scene
 
 from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors, landmark_source

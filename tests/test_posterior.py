@@ -10,6 +10,7 @@ import oracle_posterior as oracle
 import pytest
 import torch
 from backends import moved
+from posterior_cases import MODEL, K, checked, ratios, relative, scene, updated
 
 from ufmstar_torch import PosteriorConfig
 from ufmstar_torch.anchors import Anchors
@@ -18,60 +19,9 @@ from ufmstar_torch.frames.frame import check_frame
 from ufmstar_torch.kernels.compile_cpu import kernel
 from ufmstar_torch.posterior import field
 from ufmstar_torch.posterior.moments import divide, second_moments
-from ufmstar_torch.posterior.running import FEATURES, RATIOS, SIZE, constants, priors, views, write_ratios
+from ufmstar_torch.posterior.running import FEATURES, SIZE, constants, views
 from ufmstar_torch.posterior.scene import SIDE
 from ufmstar_torch.posterior.update import update
-
-MODEL = PosteriorConfig()
-K = torch.tensor([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]])
-
-
-def scene(seed, size=(36, 48), n=60):
-    """Depth [H, W] with a step and a hole, the true factor g/d at every pixel, V, and anchors."""
-    rng = np.random.default_rng(seed)
-    v, u = np.mgrid[: size[0], : size[1]] / np.array(size)[:, None, None]
-    depth = np.where((u > 0.4) & (v < 0.7), 1.2, 3.0) + 0.3 * v
-    factor = np.exp(0.3 + 0.2 * u - 0.1 * np.cos(5 * v) + np.where(depth < 2, 0.2, 0))
-    depth[3:6, 5:7] = 0
-    rows, cols = np.nonzero(depth)
-    chosen = rng.permutation(len(rows))[:n]
-    rows, cols = rows[chosen], cols[chosen]
-    g = depth[rows, cols] * factor[rows, cols] * np.exp(0.02 * rng.standard_normal(n))
-    g[: n // 20] *= 2.5  # outliers
-    pixel = np.stack([cols, rows], -1) + rng.uniform(-0.4, 0.4, (n, 2))
-    return depth, factor, np.full(size, 0.04), pixel, g, (rng.uniform(0.01, 0.3, n) * g) ** 2
-
-
-LEVEL = np.eye(4)
-
-
-def checked(depth, pixel, g, variance, pose=LEVEL):
-    frame = check_frame(torch.from_numpy(depth)[None], torch.from_numpy(pose)[None], K[None], None, None, None,
-                        rotation_tolerance=0.01)  # fmt: skip
-    anchors = Anchors(*(torch.from_numpy(x)[None] for x in (pixel, g, variance)))
-    return frame, check_anchors(anchors, frame)
-
-
-def turned(degrees):
-    """Pose of a camera that has turned to the right."""
-    c, s, pose = np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), np.eye(4)
-    pose[[0, 0, 2, 2], [0, 2, 0, 2]] = c, s, -s, c
-    return pose
-
-
-def moved_by(x):
-    """Pose of a camera that has moved to the right [m]."""
-    pose = np.eye(4)
-    pose[0, 3] = x
-    return pose
-
-
-def ratios(packed):
-    """Those of a memory [SIZE], by name."""
-    values = np.empty(RATIOS)
-    write_ratios(views(packed.numpy()), priors(MODEL), values)
-    return dict(zip(oracle_field.START, values.tolist(), strict=True))
-
 
 solve, distance, divided = kernel(field.solve), kernel(field.distance), kernel(divide)
 
@@ -167,13 +117,6 @@ def test_on_device_meta_the_results_have_shapes():
         assert (value.shape, value.dtype) == (same.shape, same.dtype)
 
 
-def updated(depth, anchors, claimed=None, packed=None, config=MODEL):
-    """State and posterior after a frame of one stream."""
-    packed = torch.zeros(1, SIZE, dtype=torch.float64) if packed is None else packed
-    claimed = np.zeros_like(depth) if claimed is None else claimed
-    return update(packed, *checked(depth, *anchors), torch.from_numpy(claimed)[None], config)
-
-
 def test_far_from_evidence_the_slopes_are_the_stream_s_mean():
     """Ten frames show a network of right shape; then anchors in the left quarter show errors that fall to the right.
     At the right border, the correction is nearer to the network's shape than to the line through these anchors."""
@@ -216,66 +159,6 @@ def test_without_anchors_the_slopes_of_the_correction_revert_and_its_scale_remai
     assert np.abs(b[0][1:]).max() > 0.1
     logs = out.depth[0].log()
     assert float(logs.std()) == pytest.approx(float(np.log(room).std()), rel=0.1)
-
-
-def away_from_evidence(degrees, frames, metres=0.0, config=MODEL):
-    """Relative variance, mean over the image, after three frames of a wall with anchors everywhere, and ``frames``
-    frames without any in which the camera turns and moves to the right, by so much each; and the share of its view
-    whose scale is unconfirmed."""
-    depth, packed = np.full((12, 16), 2.0), None
-    pixel = np.stack([x.ravel() for x in np.mgrid[1:16:3, 1:12:3]], -1).astype(float)
-    for _ in range(3):
-        packed, _ = updated(depth, (pixel, np.full(len(pixel), 2.0), np.full(len(pixel), 1e-4)), packed=packed)
-    for k in range(1, frames + 1):
-        pose = turned(degrees * k) @ moved_by(metres * k)
-        frame, _ = checked(depth, np.zeros((0, 2)), np.zeros(0), np.zeros(0), pose)
-        packed, out = update(packed, frame, None, torch.zeros(1, 12, 16, dtype=torch.float64), config)
-    return float(relative(out).mean()), float(views(packed[0].numpy()).frames[2])
-
-
-def test_in_a_turn_away_from_the_evidence_the_scale_becomes_uncertain_and_at_rest_it_does_not():
-    """The image is 44 degrees wide. The share of the view that is new, not the number of frames, decides."""
-    rest, turn, slow, far = (away_from_evidence(*each) for each in ((0, 5), (4, 5), (2, 10), (4, 30)))
-    assert rest[1] == pytest.approx(0, abs=1e-12)
-    assert 0.3 < turn[1] < 0.5
-    assert slow[1] == pytest.approx(turn[1], rel=0.05)
-    assert far[1] > 0.85
-    assert rest[0] + 0.02 < turn[0] < far[0]
-    without = type("Certain", (PosteriorConfig,), {"places": 0.0})()
-    assert away_from_evidence(4, 5, config=without)[0] == pytest.approx(rest[0], rel=1e-9)
-
-
-def test_a_camera_that_approaches_sees_nothing_new_and_one_that_moves_sideways_does():
-    depth = np.full((12, 16), 2.0)
-    pixel, g = np.array([[8.0, 6.0]]), np.full(1, 2.0)
-    ahead, back = np.eye(4), np.eye(4)
-    ahead[2, 3], back[2, 3] = 0.3, -0.3
-    shares = []
-    for pose in (ahead, back, moved_by(0.3)):
-        packed, _ = updated(depth, (pixel, g, np.full(1, 1e-4)))
-        frame, _ = checked(depth, np.zeros((0, 2)), np.zeros(0), np.zeros(0), pose)
-        packed, _ = update(packed, frame, None, torch.zeros(1, 12, 16, dtype=torch.float64), MODEL)
-        shares.append(float(views(packed[0].numpy()).frames[2]))
-    assert shares[0] == pytest.approx(0, abs=1e-12)
-    assert shares[1] == pytest.approx(1 - (1.7 / 2) ** 2, rel=0.02)  # the last frame sees the same wall at 1.7 m
-    assert shares[2] == pytest.approx(0.3 / 2 * 20 / 16, rel=0.1)  # shift [px] over the width
-
-
-def test_anchors_everywhere_confirm_the_scale_of_a_view_and_one_anchor_does_not():
-    depth, pose = np.full((12, 16), 2.0), turned(25)
-    everywhere = np.stack([x.ravel() for x in np.mgrid[1:16:3, 1:12:3]], -1).astype(float)
-    shares = []
-    for pixel in (everywhere, everywhere[:1]):
-        packed, _ = updated(depth, (everywhere, np.full(len(everywhere), 2.0), np.full(len(everywhere), 1e-4)))
-        frame, anchors = checked(depth, pixel, np.full(len(pixel), 2.0), np.full(len(pixel), 1e-4), pose)
-        packed, _ = update(packed, frame, anchors, torch.zeros(1, 12, 16, dtype=torch.float64), MODEL)
-        shares.append(float(views(packed[0].numpy()).frames[2]))
-    assert shares[0] < 0.01
-    assert shares[1] > 0.1
-
-
-def relative(out, name="variance"):
-    return (getattr(out, name) / out.depth.square())[0]
 
 
 def test_anchors_correct_a_wrong_scale_and_the_variance_covers_what_is_left():

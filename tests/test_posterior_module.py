@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import torch
-from test_posterior import MODEL, K, ratios, scene
+from posterior_cases import MODEL, K, ratios, scene
 
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors

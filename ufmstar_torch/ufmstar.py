@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor
@@ -304,7 +304,7 @@ class UfMStar(StatefulModule):
         return {name: value.reshape(depth.shape) for name, value in maps.items()} if depth.dim() == 4 else maps
 
     def _stored(self) -> UfMStarState:
-        return self._empty.with_tensors(self._buffers)  # type: ignore[arg-type]  # avoids ``__getattr__``
+        return self._empty.with_tensors(cast("dict[str, Tensor]", self._buffers))  # all are of the state, none is None
 
     def _kernels(self, like: Tensor) -> tuple[Step, FrameKernels]:
         """The step and the check for a tensor's device. The step is cached, since a GPU's counts components."""
