@@ -151,7 +151,7 @@ def test_a_source_of_landmarks_needs_no_kernel_after_the_wall():
     ("code", "step"), [(None, 1000), ("raise SystemExit(7)", 1000), ("import time; time.sleep(1000)", 0.5)]
 )
 def test_a_second_process_calls_the_kernels_of_the_search_and_may_fail(monkeypatch, code, step):
-    """Where it exits or hangs, this process compiles what is missing."""
+    """If the second process exits or hangs, the first one compiles the missing kernels."""
     started: list[subprocess.Popen] = []
     monkeypatch.setattr(
         subprocess, "Popen", lambda *a, _new=subprocess.Popen, **k: started.append(_new(*a, **k)) or started[-1]

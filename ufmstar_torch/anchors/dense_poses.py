@@ -80,8 +80,9 @@ class PoseErrors(SavedState):
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
         """Correct depths for errors of the poses and the camera, and update the estimates of these errors.
 
-        Arguments, with ``K`` from :meth:`camera`, and results ``rho``, ``variance`` and ``off`` as of
-        :func:`ufmstar_torch.anchors.kernels.poses.correct`; 0, 0 and NaN for pixels that are not accepted."""
+        The arguments are those of :func:`ufmstar_torch.anchors.kernels.poses.correct`, with ``K`` from :meth:`camera`.
+        Returns its ``rho``, ``variance`` and ``off``, which are 0, 0 and NaN for pixels that are not accepted.
+        """
         rho, variance, off_line = np.zeros(len(pixel)), np.zeros(len(pixel)), np.full(len(pixel), np.nan)
         errors = Errors(self._variance, self._unexplained, self._camera, self._covariance, self._disagreement)
         cameras = views, K, inverse_intrinsics(K), depth, trusted, self._memory

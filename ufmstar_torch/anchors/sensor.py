@@ -35,9 +35,9 @@ _SIDE, _SHARE, _SIGMAS = 5, 0.02, 3.0
 _FREEDOM, _ITERATIONS, _LEAST = 2.0, 8, 1e-10
 # Least share of a landmark's variance that is independent; least inverse depth, as a share of that measured.
 _INDEPENDENT, _NEAREST_ZERO = 0.1, 0.1
-# A landmark of the images nearer than this share of the sensor's depth beside it is left out if its standard deviation
-# exceeds this share of its depth. Most of these are wrong: weak matches, and patches at depth edges, which match the
-# nearer surface. Most of the more certain ones are right: a sensor does not see black things.
+# Limits for landmarks of the images in holes: depth over that of the nearest sensor landmark, and standard deviation
+# over depth. A landmark below the first and above the second is left out. Most of these are wrong, because weak matches
+# and patches at depth edges measure the nearer surface. Most certain near ones are right: a sensor misses black things.
 _SHARE_BESIDE, _UNCERTAIN = 0.8, 0.05
 # Number of stored points; width to which depth maps are reduced to store and show points [px]; share of the depth that
 # wrong poses add to its standard deviation.
@@ -205,7 +205,7 @@ class SensorMemory:
 
 
 def _too_near(others: Landmarks, sensor: Landmarks) -> NDArray[np.bool_]:
-    """[N] True for uncertain landmarks of the images that are much nearer than the sensor's depth beside them."""
+    """[N] True for uncertain landmarks of the images that are much nearer than the nearest landmark of the sensor."""
     if not len(sensor.depth):
         return np.zeros(len(others.depth), np.bool_)
     nearest = np.square(others.pixel[:, None] - sensor.pixel).sum(axis=-1).argmin(axis=1)
