@@ -32,7 +32,7 @@ from ufmstar_torch.frames.warnings import LOGGER
 from ufmstar_torch.gaussians.conventions import CONVENTIONS, OURS
 
 _FPS = 30.0  # of a recording without timestamps
-_MOST_FRAMES = 10**6  # whole numbers below are no times of images, but their numbers
+_MOST_FRAMES = 10**6  # smaller whole numbers are numbers of images, not times
 _POLL = 0.01  # [s] interval of polling a folder
 _KEPT = 256  # [bytes] of each end of a file of poses, by which a file that was written anew is recognised
 LONGEST_LINE = 2**28  # characters of JSON; an image of 12 megapixels has 2**26 at most

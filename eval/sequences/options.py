@@ -56,7 +56,7 @@ class Options(Checked):
     trajectory: str | Path | None = None  # with our axes, camera-to-world
     poses: str = choice(*CONVENTIONS)
     pose_scale: float | None = number(None, "", "m", 0.0, open_low=True, open_high=True)
-    fps: float | None = number(None, "", "1/s", 0.0, open_low=True)  # of the numbers of images, if a layout has them
+    fps: float | None = number(None, "", "1/s", 0.0, open_low=True)  # of images with numbers instead of times
     time_offset: float = number(0.0, "", "s", -np.inf, open_low=True, open_high=True)
     # At 0.1 s a hand that accelerates at 2 m/s^2 departs 2.5 mm from the straight line.
     max_pose_gap: float = number(0.1, "", "s", 0.0)

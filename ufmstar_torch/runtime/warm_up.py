@@ -1,4 +1,4 @@
-"""Compile all kernels by running two synthetic frames, those of the search for anchors in a second process."""
+"""Compile all kernels by running two synthetic frames. A second process compiles those of the search for anchors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _WALL, _SQUARE = (96, 128), 4  # [px] images of a wall, and its squares, by one 
 _FRAMES = 8  # of the wall
 _TOTAL = 3 * 7  # stages of a step, for two frames and an image average
 Source = LandmarkTracker | DenseEvidence
-# The second process: it imports what this one would, without running the program's main file again.
+# Program of the second process. It has this one's search path for modules and does not run the main file again.
 _SECOND = """import sys; sys.path[:] = {path}
 from ufmstar_torch.runtime import warm_up as w
 for kind in ({kinds}): w.along_wall(kind())"""
@@ -109,8 +109,8 @@ def along_wall(evidence: Source) -> None:
 @contextmanager
 def _second_process(sources: Sequence[type[Source]]) -> Iterator[Callable[[], None]]:
     """Compile the kernels of sources of landmarks in a second process while this one compiles others, unless they are
-    on disk or there is one core. Yields a function that waits for it, at most as long again; this process then loads
-    the kernels, and compiles what that one, which may fail, has not."""
+    on disk or there is one core. Yields a function that waits for the second process, at most as long as it has run.
+    After that this process loads the kernels. It compiles those that the second process has not compiled."""
     process, started = None, time.monotonic()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     # A frozen program, or one with Python inside, has no interpreter to start.
@@ -118,7 +118,7 @@ def _second_process(sources: Sequence[type[Source]]) -> Iterator[Callable[[], No
     if sources and cores > 1 and python and not on_disk(refine):
         code = _SECOND.format(path=sys.path, kinds="".join(f"w.{kind.__name__}, " for kind in sources))
         nothing = subprocess.DEVNULL
-        with suppress(OSError):  # no process or no memory: this one compiles all
+        with suppress(OSError):  # without a second process, this one compiles all kernels
             process = subprocess.Popen([sys.executable, "-c", code], stdin=nothing, stdout=nothing, stderr=nothing)
 
     def finish() -> None:
